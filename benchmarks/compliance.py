@@ -25,24 +25,30 @@ from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
+from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
 from flexsheet.nodes.planner.compliance import (
-    FELT_N,
-    GOOD_RATIO,
+    FORCE_JND_FLOOR_N,
+    TARGET_ERROR_RATIO,
     WEBER_RATIO,
     WEBER_RATIO_BARE,
     ObjectCurve,
-    compliance_for,
-    unsureness,
+    choose_stretch,
+    force_uncertainty_ratio,
 )
-from flexsheet.nodes.planner.sheet_force import law_for, membrane_table, rubber_of
+from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber, membrane_table
 
 Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 MODULI_PA = (500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 16000.0)
 DEPTHS_M = np.array([0.002, 0.005, 0.010, 0.020, 0.035, 0.050])
-PLACES: tuple[Place, ...] = (CENTRE, (0.03, 0.02), (0.055, 0.0), (0.0, 0.085), (0.045, 0.06))
+PLACES: tuple[SheetPosition, ...] = (
+    CENTRE,
+    (0.03, 0.02),
+    (0.055, 0.0),
+    (0.0, 0.085),
+    (0.045, 0.06),
+)
 PLACES_MODULUS_PA = 3000.0
 
 
@@ -53,12 +59,12 @@ def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
 
 
 def errors(
-    scene: Scene, stretch: float, pushed_m: Floats, wanted_n: Floats, place: Place = CENTRE
+    scene: Scene, stretch: float, pushed_m: Floats, wanted_n: Floats, place: SheetPosition = CENTRE
 ) -> Floats:
     """The twin's force over the wanted, less one, with the sheet pushed in by `pushed_m` (n,)."""
     radius = scene.finger.radius_m
     true = [twin_force(scene.sheet, stretch, float(depth), place, radius) for depth in pushed_m]
-    error: Floats = (np.array(true) - wanted_n) / np.maximum(wanted_n, FELT_N)
+    error: Floats = (np.array(true) - wanted_n) / np.maximum(wanted_n, FORCE_JND_FLOOR_N)
     return error
 
 
@@ -68,8 +74,8 @@ def row(name: str, values: Floats) -> str:
 
 def verdict(error: Floats) -> str:
     worst = float(np.abs(error).max())
-    if worst <= GOOD_RATIO:
-        return f"within {100 * GOOD_RATIO:.0f} %"
+    if worst <= TARGET_ERROR_RATIO:
+        return f"within {100 * TARGET_ERROR_RATIO:.0f} %"
     if worst <= WEBER_RATIO:
         return f"within what people notice ({100 * WEBER_RATIO:.0f} %)"
     return f"noticeable ({100 * worst:.0f} %; {100 * WEBER_RATIO:.0f}-{100 * WEBER_RATIO_BARE:.0f})"
@@ -81,10 +87,10 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     for modulus in MODULI_PA:
         curve = curve_of(modulus)
         wanted = curve.force_n(depths)
-        shown = scene_compliance(scene, law, curve, deepest_m=float(depths[-1]))
+        shown = scene_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
         error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
         stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
-        old = compliance_for(stiffness, scene.sheet).stretch_ratio
+        old = choose_stretch(stiffness, scene.sheet).stretch_ratio
         before = errors(scene, old, depths, wanted)
         print(
             f"{1e-3 * modulus:g} kPa, {stiffness:.0f} N/m: stretch {shown.stretch_ratio:.3f}, "
@@ -92,7 +98,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
             f"{shown.centre.edge_force_n.max():.1f} N: {verdict(error)}"
         )
         print("  wanted, N" + " " * 17 + "".join(f"{force:>8.3f}" for force in wanted))
-        retreat = 1e3 * shown.retreat_m(depths)
+        retreat = 1e3 * shown.normal_offset_m(depths)
         print("  retreat, mm" + " " * 15 + "".join(f"{one:>8.2f}" for one in retreat))
         print(row("  stretch and retreat", error))
         print(row(f"  stretch {old:.3f} alone", before))
@@ -102,7 +108,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
 
 def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     curve = object_curve(scene)(PLACES_MODULUS_PA)
-    shown = scene_compliance(scene, law, curve, deepest_m=float(depths[-1]))
+    shown = scene_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
     print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
     for place in PLACES:
         pushed = shown.indentation_m(depths, place)
@@ -111,17 +117,19 @@ def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
         print(row(where, error) + f"   {verdict(error)}")
 
 
-def limits(scene: Scene, law: SheetForceModel, deepest_m: float) -> None:
+def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
     """The softest and the stiffest modulus, by the law itself."""
     curve_of = object_curve(scene)
 
     def fits(modulus: float) -> bool:
-        shown = scene_compliance(scene, law, curve_of(modulus), deepest_m=deepest_m)
-        return float(np.abs(shown.centre.error_ratio).max()) <= GOOD_RATIO
+        shown = scene_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
+        return float(np.abs(shown.centre.error_ratio).max()) <= TARGET_ERROR_RATIO
 
     def sure(modulus: float) -> bool:
-        shown = scene_compliance(scene, law, curve_of(modulus), deepest_m=deepest_m)
-        return unsureness(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
+        shown = scene_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
+        return (
+            force_uncertainty_ratio(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
+        )
 
     def border(holds: Callable[[float], bool], inside: float, outside: float) -> float:
         for _ in range(12):
@@ -134,7 +142,7 @@ def limits(scene: Scene, law: SheetForceModel, deepest_m: float) -> None:
     for name, modulus in (("softest", softest), ("stiffest", stiffest)):
         stiffness = curve_of(modulus).force_n(np.array([LINEAR_DEPTH_M]))[0] / LINEAR_DEPTH_M
         print(
-            f"{name} to {1e3 * deepest_m:.0f} mm: {modulus:.0f} Pa, {stiffness:.0f} N/m at "
+            f"{name} to {1e3 * max_depth_m:.0f} mm: {modulus:.0f} Pa, {stiffness:.0f} N/m at "
             f"{1e3 * LINEAR_DEPTH_M:.0f} mm"
         )
 
@@ -145,11 +153,11 @@ def main() -> None:
     parser.add_argument("--depth-mm", type=float, default=50.0, help="deepest push")
     asked = parser.parse_args()
     scene = load_scene(SCENE_FILE)
-    law = law_for(scene.sheet)
+    law = make_force_model(scene.sheet)
     if asked.table:
         sheet = scene.sheet
         law = membrane_table(
-            rubber_of(sheet),
+            make_rubber(sheet),
             stretches=np.linspace(sheet.min_stretch_ratio, sheet.max_stretch_ratio, 3),
             xs_m=sheet.width_m * np.array([0.0, 0.13, 0.25]),
             ys_m=sheet.height_m * np.array([0.0, 0.19, 0.36]),

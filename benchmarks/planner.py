@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [MESH METRES_PER_UNIT]
 
 A finger hovers, touches, strokes while it pushes, lifts, and goes on behind the object, where the
-sheet holds.  Each step of `Plan.follow_finger` is timed, easing and all, the best of some repeats
+sheet holds.  Each step of `SheetTrajectoryPlanner.follow_finger` is timed, the best of some repeats
 of the same path (what else the machine does is no part of it), by phase; beside it the share of a
 tenth of the arms' 7.1 ms cycle.  Then, for strokes of rising speed along the object's tightest
 bends, the fastest at which the sheet's normal stays within half a degree.  Under three minutes.
@@ -28,10 +28,10 @@ from flexsheet.messages.scene import Mesh, Pose, Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.shapes import Shape, make_shape
-from flexsheet.nodes.planner.motion import Plan, Planned
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.sheet_force import law_for
-from flexsheet.nodes.planner.yielding import Yielding
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 
 Floats = NDArray[np.float64]
 
@@ -75,16 +75,18 @@ def geometries() -> dict[str, Mapping[str, Any]]:
     return named
 
 
-def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> Plan:
+def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlanner:
     """As the planner makes it of its own parameters, the object in the world's frame."""
     here = Pose(position_m=np.zeros(3), rpy_rad=np.zeros(3))
     body = scene.object.model_validate(
         {**dict(scene.object), "geometry": dict(geometry), "world_from_object": here}
     )
-    return Plan(scene.model_copy(update={"object": body}), PlannerParameters().settings())
+    return SheetTrajectoryPlanner(
+        scene.model_copy(update={"object": body}), PlannerParameters().trajectory_settings()
+    )
 
 
-def yielding_in(scene: Scene) -> Yielding:
+def make_compliance(scene: Scene) -> ComplianceController:
     """For an object that answers with 60 N/m, and 30 % more for each 10 mm."""
     depths = np.linspace(0.0, scene.working_range.push_depth_m, 20)
     told = SoftBody(
@@ -97,15 +99,15 @@ def yielding_in(scene: Scene) -> Yielding:
         force_curve=np.column_stack([depths, 60.0 * depths * (1.0 + 30.0 * depths)]),
         displacement_world_m=np.zeros((0, 3), dtype=np.float32),
     )
-    yielding = Yielding(scene, law_for(scene.sheet), "curve")
-    yielding.take(told, touching=False)
-    return yielding
+    compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
+    compliance.update(told, in_contact=False)
+    return compliance
 
 
-def anew(plan: Plan) -> Plan:
+def anew(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
     """The same plan with nothing done yet: a mesh's takes a second to make."""
     other = copy.copy(plan)
-    other._encounter = copy.copy(plan._encounter)  # it changes by assignment only
+    other._contact_state = copy.copy(plan._contact_state)  # it changes by assignment only
     return other
 
 
@@ -136,22 +138,26 @@ def session(shape: Shape) -> Floats:
     return np.concatenate([touch, there - depth[:, None] * out, touch[::-1], behind])
 
 
-def follow(plan: Plan, fingers: Floats, yielding: Yielding) -> Iterator[tuple[float, Planned]]:
+def follow(
+    plan: SheetTrajectoryPlanner, fingers: Floats, compliance: ComplianceController
+) -> Iterator[tuple[float, PlannedStep]]:
     """Each step's time (s) and outcome."""
     velocities = np.gradient(fingers, STEP_S, axis=0)
     for finger, velocity in zip(fingers, velocities, strict=True):
         start = time.perf_counter()
-        planned = plan.follow_finger(finger, velocity, yielding, STEP_S)
+        planned = plan.follow_finger(finger, velocity, compliance, STEP_S)
         yield time.perf_counter() - start, planned
 
 
-def time_steps(name: str, plan: Plan, shape: Shape, yielding: Yielding) -> None:
+def time_steps(
+    name: str, plan: SheetTrajectoryPlanner, shape: Shape, compliance: ComplianceController
+) -> None:
     fingers = session(shape)
     times = np.full(len(fingers), np.inf)
     for _ in range(REPEATS):
-        steps = list(follow(anew(plan), fingers, yielding))
+        steps = list(follow(anew(plan), fingers, compliance))
         times = np.minimum(times, [took for took, _ in steps])
-    phases = np.array([planned.presentation.phase for _, planned in steps])
+    phases = np.array([planned.command.phase for _, planned in steps])
     cells = []
     for phase in PHASES:
         some = 1e3 * times[phases == phase]
@@ -161,7 +167,11 @@ def time_steps(name: str, plan: Plan, shape: Shape, yielding: Yielding) -> None:
 
 
 def normal_error_deg(
-    plan: Plan, shape: Shape, heading: Floats, speed: float, yielding: Yielding
+    plan: SheetTrajectoryPlanner,
+    shape: Shape,
+    heading: Floats,
+    speed: float,
+    compliance: ComplianceController,
 ) -> float:
     """The largest along a stroke of `WAY_M` at that speed, sped up and slowed over its ends."""
     step_m = 2e-4
@@ -176,7 +186,7 @@ def normal_error_deg(
     )
     still = np.repeat(fingers[:1], 90, axis=0)
     above = still + 0.02 * normals[0]
-    steps = list(follow(anew(plan), np.concatenate([above, still, fingers]), yielding))
+    steps = list(follow(anew(plan), np.concatenate([above, still, fingers]), compliance))
     found = shape.closest(fingers, previous=np.repeat(points[:1], count, axis=0))
     return float(
         np.degrees(
@@ -190,7 +200,7 @@ def normal_error_deg(
 
 def main() -> None:
     scene = load_scene(SCENE_FILE)
-    yielding = yielding_in(scene)
+    compliance = make_compliance(scene)
     shapes = {
         name: (plan_about(scene, geometry), make_shape(geometry))
         for name, geometry in geometries().items()
@@ -199,7 +209,7 @@ def main() -> None:
     print(f"| shape | {' | '.join(PHASES)} | p99 of all | of a tenth of the arms' cycle |")
     print("|" + "---|" * (len(PHASES) + 3))
     for name, (plan, shape) in shapes.items():
-        time_steps(name, plan, shape, yielding)
+        time_steps(name, plan, shape, compliance)
     print("\nStrokes of 16 mm: peak speed to which the normal is within 0.5°\n")
     print("| shape | around, mm/s | along, mm/s |")
     print("|---|---|---|")
@@ -208,7 +218,7 @@ def main() -> None:
         for heading in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
             good = 0.0
             for speed in SPEEDS_M_PER_S:
-                if normal_error_deg(plan, shape, heading, speed, yielding) > GOOD_DEG:
+                if normal_error_deg(plan, shape, heading, speed, compliance) > GOOD_DEG:
                     break
                 good = float(speed)
             most = "≥ " if good == SPEEDS_M_PER_S[-1] else ""

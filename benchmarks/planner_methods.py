@@ -40,23 +40,28 @@ from flexsheet.nodes.models.shapes.triangles import (
     triangle_normals,
     vertex_normals,
 )
-from flexsheet.nodes.planner.rolling import Contact, rolled, tangent, turned
+from flexsheet.nodes.planner.rolling import (
+    SheetContact,
+    make_tangent_contact,
+    roll_contact,
+    transport_axes,
+)
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 NormalAt = Callable[[Floats], Floats]
-"""Points (n, 3) to the unit normals (n, 3) of the surface points nearest to them."""
+"""Function from points (n, 3) to the unit normals (n, 3) of the nearest surface points."""
 
 SEMI_AXES_M = (0.05, 0.03, 0.02)
 SUBDIVISIONS = (2, 3, 4)
 QUERIES, HEIGHT_RATIO = 400, 1.05
-FINE_ENOUGH = 0.35
-"""Jets are for meshes whose usual edge is under this share of the tightest radius of curvature."""
+MAX_EDGE_RATIO = 0.35
+"""Maximum median edge of meshes for jets, over the smallest radius of curvature."""
 
 
 def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
-    """Vertices (v, 3) on the ellipsoid, and triangles (t, 3): a stretched icosahedron's."""
-    # Late: only charts need it.
+    """Return vertices (v, 3) on the ellipsoid, and triangles (t, 3), of a scaled icosphere."""
+    # Imported late: only benchmarks need it.
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=1.0)
@@ -64,13 +69,13 @@ def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
 
 
 def facet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """The normal of the nearest triangle."""
+    """Return the normal of the nearest triangle."""
     facets, normals = Facets(vertices, triangles), triangle_normals(vertices, triangles)
     return lambda points: np.asarray(normals[facets.nearest(points)[0]])
 
 
 def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """The vertices' normals, interpolated at the nearest point of the facets (Phong 1975)."""
+    """Interpolate the vertices' normals at the nearest point of the facets (Phong 1975)."""
     facets, normals = Facets(vertices, triangles), vertex_normals(vertices, triangles)
 
     def normal_at(points: Floats) -> Floats:
@@ -82,13 +87,13 @@ def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
 
 
 def jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Those of `SmoothMeshShape`, each query by itself."""
+    """Return the normals of `SmoothMeshShape`, for independent queries."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     return lambda points: shape.closest(points).normal
 
 
 def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Those of `SmoothMeshShape`, on from where it was a third of a millimetre ago."""
+    """Return the normals of `SmoothMeshShape`, starting from points 0.3 mm away."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     earlier: dict[bytes, Floats] = {}
 
@@ -101,7 +106,7 @@ def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
     return normal_at
 
 
-METHODS: dict[str, Callable[[Floats, Indices], NormalAt]] = {
+NORMAL_METHODS: dict[str, Callable[[Floats, Indices], NormalAt]] = {
     "facets": facet_normals,
     "blended": blended_normals,
     "jets": jet_normals,
@@ -110,7 +115,7 @@ METHODS: dict[str, Callable[[Floats, Indices], NormalAt]] = {
 
 
 def mesh_normal_trials(scene: Scene) -> Iterator[Trial]:
-    """Every method at every density."""
+    """Yield every method at every density."""
     known = EllipsoidShape(SEMI_AXES_M)
     directions = np.random.default_rng(0).normal(size=(QUERIES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -121,10 +126,10 @@ def mesh_normal_trials(scene: Scene) -> Iterator[Trial]:
         vertices, triangles = ellipsoid_mesh(subdivisions)
         run = half_edges(triangles)
         edge_m = np.median(np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1))
-        fine = bool(edge_m < FINE_ENOUGH * tightest_m)
+        fine = bool(edge_m < MAX_EDGE_RATIO * tightest_m)
         case: Case = {"triangles": len(triangles)}
-        for name, method in METHODS.items():
-            # Only jets give a normal whose rate does not jump, whatever its error.
+        for name, method in NORMAL_METHODS.items():
+            # Only the normal of jets has a continuous rate, whatever its error.
             in_range = fine and name.startswith("jets")
             yield _trial(
                 name, method(vertices, triangles), queries, wanted, case=case, in_range=in_range
@@ -140,7 +145,7 @@ def _trial(
     case: Case,
     in_range: bool,
 ) -> Trial:
-    """Timed is one query, judged are all."""
+    """Return the trial of one query in time, and of all queries in error."""
 
     def error_deg(_: Floats) -> float:
         apart = np.linalg.norm(normal_at(queries) - wanted, axis=1)
@@ -153,7 +158,7 @@ MESH_NORMAL = Family(
     name="mesh-normal",
     unit="deg",
     reference="an ellipsoid's known normals, the worst of 400",
-    methods=tuple(METHODS),
+    methods=tuple(NORMAL_METHODS),
     trials=mesh_normal_trials,
     tolerance=lambda scene: float(
         np.degrees(scene.tolerances.sheet_position_m / scene.sheet.usable_half_height_m)
@@ -161,8 +166,8 @@ MESH_NORMAL = Family(
 )
 
 
-RollStep = Callable[[Shape, Contact, Floats], Contact]
-"""A shape, the contact before and a finger (3,) to the contact after."""
+RollStep = Callable[[Shape, SheetContact, Floats], SheetContact]
+"""Function of a shape, the previous contact and a finger (3,) that returns the next contact."""
 
 ROLLED_SHAPES: dict[str, Callable[[], Shape]] = {
     "cylinder": lambda: CylinderShape(0.0353553, 0.12),
@@ -177,10 +182,10 @@ FRONT = np.array([0.0, 0.0, 1.0])
 HEADING = np.array([0.6, 0.8, 0.0])
 
 
-def roll_as_a_cylinder(shape: Shape, before: Contact, finger: Floats) -> Contact:
-    """The paper's own: the angle about an axis along x says all (its Fig. 7b).
+def roll_as_a_cylinder(shape: Shape, before: SheetContact, finger: Floats) -> SheetContact:
+    """Roll by the angle about an axis along x, as the paper does (its Fig. 7b).
 
-    The radius is that of the tightest bend where the sheet is.
+    The radius is the smallest radius of curvature at the contact.
     """
     radius = 1.0 / tightest_curvature(before.shape_operator)
     centre = before.point - radius * before.normal
@@ -189,38 +194,46 @@ def roll_as_a_cylinder(shape: Shape, before: Contact, finger: Floats) -> Contact
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
     axes = np.column_stack([[1.0, 0.0, 0.0], [0.0, normal[2], -normal[1]], normal])
     point = np.array([finger[0], *(centre + radius * normal)[1:]])
-    way = np.array([point[0] - before.point[0], radius * (angle - begun)])
-    return Contact(point, normal, before.shape_operator, axes, before.on_sheet + way)
+    displacement = np.array([point[0] - before.point[0], radius * (angle - begun)])
+    return SheetContact(
+        point, normal, before.shape_operator, axes, before.position_sheet_m + displacement
+    )
 
 
-def roll_not_at_all(shape: Shape, before: Contact, finger: Floats) -> Contact:
-    """Tangent at the nearest point, always by the sheet's middle: as it is held ready."""
-    return tangent(np.eye(3), shape.closest(finger, previous=before.point), WIDE_M)
+def project_contact(shape: Shape, before: SheetContact, finger: Floats) -> SheetContact:
+    """Return the tangent sheet at the nearest point, in contact at its centre line."""
+    return make_tangent_contact(np.eye(3), shape.closest(finger, previous=before.point), WIDE_M)
 
 
-def roll_by_chords(shape: Shape, before: Contact, finger: Floats) -> Contact:
-    """Parallel transport of the axes, but the way on the sheet is the chord, seen from before."""
+def roll_by_chords(shape: Shape, before: SheetContact, finger: Floats) -> SheetContact:
+    """Transport the axes, but displace the contact by the chord in the previous plane."""
     found = shape.closest(finger, previous=before.point)
-    axes = turned(before.axes, found.normal)
-    way = (found.point - before.point) @ before.axes[:, :2]
-    return Contact(found.point, found.normal, found.shape_operator, axes, before.on_sheet + way)
+    axes = transport_axes(before.axes, found.normal)
+    displacement = (found.point - before.point) @ before.axes[:, :2]
+    return SheetContact(
+        found.point,
+        found.normal,
+        found.shape_operator,
+        axes,
+        before.position_sheet_m + displacement,
+    )
 
 
-def roll(shape: Shape, before: Contact, finger: Floats) -> Contact:
-    """The planner's own, see `rolling.rolled`."""
-    return rolled(before, shape.closest(finger, previous=before.point))
+def roll(shape: Shape, before: SheetContact, finger: Floats) -> SheetContact:
+    """Roll as the planner does, see `rolling.roll_contact`."""
+    return roll_contact(before, shape.closest(finger, previous=before.point))
 
 
-ROLLS: dict[str, RollStep] = {
+ROLLING_METHODS: dict[str, RollStep] = {
     "as_a_cylinder": roll_as_a_cylinder,
-    "projection": roll_not_at_all,
+    "projection": project_contact,
     "chords": roll_by_chords,
     "transport": roll,
 }
 
 
-def stroke_on(shape: Shape, step_m: float) -> Floats:
-    """Fingers (n, 3) along a straightest way from the front, to and beside the sheet's axes."""
+def make_stroke(shape: Shape, step_m: float) -> Floats:
+    """Return fingers (n, 3) along a geodesic from the front, oblique to the sheet's axes."""
     found = shape.closest(10.0 * FRONT)
     heading, fingers = HEADING, [found.point - STROKE_DEPTH_M * found.normal]
     for _ in range(round(STROKE_M / step_m)):
@@ -231,28 +244,28 @@ def stroke_on(shape: Shape, step_m: float) -> Floats:
     return np.array(fingers)
 
 
-def rolled_along(step: RollStep, shape: Shape, fingers: Floats) -> Contact:
-    """The contact at the end of a stroke."""
-    contact = tangent(np.eye(3), shape.closest(fingers[0]), WIDE_M)
+def roll_along(step: RollStep, shape: Shape, fingers: Floats) -> SheetContact:
+    """Return the contact at the end of a stroke."""
+    contact = make_tangent_contact(np.eye(3), shape.closest(fingers[0]), WIDE_M)
     for finger in fingers[1:]:
         contact = step(shape, contact, finger)
     return contact
 
 
 def rolling_trials(scene: Scene) -> Iterator[Trial]:
-    """Every way on every shape, at the scene's speed and at half of it."""
+    """Yield every method on every shape, at the scene's speed and at half of it."""
     half = np.array([0.5 * scene.sheet.width_m, scene.sheet.usable_half_height_m])
     corners = np.array([[x * half[0], y * half[1], 0.0] for x in (-1, 1) for y in (-1, 1)])
-    finest_m = scene.working_range.speed_m_per_s / ROLL_HZ / FINER
+    fine_step_m = scene.working_range.speed_m_per_s / ROLL_HZ / FINER
     for name, make in ROLLED_SHAPES.items():
         shape = make()
-        finest = stroke_on(shape, finest_m)
-        for share in (0.5, 1.0):
-            every = round(share * FINER)
-            fingers = finest[::every]
-            true = rolled_along(roll, shape, finest[: (len(fingers) - 1) * every + 1])
-            speed = share * scene.working_range.speed_m_per_s
-            for method, step in ROLLS.items():
+        fine_stroke = make_stroke(shape, fine_step_m)
+        for speed_ratio in (0.5, 1.0):
+            every = round(speed_ratio * FINER)
+            fingers = fine_stroke[::every]
+            true = roll_along(roll, shape, fine_stroke[: (len(fingers) - 1) * every + 1])
+            speed = speed_ratio * scene.working_range.speed_m_per_s
+            for method, step in ROLLING_METHODS.items():
                 yield _roll_trial(
                     method,
                     shape,
@@ -260,7 +273,7 @@ def rolling_trials(scene: Scene) -> Iterator[Trial]:
                     case={"shape": name, "speed_mm_per_s": 1e3 * speed},
                     true=true,
                     corners=corners,
-                    # A projection forgets where on the sheet the finger is.
+                    # A projection has no memory of the contact's position on the sheet.
                     in_range=step in (roll, roll_by_chords)
                     or (step is roll_as_a_cylinder and name == "cylinder"),
                 )
@@ -272,17 +285,17 @@ def _roll_trial(
     fingers: Floats,
     *,
     case: Case,
-    true: Contact,
+    true: SheetContact,
     corners: Floats,
     in_range: bool,
 ) -> Trial:
-    """Timed is one step, judged is the whole stroke."""
-    step = ROLLS[method]
-    begun = tangent(np.eye(3), shape.closest(fingers[0]), WIDE_M)
+    """Return the trial of one step in time, and of the whole stroke in error."""
+    step = ROLLING_METHODS[method]
+    begun = make_tangent_contact(np.eye(3), shape.closest(fingers[0]), WIDE_M)
     wanted = apply(true.object_from_sheet, corners)
 
-    def error_mm(_: Contact) -> float:
-        reached = rolled_along(step, shape, fingers).object_from_sheet
+    def error_mm(_: SheetContact) -> float:
+        reached = roll_along(step, shape, fingers).object_from_sheet
         return float(1e3 * np.linalg.norm(apply(reached, corners) - wanted, axis=1).max())
 
     return Trial(method, case, partial(step, shape, begun, fingers[1]), error_mm, in_range)
@@ -292,7 +305,7 @@ ROLLING = Family(
     name="rolling",
     unit="mm",
     reference="rolling in steps a fiftieth as long, at the usable sheet's corners after 20 mm",
-    methods=tuple(ROLLS),
+    methods=tuple(ROLLING_METHODS),
     trials=rolling_trials,
     tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
 )

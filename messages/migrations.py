@@ -38,6 +38,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     },
     "Frame": {"lost_share": "occluded_fraction"},
     "Methods": {"mark": "marker"},
+    "SheetTarget": {"retreat_m": "normal_offset_m"},
     "Status": {"taken": "execution_log"},
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
@@ -58,6 +59,37 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Methods", "sheet_force"): {"cubic": "scaled"},
 }
 """By model and today's field name: recorded literal values and those of today."""
+
+SHEET_REASONS = {
+    "": "ok",
+    "fingertip: numbers that are not finite": "fingertip_not_finite",
+    "finger inside the object, on no side of it": "ambiguous_side",
+    "finger through the object": "through_object",
+    "finger past the object's edge": "past_object_edge",
+    "finger past the sheet's usable width": "past_sheet_width",
+    "finger past the sheet's usable height": "past_sheet_height",
+    "finger's place or velocity is no hand's": "implausible_input",
+    "finger beyond the tilt that the arms present": "beyond_tilt",
+    "sheet turned too far about its normal; lift the finger": "beyond_spin",
+    "hollow place: the flat sheet rests on its rim": "concave_contact",
+}
+"""Recorded texts of `SheetTarget.reason` and today's literals."""
+
+
+def _sheet_reason(recorded: str) -> str:
+    if recorded in SHEET_REASONS:
+        return SHEET_REASONS[recorded]
+    if recorded.startswith("fingertip: "):
+        return "fingertip_invalid"
+    if recorded.startswith("fingertip is -"):
+        return "fingertip_in_future"
+    return "fingertip_too_old"
+
+
+TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
+    ("SheetTarget", "reason"): _sheet_reason,
+}
+"""By model and today's field name: makes the literal of a field that was recorded as text."""
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {"Methods": frozenset({"kinematics"})}
 """By model: recorded fields that are dropped, since nothing reads them any more."""
@@ -92,8 +124,9 @@ def migration_for(
         return _unchanged
     if (message_type.__name__, fingerprint) in MIGRATIONS:
         return MIGRATIONS[message_type.__name__, fingerprint]
+    today = message_type.model_json_schema()
     renamed_schema = _rename_in_schema(message_type, recorded_schema)
-    if not fits(renamed_schema, message_type.model_json_schema()):
+    if not fits(_literal_schema(message_type.__name__, renamed_schema, today), today):
         return None
     return lambda fields: _rename_in_fields(message_type, fields)
 
@@ -105,6 +138,23 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
         return recorded
     renamed = {name: _rename_part(name, part) for name, part in parts.items()}
     return {**_rename_part(message_type.__name__, recorded), "$defs": renamed}
+
+
+def _literal_schema(model: str, recorded: Schema, today: Schema) -> Schema:
+    """Return a recorded schema whose text fields are the literals that they are read as."""
+    properties = recorded.get("properties")
+    if not isinstance(properties, Mapping):
+        return recorded
+    literals = {
+        name: today["properties"][name]
+        for owner, name in TEXTS_TO_LITERALS
+        if owner == model and _is_text(properties.get(name))
+    }
+    return {**recorded, "properties": {**properties, **literals}}
+
+
+def _is_text(schema: Any) -> bool:
+    return isinstance(schema, Mapping) and schema.get("type") == "string" and "enum" not in schema
 
 
 def _rename_part(model: str, schema: Any) -> Any:
@@ -147,7 +197,11 @@ def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
         key = names.get(name, name)
         values = RENAMED_VALUES.get((model.__name__, key), {})
         if isinstance(value, str):
-            renamed[key] = values.get(value, value)
+            as_literal = TEXTS_TO_LITERALS.get((model.__name__, key))
+            known = get_args(model.model_fields[key].annotation) if as_literal else ()
+            renamed[key] = (
+                as_literal(value) if as_literal and value not in known else values.get(value, value)
+            )
         elif isinstance(value, dict | list) and key in model.model_fields:
             renamed[key] = _rename_in_parts(_model_in(model.model_fields[key].annotation), value)
         else:

@@ -104,16 +104,34 @@ class Fingertip(Message):
 
 Phase = Literal["wait", "approach", "contact", "hold"]
 
+SheetReason = Literal[
+    "ok",
+    "fingertip_invalid",
+    "fingertip_not_finite",
+    "fingertip_too_old",
+    "fingertip_in_future",
+    "implausible_input",
+    "ambiguous_side",
+    "through_object",
+    "past_object_edge",
+    "beyond_tilt",
+    "beyond_spin",
+    "past_sheet_width",
+    "past_sheet_height",
+    "concave_contact",
+]
+"""Why the sheet does not follow the finger; "concave_contact": it follows with a distance."""
+
 
 class SheetTarget(Message):
-    """Where the sheet shall be at `valid_at_ns`, and how it moves there.
+    """Command the sheet's pose at `valid_at_ns`, and its motion there.
 
     The sheet frame sits at the sheet's centre: x from the left edge to the right, z towards the
     user.  A consumer that uses it at another time adds twist times the difference.
     """
 
     phase: Phase
-    reason: str = Field(description="why the sheet holds or waits; empty otherwise")
+    reason: SheetReason = Field(description='why the sheet holds or waits; otherwise "ok"')
     valid_at_ns: Stamp = Field(description="on the clock of the header's stamps")
     world_from_sheet: Transform
     twist_world: Vector6 = Field(description="linear (m/s) of the centre, then angular (rad/s)")
@@ -122,10 +140,10 @@ class SheetTarget(Message):
     normal_world: Vector3
     contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
     push_depth_m: NonNegative = Field(description="of the finger in the undeformed object")
-    retreat_m: Finite = Field(
+    normal_offset_m: Finite = Field(
         default=0.0,
-        description="how far behind the object's tangent plane the sheet is to be, so that it "
-        "yields as the object would; below 0: before it",
+        description="distance of the sheet behind the object's tangent plane, at which it has the "
+        "object's force; negative: in front of it",
     )
 
 

@@ -50,7 +50,7 @@ class Stroker(Node):
         self.sheet_target.publish(
             SheetTarget(
                 phase="contact",
-                reason="",
+                reason="ok",
                 valid_at_ns=now_ns,
                 world_from_sheet=transform_from_rpy(
                     np.zeros(3), [LEAN_RAD * math.sin(phase), 0.0, 0.0]

@@ -13,10 +13,10 @@ from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
-from flexsheet.nodes.planner.motion import Plan, Planned
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.sheet_force import law_for
-from flexsheet.nodes.planner.yielding import Yielding
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -45,43 +45,43 @@ class Desk:
 
     def __init__(self, scene: Scene, **parameters: float) -> None:
         self.given = PlannerParameters(**parameters)
-        self.plan = Plan(scene, self.given.settings())
-        self.yielding = Yielding(scene, law_for(scene.sheet), "curve")
+        self.plan = SheetTrajectoryPlanner(scene, self.given.trajectory_settings())
+        self.compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
         pose = scene.object.world_from_object
         self.world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self.tilt_rad = scene.working_range.tilt_rad + self.given.tilt_margin_rad
-        self.seen: list[Planned] = []
+        self.seen: list[PlannedStep] = []
         self.home = self.plan.motion
 
-    def see(self, finger: Floats, velocity: Floats = STILL) -> Planned:
+    def see(self, finger: Floats, velocity: Floats = STILL) -> PlannedStep:
         """The sheet's next step for a finger (3,) with a velocity (3,)."""
         planned = self.plan.follow_finger(
             apply(self.world_from_object, finger),
             self.world_from_object[:3, :3] @ velocity,
-            self.yielding,
+            self.compliance,
             STEP_S,
         )
         self.seen.append(planned)
         return planned
 
-    def lose(self) -> Planned:
+    def lose(self) -> PlannedStep:
         """The next step when nothing is known of the finger."""
-        planned = self.plan.hold("lost", STEP_S)
+        planned = self.plan.hold("fingertip_invalid", STEP_S)
         self.seen.append(planned)
         return planned
 
-    def rest(self, finger: Floats, steps: int = 150) -> Planned:
+    def rest(self, finger: Floats, steps: int = 150) -> PlannedStep:
         """The finger still there for so many steps."""
         for _ in range(steps):
             planned = self.see(finger)
         return planned
 
-    def follow(self, fingers: Floats) -> list[Planned]:
+    def follow(self, fingers: Floats) -> list[PlannedStep]:
         """Along fingers (n, 3), one a step, that move evenly enough for their differences."""
         velocities = np.gradient(fingers, STEP_S, axis=0)
         return [self.see(*one) for one in zip(fingers, velocities, strict=True)]
 
-    def object_from_sheet(self, planned: Planned) -> Floats:
+    def object_from_sheet(self, planned: PlannedStep) -> Floats:
         """Where the sheet is planned to be, (4, 4)."""
         return np.asarray(inverse(self.world_from_object) @ planned.motion.world_from_sheet)
 

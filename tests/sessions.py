@@ -56,7 +56,7 @@ SCENE: Scene = load_scene(Path("launch/scenes/cylinder.yaml"))
 def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetTarget:
     return SheetTarget(
         phase=phase,
-        reason="",
+        reason="ok",
         valid_at_ns=valid_at_ns,
         world_from_sheet=pose,
         twist_world=np.zeros(6),

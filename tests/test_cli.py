@@ -190,7 +190,7 @@ def test_node_list_and_describe(flexsheet: Command) -> None:
     assert {"port": "sheet_target", "direction": "output", "message": "SheetTarget"} in described[
         "ports"
     ]
-    assert "lead_s" in [row["parameter"] for row in described["parameters"]]
+    assert "prediction_horizon_s" in [row["parameter"] for row in described["parameters"]]
     said = flexsheet("node", "describe", "tests.launch_nodes:Beacon")
     assert "twin__finger" in said.out
     assert "rate_hz" in said.out
@@ -380,9 +380,10 @@ def test_a_node_that_fails_for_good_ends_an_experiment_in_a_sentence(
 
 
 def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
-    said = flexsheet("launch", "launch/demo.yaml", "--dry-run", "--set", "planner.lead_s=[1,")
+    setting = "planner.prediction_horizon_s=[1,"
+    said = flexsheet("launch", "launch/demo.yaml", "--dry-run", "--set", setting)
     assert said.code == 2
-    assert "planner.lead_s=[1," in said.err
+    assert setting in said.err
     assert "Traceback" not in said.err
 
 

@@ -22,28 +22,28 @@ from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner import sheet_force
 from flexsheet.nodes.planner.compliance import (
-    ADVANCE_PER_DEPTH,
-    GOOD_RATIO,
-    RESERVE,
+    MAX_ADVANCE_PER_DEPTH,
+    TARGET_ERROR_RATIO,
+    USABLE_FRACTION,
     Compliance,
     ObjectCurve,
-    Pull,
+    StretchLimits,
     UnfitCurveError,
-    compliance_at,
+    fit_at_stretch,
     fit_compliance,
-    present,
-    pull_of,
-    unsureness,
+    force_uncertainty_ratio,
+    make_stretch_limits,
+    render_force,
 )
-from flexsheet.nodes.planner.sheet_force import law_for
+from flexsheet.nodes.planner.sheet_force import make_force_model
 
 Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)
 SHEET = SCENE.sheet
-LAW = law_for(SHEET)
-PULL = pull_of(SHEET, LAW)
+LAW = make_force_model(SHEET)
+PULL = make_stretch_limits(SHEET, LAW)
 RADIUS = SCENE.finger.radius_m
 
 
@@ -54,12 +54,12 @@ def soft_curve(scale: float, deepest: float = 0.05) -> ObjectCurve:
     return ObjectCurve(depths, forces)
 
 
-def compliance(curve: ObjectCurve, deepest: float = 0.05, pull: Pull = PULL) -> Compliance:
+def compliance(curve: ObjectCurve, deepest: float = 0.05, pull: StretchLimits = PULL) -> Compliance:
     return fit_compliance(
         curve,
         LAW,
         pull,
-        deepest_m=deepest,
+        max_depth_m=deepest,
         finger_radius_m=RADIUS,
         usable_half_height_m=SHEET.usable_half_height_m,
         position_error_m=SCENE.tolerances.sheet_position_m,
@@ -77,7 +77,7 @@ def test_the_twins_sheet_answers_as_the_object(scale: float, place: tuple[float,
         twin_push(SHEET, shown.stretch_ratio, float(pushed), place, RADIUS, cells=24)
         for pushed in shown.indentation_m(depths, place)
     ]
-    assert [one[0] for one in true] == pytest.approx(curve.force_n(depths), rel=GOOD_RATIO)
+    assert [one[0] for one in true] == pytest.approx(curve.force_n(depths), rel=TARGET_ERROR_RATIO)
     assert max(one[1] for one in true) < SHEET.max_edge_force_n
 
 
@@ -92,20 +92,20 @@ def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
 ) -> None:
     shown = compliance(soft_curve(scale), deepest)
     depths = np.linspace(-0.005, 1.2 * deepest, 800)
-    retreat = shown.retreat_m(depths, place)
+    retreat = shown.normal_offset_m(depths, place)
     slopes = np.diff(retreat) / np.diff(depths)
     assert np.isfinite(retreat).all()
     assert (retreat[depths <= 0.0] == 0.0).all()
     assert slopes.max() < 1.0 + 1e-6
-    assert slopes.min() > -ADVANCE_PER_DEPTH - 1e-6
+    assert slopes.min() > -MAX_ADVANCE_PER_DEPTH - 1e-6
     pushed = shown.indentation_m(depths, place)
     assert (np.diff(pushed) >= -1e-9).all()
     inner = slopes[(depths[1:] > 0.02 * deepest) & (depths[1:] < 0.99 * deepest)]
     assert np.abs(np.diff(inner)).max() < 0.25
     held = (min(abs(place[0]), 0.06), min(abs(place[1]), 0.09))
-    pressed = LAW.evaluate(shown.stretch_ratio, pushed, place_m=held, finger_radius_m=RADIUS)
+    pressed = LAW.evaluate(shown.stretch_ratio, pushed, position_m=held, finger_radius_m=RADIUS)
     assert pressed.edge_force_n.max() < SHEET.max_edge_force_n
-    assert PULL.least_stretch <= shown.stretch_ratio <= PULL.largest_stretch
+    assert PULL.min_stretch_ratio <= shown.stretch_ratio <= PULL.max_stretch_ratio
 
 
 @settings(max_examples=15, deadline=None)
@@ -114,7 +114,7 @@ def test_what_fits_is_presented_exactly_by_the_law(scale: float) -> None:
     curve = soft_curve(scale)
     shown = compliance(curve)
     depths = np.linspace(0.004, 0.05, 30)
-    assert shown.presented(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
+    assert shown.rendered_force_n(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
 
 
 def test_between_the_nodes_of_the_places_the_law_still_holds() -> None:
@@ -122,16 +122,18 @@ def test_between_the_nodes_of_the_places_the_law_still_holds() -> None:
     shown = compliance(curve)
     depths = np.array([0.006, 0.012, 0.03])
     for place in ((0.01, 0.02), (0.045, 0.03), (-0.025, -0.075), (0.055, 0.08)):
-        assert shown.presented(depths, place) == pytest.approx(curve.force_n(depths), rel=0.02)
+        assert shown.rendered_force_n(depths, place) == pytest.approx(
+            curve.force_n(depths), rel=0.02
+        )
 
 
 def test_a_soft_object_lets_the_sheet_follow_the_finger_and_a_stiff_one_brings_it() -> None:
     soft, stiff = compliance(soft_curve(0.1)), compliance(soft_curve(1.3))
     assert soft.stretch_ratio < stiff.stretch_ratio
-    assert soft.retreat_m(0.04) > 0.02
+    assert soft.normal_offset_m(0.04) > 0.02
     assert soft.centre.advance_per_depth < 0.05
-    assert stiff.retreat_m(0.006) < 0.0
-    assert 0.0 < stiff.centre.advance_per_depth <= ADVANCE_PER_DEPTH + 1e-9
+    assert stiff.normal_offset_m(0.006) < 0.0
+    assert 0.0 < stiff.centre.advance_per_depth <= MAX_ADVANCE_PER_DEPTH + 1e-9
 
 
 def test_a_stiffer_object_is_said_to_be_and_by_how_much() -> None:
@@ -144,76 +146,80 @@ def test_a_stiffer_object_is_said_to_be_and_by_how_much() -> None:
 
 
 def test_what_keeps_it_from_a_stiffer_object_is_named() -> None:
-    pulled = compliance(soft_curve(1.0), pull=Pull(1.02, 1.02, 5.3))
-    assert pulled.centre.pull_bound
-    assert "may not pull harder" in pulled.note
-    strong = Pull(1.02, 1.06, 1e3)
+    pulled = compliance(soft_curve(1.0), pull=StretchLimits(1.02, 1.02, 5.3))
+    assert pulled.centre.force_limited
+    assert "edge force is at its limit" in pulled.note
+    strong = StretchLimits(1.02, 1.06, 1e3)
     eager = compliance(soft_curve(3.0), 0.01, strong)
-    assert not eager.centre.pull_bound
-    assert "towards the finger" in eager.note
+    assert not eager.centre.force_limited
+    assert "advance towards the finger" in eager.note
 
 
 def test_a_softer_object_than_the_sheet_is_sure_of_is_said_to_be() -> None:
     shown = compliance(soft_curve(0.02), 0.01)
-    assert "softer than the sheet presents surely" in shown.note
-    assert unsureness(shown.centre, 0.0005) > 0.15
-    assert unsureness(shown.centre, 0.0) == 0.0
+    assert "too soft for the position tolerance" in shown.note
+    assert force_uncertainty_ratio(shown.centre, 0.0005) > 0.15
+    assert force_uncertainty_ratio(shown.centre, 0.0) == 0.0
 
 
 def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> None:
     weak = SHEET.model_copy(update={"max_edge_force_n": 9.0})
-    pull = pull_of(weak, LAW)
-    assert pull.edge_force_n == pytest.approx(RESERVE * 9.0)
-    flat = LAW.evaluate(pull.largest_stretch, np.zeros(1), place_m=CENTRE, finger_radius_m=RADIUS)
-    assert flat.edge_force_n[0] == pytest.approx(RESERVE * 9.0, rel=1e-6)
+    pull = make_stretch_limits(weak, LAW)
+    assert pull.edge_force_n == pytest.approx(USABLE_FRACTION * 9.0)
+    flat = LAW.evaluate(
+        pull.max_stretch_ratio, np.zeros(1), position_m=CENTRE, finger_radius_m=RADIUS
+    )
+    assert flat.edge_force_n[0] == pytest.approx(USABLE_FRACTION * 9.0, rel=1e-6)
     for scale in (0.2, 1.0, 10.0):
         shown = compliance(soft_curve(scale), pull=pull)
-        assert shown.centre.edge_force_n.max() <= RESERVE * 9.0 * (1.0 + 1e-3)
+        assert shown.centre.edge_force_n.max() <= USABLE_FRACTION * 9.0 * (1.0 + 1e-3)
 
 
 def test_a_sheet_that_pulls_too_hard_already_gives_way_at_once() -> None:
-    shown = present(
+    shown = render_force(
         soft_curve(1.0),
         LAW,
-        Pull(1.08, 1.08, 2.0),
+        StretchLimits(1.08, 1.08, 2.0),
         stretch_ratio=1.08,
-        deepest_m=0.05,
+        max_depth_m=0.05,
         finger_radius_m=RADIUS,
     )
     assert not shown.indentation_m.any()
-    assert shown.pull_bound
-    assert shown.retreat_m == pytest.approx(shown.depths_m)
+    assert shown.force_limited
+    assert shown.normal_offset_m == pytest.approx(shown.depths_m)
 
 
 def test_the_slack_sheet_presents_what_it_can() -> None:
-    slack = compliance(soft_curve(0.5), pull=Pull(1.0, 1.0, 17.0))
+    slack = compliance(soft_curve(0.5), pull=StretchLimits(1.0, 1.0, 17.0))
     assert slack.stretch_ratio == 1.0
-    assert np.isfinite(slack.retreat_m(np.linspace(0.0, 0.05, 50))).all()
+    assert np.isfinite(slack.normal_offset_m(np.linspace(0.0, 0.05, 50))).all()
     assert slack.note
 
 
 def test_an_object_that_is_not_there_is_not_felt() -> None:
     shown = compliance(ObjectCurve.linear(0.0, 0.05))
     depths = np.linspace(0.0, 0.05, 20)
-    assert shown.presented(depths) == pytest.approx(0.0, abs=1e-12)
-    assert shown.retreat_m(depths) == pytest.approx(depths)
+    assert shown.rendered_force_n(depths) == pytest.approx(0.0, abs=1e-12)
+    assert shown.normal_offset_m(depths) == pytest.approx(depths)
 
 
 def test_a_curve_elsewhere_keeps_the_stretch() -> None:
     here = compliance(soft_curve(1.0))
-    there = compliance_at(
+    there = fit_at_stretch(
         soft_curve(0.8),
         LAW,
         PULL,
         stretch_ratio=here.stretch_ratio,
-        deepest_m=0.05,
+        max_depth_m=0.05,
         finger_radius_m=RADIUS,
         usable_half_height_m=SHEET.usable_half_height_m,
         position_error_m=0.0005,
     )
     assert there.stretch_ratio == here.stretch_ratio
     depths = np.array([0.005, 0.02])
-    assert there.presented(depths) == pytest.approx(soft_curve(0.8).force_n(depths), rel=0.01)
+    assert there.rendered_force_n(depths) == pytest.approx(
+        soft_curve(0.8).force_n(depths), rel=0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -222,8 +228,8 @@ def test_a_curve_elsewhere_keeps_the_stretch() -> None:
         ([0.0], [0.0], "two or more"),
         ([0.0, 0.01], [0.0], "as many"),
         ([0.0, np.nan], [0.0, 1.0], "finite"),
-        ([0.001, 0.01], [0.0, 1.0], "begin at 0"),
-        ([0.0, 0.01], [0.1, 1.0], "begin at 0"),
+        ([0.001, 0.01], [0.0, 1.0], "must be 0, 0"),
+        ([0.0, 0.01], [0.1, 1.0], "must be 0, 0"),
         ([0.0, 0.01, 0.01], [0.0, 1.0, 2.0], "ascend"),
         ([0.0, 0.01, 0.02], [0.0, 1.0, 0.5], "fall"),
     ],
@@ -254,14 +260,14 @@ def test_a_calibrated_law_serves_as_well() -> None:
     shown = fit_compliance(
         curve,
         stiffer,
-        pull_of(SHEET, stiffer),
-        deepest_m=0.05,
+        make_stretch_limits(SHEET, stiffer),
+        max_depth_m=0.05,
         finger_radius_m=RADIUS,
         usable_half_height_m=SHEET.usable_half_height_m,
         position_error_m=0.0005,
     )
     depths = np.array([0.005, 0.02, 0.045])
-    assert shown.presented(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
+    assert shown.rendered_force_n(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
     assert shown.stretch_ratio < compliance(curve).stretch_ratio
 
 
@@ -277,7 +283,7 @@ def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
     assert result.exit_code == code, result.output
     told = json.loads(result.stdout)
     assert words in told["note"]
-    assert (told["worst_error_ratio"] <= GOOD_RATIO) == (code == 0)
+    assert (told["worst_error_ratio"] <= TARGET_ERROR_RATIO) == (code == 0)
     assert told["rows"][-1]["depth_mm"] == pytest.approx(50.0)
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == code
@@ -300,7 +306,7 @@ def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
 def test_every_law_is_charted_within_the_scenes_range() -> None:
     axes = np.array([1.02, 1.08]), np.array([0.002, 0.05]), np.array([0.0, 0.06])
     table = TabulatedSheetModel(
-        ScaledSheetModel(sheet_force.rubber_of(SHEET)),
+        ScaledSheetModel(sheet_force.make_rubber(SHEET)),
         *axes,
         np.array([0.0, 0.09]),
         np.ones((2, 2, 2, 2)),

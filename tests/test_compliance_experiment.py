@@ -27,7 +27,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
-from flexsheet.nodes.planner.compliance import FELT_N
+from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 
 Floats = NDArray[np.float64]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
@@ -36,12 +36,12 @@ STRETCH = 1.06
 CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
 
 
-def held(press: Press, depth_m: float, retreat_m: float) -> ComplianceRecording:
+def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceRecording:
     """The finger rests at a depth; the sheet stands so far behind the object's tangent plane."""
     tip = press.surface - depth_m * press.normal
     y_axis = np.cross(press.normal, [1.0, 0.0, 0.0])
     axes = np.column_stack([[1.0, 0.0, 0.0], y_axis, press.normal])
-    middle = press.surface - retreat_m * press.normal
+    middle = press.surface - normal_offset_m * press.normal
     half = 0.5 * STRETCH * SCENE.sheet.width_m * axes[:, 0]
     rows = []
     for side, arm in ((-1.0, SCENE.arms.left), (1.0, SCENE.arms.right)):
@@ -60,14 +60,18 @@ def held(press: Press, depth_m: float, retreat_m: float) -> ComplianceRecording:
 
 
 @pytest.mark.parametrize("press", make_presses(SCENE)[::2], ids=lambda press: press.path.label)
-@pytest.mark.parametrize(("depth_m", "retreat_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)])
-def test_the_twins_sheet_says_what_was_felt(press: Press, depth_m: float, retreat_m: float) -> None:
-    felt = ForceReference(held(press, depth_m, retreat_m)).evaluate(500_000_000, press)
+@pytest.mark.parametrize(
+    ("depth_m", "normal_offset_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)]
+)
+def test_the_twins_sheet_says_what_was_felt(
+    press: Press, depth_m: float, normal_offset_m: float
+) -> None:
+    felt = ForceReference(held(press, depth_m, normal_offset_m)).evaluate(500_000_000, press)
     assert felt.depth_m == pytest.approx(depth_m, abs=1e-9)
-    assert felt.retreat_m == pytest.approx(retreat_m, abs=1e-9)
+    assert felt.normal_offset_m == pytest.approx(normal_offset_m, abs=1e-9)
     assert felt.wanted_n == pytest.approx(50.0 * depth_m, rel=1e-6)
     alone = twin_force(
-        SCENE.sheet, STRETCH, depth_m - retreat_m, (float(press.surface[0]), 0.0), 0.007
+        SCENE.sheet, STRETCH, depth_m - normal_offset_m, (float(press.surface[0]), 0.0), 0.007
     )
     assert felt.presented_n == pytest.approx(alone, rel=0.02)
 
@@ -82,7 +86,9 @@ def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
 
 def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
     assert PresentedForce(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
-    assert PresentedForce(0.0001, 0.0, 0.5 * FELT_N, 0.0).error_ratio == pytest.approx(0.5)
+    assert PresentedForce(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0).error_ratio == pytest.approx(
+        0.5
+    )
 
 
 def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:

@@ -95,7 +95,7 @@ def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -
     module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     with (
-        patch.dict("flexsheet.nodes.models.shapes.SHAPES"),
+        patch.dict("flexsheet.nodes.models.shapes.GEOMETRIES"),
         patch.dict("flexsheet.nodes.triangulator.triangulation.TRIANGULATION_METHODS"),
     ):
         for block in with_language("python")[page]:

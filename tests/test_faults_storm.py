@@ -176,7 +176,7 @@ class Link:
 def target(lean_rad: float, now_ns: int, *, twist: Floats | None = None) -> SheetTarget:
     return SheetTarget(
         phase="contact",
-        reason="",
+        reason="ok",
         valid_at_ns=now_ns,
         world_from_sheet=transform_from_rpy(np.zeros(3), [lean_rad, 0.0, 0.0]),
         twist_world=np.zeros(6) if twist is None else twist,

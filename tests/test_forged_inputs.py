@@ -248,7 +248,7 @@ def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: in
         for target in bench.targets_told:
             assert np.isfinite(target.world_from_sheet).all()
             assert np.isfinite(target.twist_world).all()
-            assert target.phase in ("approach", "contact") or target.reason
+            assert target.phase in ("approach", "contact") or target.reason != "ok"
 
     run_bench(test)
 
@@ -263,7 +263,7 @@ def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_says_why(kind
         await bench.point(0.3, lambda: forged_tip(bench, kind, random))
         for target in bench.targets_told[told:]:
             assert target.phase == "hold"
-            assert target.reason
+            assert target.reason != "ok"
             assert target.world_from_sheet == pytest.approx(before, abs=1e-3)
         await bench.point(0.3, bench.honest)
         assert bench.modes() == {"follow"}

@@ -113,7 +113,7 @@ def test_differences_are_found_field_by_field() -> None:
 def test_instants_in_a_message_move_with_its_stamps() -> None:
     target = SheetTarget(
         phase="contact",
-        reason="",
+        reason="ok",
         valid_at_ns=5_000,
         world_from_sheet=np.eye(4),
         twist_world=np.zeros(6),

@@ -178,7 +178,7 @@ async def test_outputs_number_and_stamp_what_they_send() -> None:
     node.sheet_target.publish(
         SheetTarget(
             phase="wait",
-            reason="",
+            reason="ok",
             valid_at_ns=0,
             world_from_sheet=np.eye(4),
             twist_world=np.zeros(6),

@@ -313,7 +313,7 @@ async def aim(rig: Rig, nodes: dict[str, ArmBridge], sheet: SheetMotion) -> None
     while True:
         target = SheetTarget(
             phase="wait",
-            reason="",
+            reason="ok",
             valid_at_ns=rig.clock.now_ns(),
             world_from_sheet=sheet.world_from_sheet,
             twist_world=sheet.twist_world,

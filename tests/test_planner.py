@@ -22,8 +22,8 @@ from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
 from flexsheet.nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from flexsheet.nodes.models.shapes import CylinderShape
 from flexsheet.nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
-from flexsheet.nodes.planner.compliance import RESERVE, compliance_for, stretch_range
-from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach
+from flexsheet.nodes.planner.compliance import USABLE_FRACTION, choose_stretch, stretch_range
+from flexsheet.nodes.planner.contact_state import ContactCommand, ContactLimits, ContactStateMachine
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from tests.fingertips import fingertip
@@ -124,7 +124,7 @@ async def test_without_a_finger_the_sheet_waits_in_the_imaginary_screen() -> Non
     desk = await table()
     target = await desk.see(np.zeros(3), reason="no_marker")
     assert target.phase == "wait"
-    assert target.reason == "fingertip: no_marker"
+    assert target.reason == "fingertip_invalid"
     assert target.world_from_sheet == pytest.approx(np.eye(4), abs=1e-12)
     assert target.stretch_ratio == SCENE.sheet.min_stretch_ratio
 
@@ -160,7 +160,7 @@ async def stroke(
 
 
 async def test_in_touch_the_sheet_rolls_without_slipping() -> None:
-    desk = await table(lead_s=0.0)
+    desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(0.0, 0.02)))
     first = await desk.rest_at(in_world(on_cylinder(0.0, -0.002)))
     assert first.phase == "contact"
@@ -180,7 +180,7 @@ async def test_in_touch_the_sheet_rolls_without_slipping() -> None:
 
 
 async def test_the_published_twist_leads_to_the_next_pose() -> None:
-    desk = await table(lead_s=0.04)
+    desk = await table(prediction_horizon_s=0.04)
     await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
     sent = await stroke(desk, 0.0, 50.0, 500)
     for before, after in itertools.pairwise(sent[50:]):
@@ -190,7 +190,7 @@ async def test_the_published_twist_leads_to_the_next_pose() -> None:
 
 
 async def test_the_prediction_is_for_the_moment_that_it_names() -> None:
-    desk = await table(lead_s=0.05)
+    desk = await table(prediction_horizon_s=0.05)
     await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
     sent = await stroke(desk, 0.0, 40.0, 600)
     assert sent[-1].valid_at_ns == desk.now_ns + 50_000_000
@@ -200,7 +200,7 @@ async def test_the_prediction_is_for_the_moment_that_it_names() -> None:
 
 
 async def test_the_lead_grows_with_the_fingertips_age_and_steps_stay_even() -> None:
-    desk = await table(arrival_s=0.03)
+    desk = await table(actuation_delay_s=0.03)
     for _ in range(200):
         target = await desk.see(in_world(on_cylinder(0.0, -0.001)), age_ns=12_000_000)
     assert (target.valid_at_ns - desk.now_ns) * 1e-9 == pytest.approx(0.042, abs=1e-4)
@@ -214,7 +214,7 @@ async def test_the_lead_grows_with_the_fingertips_age_and_steps_stay_even() -> N
 
 
 async def test_contact_has_hysteresis() -> None:
-    desk = await table(lead_s=0.0)
+    desk = await table(prediction_horizon_s=0.0)
     phases = []
     for height_mm in (5.0, 1.0, 0.4, 1.0, 2.9, 3.1, 1.0, 0.6, 0.4):
         target = await desk.rest_at(in_world(on_cylinder(10.0, height_mm * 1e-3)), 2)
@@ -223,7 +223,7 @@ async def test_contact_has_hysteresis() -> None:
 
 
 async def test_after_a_lift_the_sheet_is_met_at_its_middle_again() -> None:
-    desk = await table(lead_s=0.0)
+    desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
     sent = await stroke(desk, 0.0, 50.0, 500)
     assert sent[-1].contact_sheet_m[1] > 0.03
@@ -232,7 +232,7 @@ async def test_after_a_lift_the_sheet_is_met_at_its_middle_again() -> None:
 
 
 async def test_a_contact_begun_on_the_way_takes_the_sheet_as_it_is() -> None:
-    desk = await table(lead_s=0.0)
+    desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(40.0, 0.02)))
     for _ in range(3):
         before = await desk.see(in_world(on_cylinder(10.0, 0.02)))
@@ -243,15 +243,15 @@ async def test_a_contact_begun_on_the_way_takes_the_sheet_as_it_is() -> None:
     assert abs(target.contact_sheet_m[1]) > 0.001
 
 
-REACH = Reach(
+LIMITS = ContactLimits(
     front=np.array([0.0, 0.0, 1.0]),
-    tilt_rad=1.2,
-    spin_rad=0.3,
+    max_tilt_rad=1.2,
+    max_spin_rad=0.3,
     half_width_m=0.09,
     half_height_m=0.03,
-    touch_m=0.0005,
-    release_m=0.003,
-    deepest_m=2.0 * RADIUS,
+    contact_on_m=0.0005,
+    contact_off_m=0.003,
+    max_depth_m=2.0 * RADIUS,
 )
 STILL = np.zeros(3)
 
@@ -260,14 +260,14 @@ class Desk:
     """An encounter with the cylinder, in the terms of its cross-section."""
 
     def __init__(self) -> None:
-        self.encounter = Encounter(SHAPE, np.eye(3), REACH)
+        self.machine = ContactStateMachine(SHAPE, np.eye(3), LIMITS)
 
-    def see(self, finger: Floats, velocity: Floats = STILL) -> Presentation:
-        now = self.encounter.contact.object_from_sheet
-        return self.encounter.step(finger, velocity, now)
+    def see(self, finger: Floats, velocity: Floats = STILL) -> ContactCommand:
+        now = self.machine.contact.object_from_sheet
+        return self.machine.step(finger, velocity, now)
 
 
-def angle_of(shown: Presentation) -> float:
+def angle_of(shown: ContactCommand) -> float:
     return math.atan2(shown.contact.normal[1], shown.contact.normal[2])
 
 
@@ -278,21 +278,23 @@ def touched(angle_deg: float = 0.0) -> Desk:
 
 
 @pytest.mark.parametrize(
-    ("finger", "words", "depth"),
+    ("finger", "reason", "depth"),
     [
-        (np.array([0.0, 0.0, -1.1 * RADIUS]), "through the object", 2.1 * RADIUS),
-        (on_cylinder(0.0, -0.001, 0.061), "past the object's edge", 0.001),
-        (on_cylinder(0.0, -0.001, -0.08), "past the object's edge", 0.001),
+        (np.array([0.0, 0.0, -1.1 * RADIUS]), "through_object", 2.1 * RADIUS),
+        (on_cylinder(0.0, -0.001, 0.061), "past_object_edge", 0.001),
+        (on_cylinder(0.0, -0.001, -0.08), "past_object_edge", 0.001),
     ],
 )
-def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, words: str, depth: float) -> None:
+def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, reason: str, depth: float) -> None:
     desk = touched()
     shown = desk.see(finger, np.array([0.1, 0.2, 0.3]))
     assert shown.phase == "hold"
-    assert words in shown.reason
+    assert shown.reason == reason
     assert (shown.twist == 0.0).all()
     assert shown.push_depth_m == pytest.approx(depth, abs=1e-12)
-    assert (np.abs(shown.contact.on_sheet) <= [REACH.half_width_m, REACH.half_height_m]).all()
+    assert (
+        np.abs(shown.contact.position_sheet_m) <= [LIMITS.half_width_m, LIMITS.half_height_m]
+    ).all()
     back = desk.see(on_cylinder(0.0, -0.001))
     assert (back.phase, angle_of(back)) == ("contact", pytest.approx(0.0, abs=1e-12))
 
@@ -301,11 +303,11 @@ def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_bac
     desk = touched()
     for angle_deg in np.arange(0.0, 61.0, 2.0):
         shown = desk.see(on_cylinder(angle_deg, -0.001))
-        assert abs(shown.contact.on_sheet[1]) <= REACH.half_height_m + 1e-12
+        assert abs(shown.contact.position_sheet_m[1]) <= LIMITS.half_height_m + 1e-12
     assert shown.phase == "hold"
     assert (shown.twist == 0.0).all()
-    assert "usable height" in shown.reason
-    assert angle_of(shown) == pytest.approx(REACH.half_height_m / RADIUS, abs=1e-3)
+    assert shown.reason == "past_sheet_height"
+    assert angle_of(shown) == pytest.approx(LIMITS.half_height_m / RADIUS, abs=1e-3)
     for angle_deg in np.arange(60.0, -1.0, -2.0):
         shown = desk.see(on_cylinder(angle_deg, -0.001))
     assert (shown.phase, angle_of(shown)) == ("contact", pytest.approx(0.0, abs=1e-9))
@@ -353,8 +355,8 @@ def test_behind_the_object_the_side_is_kept() -> None:
         angle_of(desk.see(on_cylinder(angle_deg, 0.02)))
         for angle_deg in (40.0, 100.0, 170.0, 185.0, 200.0, 175.0)
     ]
-    assert angles == pytest.approx([math.radians(40.0)] + [REACH.tilt_rad] * 5, abs=0.005)
-    assert max(angles) <= REACH.tilt_rad
+    assert angles == pytest.approx([math.radians(40.0)] + [LIMITS.max_tilt_rad] * 5, abs=0.005)
+    assert max(angles) <= LIMITS.max_tilt_rad
 
 
 @settings(max_examples=200, deadline=None)
@@ -371,20 +373,20 @@ def test_wherever_the_finger_goes_the_presentation_is_within_reach(
     desk = Desk()
     for x, y, z in path:
         shown = desk.see(np.array([x, y, z]), np.array([0.1, -0.1, 0.1]))
-        assert abs(angle_of(shown)) <= REACH.tilt_rad + 1e-9
-        most = np.array([REACH.half_width_m, REACH.half_height_m])
-        assert (np.abs(shown.contact.on_sheet) <= most + 1e-9).all()
+        assert abs(angle_of(shown)) <= LIMITS.max_tilt_rad + 1e-9
+        most = np.array([LIMITS.half_width_m, LIMITS.half_height_m])
+        assert (np.abs(shown.contact.position_sheet_m) <= most + 1e-9).all()
         assert np.isfinite(shown.twist).all()
         assert shown.push_depth_m >= 0.0
 
 
 async def test_a_lost_finger_brings_the_sheet_to_rest_smoothly() -> None:
-    desk = await table(lead_s=0.0)
+    desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
     await stroke(desk, 0.0, 40.0, 120)
     lost = [await desk.see(np.zeros(3), reason="two_markers") for _ in range(30)]
     assert {target.phase for target in lost} == {"hold"}
-    assert lost[0].reason == "fingertip: two_markers"
+    assert lost[0].reason == "fingertip_invalid"
     assert lost[-1].twist_world == pytest.approx(np.zeros(6), abs=0.0)
     assert lost[-1].world_from_sheet == pytest.approx(lost[-2].world_from_sheet, abs=1e-15)
     found = await desk.rest_at(in_world(on_cylinder(40.0, -0.001)), 60)
@@ -397,18 +399,18 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
     await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 5)
     target = await desk.see(in_world(on_cylinder(30.0, 0.02)), age_ns=150_000_000)
     assert target.phase == "hold"
-    assert target.reason == "fingertip is 150 ms old"
+    assert target.reason == "fingertip_too_old"
     count = len(desk.sent)
     await desk.see(in_world(on_cylinder(30.0, 0.02)), after_ns=-FRAME_NS)
     assert len(desk.sent) == count
-    assert "1 fingertips came out of order" in desk.planner.note
+    assert "1 fingertips dropped: out of order" in desk.planner.note
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
     random = np.random.default_rng(seed)
-    desk = await table(lead_s=0.05)  # so that targets are even in time
+    desk = await table(prediction_horizon_s=0.05)  # so that targets are even in time
     given = desk.planner.parameters
     sent = []
     for _ in range(40):
@@ -446,7 +448,7 @@ def soft(stiffness: float) -> SoftBody:
 
 
 async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> None:
-    desk = await table(presents="stretch")
+    desk = await table(compliance_mode="stiffness")
     position = in_world(on_cylinder(0.0, -0.001))
     await desk.rest_at(position, 10)
     await desk.planner.step("soft_body", soft(45.0), desk.header())
@@ -455,16 +457,17 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
     force = edge_force_n(
         target.stretch_ratio,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
     assert push_stiffness_n_per_m(force, width_m=sheet.width_m) == pytest.approx(45.0, rel=1e-6)
-    assert desk.planner.note == "sheet's force: scaled"
+    assert desk.planner.note == "sheet force model: scaled"
 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
 async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: str) -> None:
-    desk = await table(presents="stretch")
+    desk = await table(compliance_mode="stiffness")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
     assert words in desk.planner.note
     least, largest = stretch_range(SCENE.sheet)
@@ -476,13 +479,14 @@ def test_the_arms_pull_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
     _, largest = stretch_range(weak)
     force = edge_force_n(
-        compliance_for(1e4, weak).stretch_ratio,
+        choose_stretch(1e4, weak).stretch_ratio,
         young_modulus_pa=weak.young_modulus_pa,
+        width_m=weak.width_m,
         height_m=weak.height_m,
         thickness_m=weak.thickness_m,
     )
     assert largest < weak.max_stretch_ratio
-    assert force == pytest.approx(RESERVE * 8.0, rel=1e-9)
+    assert force == pytest.approx(USABLE_FRACTION * 8.0, rel=1e-9)
 
 
 async def test_the_same_inputs_give_the_same_bytes() -> None:

@@ -29,9 +29,14 @@ from flexsheet.nodes.models.shapes import (
     SmoothMeshShape,
     make_shape,
 )
-from flexsheet.nodes.planner import encounter
-from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach, UnpresentableError
-from flexsheet.nodes.planner.motion import Planned
+from flexsheet.nodes.planner import contact_state
+from flexsheet.nodes.planner.contact_state import (
+    ContactCommand,
+    ContactLimits,
+    ContactStateMachine,
+    UnpresentableError,
+)
+from flexsheet.nodes.planner.trajectory import PlannedStep
 from tests.plans import STEP_S, STILL, Desk, scene_with
 
 Floats = NDArray[np.float64]
@@ -145,7 +150,7 @@ def fresh(name: str) -> tuple[Desk, Shape]:
     new = copy.copy(desk)
     new.plan, new.seen = copy.copy(desk.plan), []
     # The plan alone knows its encounter, and that changes by assignment only.
-    new.plan._encounter = copy.copy(desk.plan._encounter)
+    new.plan._contact_state = copy.copy(desk.plan._contact_state)
     return new, shape
 
 
@@ -165,19 +170,19 @@ def walk(
     return points, normals, bends
 
 
-def touch(desk: Desk, point: Floats, normal: Floats, depth_m: float = 0.001) -> Planned:
+def touch(desk: Desk, point: Floats, normal: Floats, depth_m: float = 0.001) -> PlannedStep:
     """Come from above, touch, and rest there."""
     desk.rest(point + 0.03 * normal)
     desk.follow(point + np.linspace(0.03, -depth_m, 60)[:, None] * normal)
     return desk.rest(point - depth_m * normal, 40)
 
 
-def phases(planned: list[Planned]) -> list[str]:
-    return [one.presentation.phase for one in planned]
+def phases(planned: list[PlannedStep]) -> list[str]:
+    return [one.command.phase for one in planned]
 
 
-def reasons(planned: list[Planned]) -> set[str]:
-    return {one.presentation.reason for one in planned}
+def reasons(planned: list[PlannedStep]) -> set[str]:
+    return {one.command.reason for one in planned}
 
 
 def eased_path(corners: list[Floats], steps: int) -> Floats:
@@ -301,23 +306,23 @@ def test_on_the_real_mesh_the_sheets_normal_is_the_smooth_surfaces(
 # Where it cannot go on
 
 
-def reach(**changes: float) -> Reach:
+def limits(**changes: float) -> ContactLimits:
     given: dict[str, Any] = {
         "front": FRONT,
-        "tilt_rad": 1.2,
-        "spin_rad": 0.3,
+        "max_tilt_rad": 1.2,
+        "max_spin_rad": 0.3,
         "half_width_m": 0.09,
         "half_height_m": 0.09,
-        "touch_m": 0.0005,
-        "release_m": 0.003,
-        "deepest_m": 0.07,
+        "contact_on_m": 0.0005,
+        "contact_off_m": 0.003,
+        "max_depth_m": 0.07,
     }
-    return Reach(**given | changes)
+    return ContactLimits(**given | changes)
 
 
-def shown_to(shape: Shape, finger: Floats, **changes: float) -> Presentation:
+def shown_to(shape: Shape, finger: Floats, **changes: float) -> ContactCommand:
     """What is presented to a finger that is there from the first."""
-    met = Encounter(shape, np.eye(3), reach(**changes))
+    met = ContactStateMachine(shape, np.eye(3), limits(**changes))
     return met.step(finger, STILL, met.contact.object_from_sheet)
 
 
@@ -351,12 +356,12 @@ def test_no_transition_is_a_step_wherever_the_finger_goes(
         here = there
     desk.assert_bounded()
     for planned in desk.seen:
-        shown = planned.presentation
+        shown = planned.command
         assert np.isfinite(shown.twist).all()
         assert shown.push_depth_m >= 0.0
         assert angle_between(shown.contact.normal, FRONT) <= desk.tilt_rad + 1e-6
         if shown.phase == "hold":
-            assert shown.reason
+            assert shown.reason != "ok"
             assert (shown.twist == 0.0).all()
 
 
@@ -377,12 +382,12 @@ def test_a_finger_inside_on_no_side_is_held_and_not_met(
     desk, shape = fresh(name)
     home = desk.plan.motion.world_from_sheet
     held = desk.rest(np.array(finger), 20)
-    assert held.presentation.phase == "hold"
-    assert held.presentation.reason == encounter.NO_SIDE
+    assert held.command.phase == "hold"
+    assert held.command.reason == "ambiguous_side"
     assert held.motion.world_from_sheet == pytest.approx(home, abs=1e-12)
     front = shape.closest(np.array([0.0, 0.0, 0.2]))
     out = touch(desk, front.point, front.normal)
-    assert out.presentation.phase == "contact"
+    assert out.command.phase == "contact"
     desk.assert_bounded()
 
 
@@ -393,14 +398,14 @@ def test_pushed_to_the_middle_the_side_is_kept_for_every_shape() -> None:
         desk, shape = fresh(name)
         front = shape.closest(np.array([0.0, 0.0, 0.2]))
         before = touch(desk, front.point, front.normal)
-        assert before.presentation.phase == "contact"
+        assert before.command.phase == "contact"
         deepest = min(0.05, front.point[2])
         for depth in np.linspace(0.001, deepest, 150):
             trembling = noise.normal(0.0, 1e-4, 3)
             after = desk.see(front.point - depth * front.normal + trembling)
-            if after.presentation.phase != "contact":
+            if after.command.phase != "contact":
                 # A mesh's saddle is an edge deep below it; the sheet then waits where it is.
-                assert after.presentation.phase == "hold"
+                assert after.command.phase == "hold"
         assert angle_between(after.motion.world_from_sheet[:3, 2], front.normal) < 0.06
         desk.assert_bounded()
 
@@ -412,15 +417,15 @@ def test_between_two_lobes_the_nearer_is_presented_and_the_other_only_once_it_mu
     sides = []
     for y in ways:
         planned = desk.see(over + np.array([0.0, y, 0.0]), np.array([0.0, -0.25, 0.0]))
-        assert planned.presentation.phase == "approach"
-        sides.append(planned.presentation.contact.point[1] > 0.0)
+        assert planned.command.phase == "approach"
+        sides.append(planned.command.contact.point[1] > 0.0)
     changes = np.flatnonzero(np.diff(sides))
     # Once each way, and late rather than early: no to and fro at the middle.
     assert len(changes) == 2
     assert ways[changes[0]] <= 0.001
     assert ways[changes[1] + 1] >= -0.001
     still = [desk.see(over + 1e-5 * np.array([0.0, (-1.0) ** i, 0.0])) for i in range(60)]
-    assert len({one.presentation.contact.point[1] > 0.0 for one in still}) == 1
+    assert len({one.command.contact.point[1] > 0.0 for one in still}) == 1
     desk.assert_bounded()
 
 
@@ -431,14 +436,14 @@ def test_at_a_meshs_sharp_edge_the_sheet_holds_until_the_finger_is_back() -> Non
     way = eased_path([start + depth, np.array([0.0, 0.044, 0.038])], 90)
     for finger in way:
         out = desk.see(finger)
-        if out.presentation.phase == "hold":
+        if out.command.phase == "hold":
             break
-    assert out.presentation.reason == encounter.PAST_EDGE
+    assert out.command.reason == "past_object_edge"
     held = desk.rest(finger, 60)
-    assert held.presentation.reason == encounter.PAST_EDGE
+    assert held.command.reason == "past_object_edge"
     assert held.motion.twist_world == pytest.approx(np.zeros(6), abs=1e-9)
     back = desk.rest(start + depth, 120)
-    assert back.presentation.phase == "contact"
+    assert back.command.phase == "contact"
     assert back.motion.world_from_sheet[:3, 2] == pytest.approx(FRONT, abs=1e-6)
     desk.assert_bounded()
 
@@ -446,7 +451,7 @@ def test_at_a_meshs_sharp_edge_the_sheet_holds_until_the_finger_is_back() -> Non
 def test_over_an_edge_the_sheet_is_presented_but_no_touch_begins() -> None:
     met = shown_to(make_shape(SOLIDS["cylinder"]), np.array([0.07, 0.0, RADIUS - 0.0005]))
     assert met.phase == "approach"
-    assert met.reason == encounter.PAST_EDGE
+    assert met.reason == "past_object_edge"
 
 
 def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
@@ -454,24 +459,24 @@ def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
     desk, shape = fresh("bowl")
     bottom = shape.closest(np.array([0.0, 0.0, 0.02]))
     waiting = desk.rest(np.array([0.0, 0.0, 0.04]), 200)
-    assert waiting.presentation.reason == encounter.HOLLOW
+    assert waiting.command.reason == "concave_contact"
     stands = desk.object_from_sheet(waiting)[2, 3] - bottom.point[2]
     assert stands == pytest.approx(0.024**2 / 0.12, abs=3e-4)
     # Over the rim, where the block falls away to the sides, it is tangent to what is touched.
     touched = desk.rest(np.array([0.0, 0.0, stands - 0.001]), 60)
-    assert touched.presentation.phase == "contact"
-    assert touched.presentation.push_depth_m == pytest.approx(0.001, abs=3e-4)
+    assert touched.command.phase == "contact"
+    assert touched.command.push_depth_m == pytest.approx(0.001, abs=3e-4)
     desk.follow(eased_path([np.array([0, 0, stands - 0.001]), np.array([0, 0.03, 0.0065])], 120))
-    lifts = [planned.presentation.contact.lift_m for planned in desk.seen]
+    lifts = [planned.command.contact.lift_m for planned in desk.seen]
     assert np.abs(np.diff(lifts)).max() < 4e-4
     desk.assert_bounded()
 
 
 @pytest.mark.parametrize(
-    ("name", "axis", "words"), [("plane", 0, "width"), ("plane", 1, "height"), ("box", 0, "width")]
+    ("name", "axis", "side"), [("plane", 0, "width"), ("plane", 1, "height"), ("box", 0, "width")]
 )
 def test_out_of_sheet_it_holds_and_is_met_at_its_middle_again_after_a_lift(
-    name: str, axis: int, words: str
+    name: str, axis: int, side: str
 ) -> None:
     """The finger goes to the end of the sheet, lifts, and comes again elsewhere."""
     desk, shape = fresh(name)
@@ -483,20 +488,20 @@ def test_out_of_sheet_it_holds_and_is_met_at_its_middle_again_after_a_lift(
     first = touch(desk, start.point, start.normal)
     pose = desk.object_from_sheet(first)
     # Shifted by hand, as if it had been rolled so far: most of it is used up.
-    met = desk.plan._encounter
-    shifted = met.contact.on_sheet.copy()
+    met = desk.plan._contact_state
+    shifted = met.contact.position_sheet_m.copy()
     shifted[axis] = most - 0.01
-    met.contact = replace(met.contact, on_sheet=shifted)
+    met.contact = replace(met.contact, position_sheet_m=shifted)
     desk.rest(start.point - 0.001 * start.normal, 200)
     end = start.point + 0.03 * along - 0.001 * start.normal
     out = desk.follow(eased_path([start.point - 0.001 * start.normal, end], 120))
     assert phases(out)[-1] == "hold"
-    assert words in out[-1].presentation.reason
-    assert abs(out[-1].presentation.contact.on_sheet[axis]) <= most
+    assert out[-1].command.reason == f"past_sheet_{side}"
+    assert abs(out[-1].command.contact.position_sheet_m[axis]) <= most
     lifted = desk.rest(end + 0.03 * start.normal, 200)
-    assert lifted.presentation.phase == "approach"
+    assert lifted.command.phase == "approach"
     again = touch(desk, start.point, start.normal)
-    assert again.presentation.phase == "contact"
+    assert again.command.phase == "contact"
     assert desk.object_from_sheet(again) == pytest.approx(pose, abs=1e-5)
     desk.assert_bounded()
 
@@ -507,12 +512,12 @@ def test_released_and_met_elsewhere_the_sheet_goes_there_at_once_and_smoothly() 
         one, other = (
             shape.closest(np.array([x, y, 0.2])) for x, y in ((-0.01, 0.06), (0.015, -0.06))
         )
-        assert touch(desk, one.point, one.normal).presentation.phase == "contact"
+        assert touch(desk, one.point, one.normal).command.phase == "contact"
         away = eased_path([one.point, one.point + 0.03 * one.normal, other.point], 40)
         flown = desk.follow(away + 0.01 * FRONT)
         assert "approach" in phases(flown)
         again = touch(desk, other.point, other.normal)
-        assert again.presentation.phase == "contact"
+        assert again.command.phase == "contact"
         assert desk.object_from_sheet(again)[:3, 2] == pytest.approx(other.normal, abs=1e-3)
         assert again.contact_sheet_m[1] == pytest.approx(0.0, abs=1e-3)
         desk.assert_bounded()
@@ -539,11 +544,11 @@ def test_a_finger_that_is_none_is_held(
     before = desk.plan.motion.world_from_sheet
     with np.errstate(all="ignore"):
         held = desk.see(np.array(finger), np.array(velocity))
-    assert held.presentation.phase == "hold"
-    assert held.presentation.reason == encounter.NOWHERE
+    assert held.command.phase == "hold"
+    assert held.command.reason == "implausible_input"
     assert held.motion.world_from_sheet == pytest.approx(before, abs=1e-3)
     after = desk.rest(np.array([0.0, 0.0, 0.049]), 60)
-    assert after.presentation.phase == "contact"
+    assert after.command.phase == "contact"
     desk.assert_bounded()
 
 
@@ -582,7 +587,7 @@ def test_an_inverted_mesh_is_refused() -> None:
 
 @pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
 def test_an_object_that_turns_no_side_to_the_user_is_refused(turn_rad: float) -> None:
-    with pytest.raises(UnpresentableError, match=r"leans .* turn it by object.world_from_object"):
+    with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
         Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
 
 
@@ -591,22 +596,22 @@ def test_a_tilt_beyond_a_right_angle_is_cut() -> None:
     shape = make_shape(SOLIDS["sphere"])
     for lean in (1.3, -1.3):
         met = shown_to(shape, 0.08 * np.array([0.0, math.sin(2 * lean), -0.9]), tilt_rad=3.0)
-        assert angle_between(met.contact.normal, FRONT) <= encounter.STEEPEST_RAD + 1e-9
+        assert angle_between(met.contact.normal, FRONT) <= contact_state.MAX_TILT_RAD + 1e-9
         assert np.isfinite(met.contact.object_from_sheet).all()
 
 
 # Stroking and pushing together
 
 
-def sheet_way_m(planned: list[Planned]) -> float:
+def sheet_way_m(planned: list[PlannedStep]) -> float:
     """How far the contact has gone on the sheet, step by step."""
-    places = np.array([one.presentation.contact.on_sheet for one in planned])
+    places = np.array([one.command.contact.position_sheet_m for one in planned])
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
-def object_way_m(planned: list[Planned]) -> float:
+def object_way_m(planned: list[PlannedStep]) -> float:
     """How far it has gone on the object."""
-    points = np.array([one.presentation.contact.point for one in planned])
+    points = np.array([one.command.contact.point for one in planned])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
@@ -630,7 +635,7 @@ def test_stroking_while_pushing_neither_steps_nor_slips(name: str, deepest_share
     # No slip: what the contact goes on the object it goes on the sheet.
     assert sheet_way_m(sent) == pytest.approx(object_way_m(sent), rel=2e-3, abs=2e-5)
     # No step: the contact moves by no more than a small multiple of what the finger moves.
-    points = np.array([one.presentation.contact.point for one in sent])
+    points = np.array([one.command.contact.point for one in sent])
     moved_m = np.linalg.norm(np.diff(fingers, axis=0), axis=1)
     assert (np.linalg.norm(np.diff(points, axis=0), axis=1) <= 8.0 * moved_m + 1e-5).all()
     desk.assert_bounded()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -22,7 +22,15 @@ from flexsheet.messages.bag import BagReader, BagWriter, recover
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic, UnknownTopicError, topic_named
-from flexsheet.messages.types import Bookmark, Display, Frame, HostStatus, Status
+from flexsheet.messages.types import (
+    Bookmark,
+    Display,
+    Frame,
+    HostStatus,
+    SheetReason,
+    SheetTarget,
+    Status,
+)
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import parameters_of
 
@@ -68,6 +76,18 @@ def test_the_former_key_of_external_topics_gets_an_error_that_names_the_new_one(
         load_graph(file)
 
 
+@pytest.mark.parametrize("old", renamed_keys.VALUES["compliance_mode"])
+def test_an_old_value_of_a_parameter_gets_an_error_that_names_the_new_one(
+    tmp_path: Path, old: str
+) -> None:
+    file = tmp_path / "old.yaml"
+    nodes = {"one": {"type": "planner", "parameters": {"compliance_mode": old}}}
+    YAML().dump({"nodes": nodes}, file)
+    new = renamed_keys.VALUES["compliance_mode"][old]
+    with pytest.raises(BadInputError, match=f'compliance_mode.*it is now "{new}"'):
+        load_graph(file)
+
+
 @pytest.mark.parametrize("old", renamed_keys.VALUES["sheet_shape"])
 def test_an_old_method_in_a_scene_gets_an_error_that_names_the_new_one(
     tmp_path: Path, old: str
@@ -104,6 +124,22 @@ def test_a_recorded_value_of_an_old_name_is_read() -> None:
     assert migration is not None
     assert migration({"pattern": "places_x"}) == {"pattern": "coordinate_ramp_x"}
     assert migration({"pattern": "grid"}) == {"pattern": "grid"}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [*migrations.SHEET_REASONS.items(), ("fingertip: two_markers", "fingertip_invalid"),
+     ("fingertip is 150 ms old", "fingertip_too_old"),
+     ("fingertip is -20 ms old", "fingertip_in_future")],
+)  # fmt: skip
+def test_the_recorded_text_of_a_sheet_target_is_read_as_its_reason(text: str, reason: str) -> None:
+    recorded: dict[str, Any] = SheetTarget.model_json_schema()
+    recorded["properties"]["reason"] = {"type": "string"}
+    migration = migrations.migration_for(SheetTarget, "0" * 16, recorded)
+    assert migration is not None
+    assert reason in get_args(SheetReason)
+    assert migration({"reason": text}) == {"reason": reason}
+    assert migration({"reason": reason}) == {"reason": reason}
 
 
 def test_a_recorded_value_within_a_part_is_read() -> None:

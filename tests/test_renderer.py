@@ -485,7 +485,7 @@ async def test_sheet_is_predicted_to_when_the_light_leaves(bench: Bench) -> None
     await bench.arms(np.eye(4), age_ms=4.0)
     target = SheetTarget(
         phase="contact",
-        reason="",
+        reason="ok",
         valid_at_ns=bench.clock.now_ns(),
         world_from_sheet=np.eye(4),
         twist_world=np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]),

@@ -21,17 +21,17 @@ from flexsheet.nodes.models.shapes import (
     Shape,
     SphereShape,
 )
-from flexsheet.nodes.planner.encounter import BEYOND_SPIN, Encounter, Reach
+from flexsheet.nodes.planner.contact_state import ContactLimits, ContactStateMachine
 from flexsheet.nodes.planner.rolling import (
-    Contact,
-    rim_lift_m,
-    rolled,
+    SheetContact,
+    compute_rim_lift_m,
+    limit_tilt,
+    make_tangent_contact,
+    measure_spin_rad,
+    roll_contact,
     rolling_twist,
-    spin_rad,
-    tangent,
     tangent_twist,
-    turned,
-    within_tilt,
+    transport_axes,
 )
 
 Floats = NDArray[np.float64]
@@ -44,10 +44,10 @@ def unit(vector: tuple[float, float, float] | Floats) -> Floats:
     return np.asarray(vector) / np.linalg.norm(vector)
 
 
-def rolled_along(shape: Shape, start: Floats, points: Floats) -> Contact:
-    contact = tangent(np.eye(3), shape.closest(start), WIDE)
+def rolled_along(shape: Shape, start: Floats, points: Floats) -> SheetContact:
+    contact = make_tangent_contact(np.eye(3), shape.closest(start), WIDE)
     for point in points:
-        contact = rolled(contact, shape.closest(point, previous=contact.point))
+        contact = roll_contact(contact, shape.closest(point, previous=contact.point))
     return contact
 
 
@@ -63,12 +63,12 @@ def great_circle(begin: Floats, end: Floats, count: int) -> Floats:
 def test_axes_are_turned_by_the_least_rotation(
     before: tuple[float, float, float], after: tuple[float, float, float]
 ) -> None:
-    axes = turned(np.eye(3), unit(before)) if unit(before)[2] > -0.99 else np.eye(3)
+    axes = transport_axes(np.eye(3), unit(before)) if unit(before)[2] > -0.99 else np.eye(3)
     normal = unit(after)
     angle = angle_between(axes[:, 2], normal)
     if angle > math.pi - 0.05:
         return
-    there = turned(axes, normal)
+    there = transport_axes(axes, normal)
     assert there.T @ there == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(there) == pytest.approx(1.0)
     assert there[:, 2] == pytest.approx(normal)
@@ -85,11 +85,11 @@ def test_arc_and_way_on_the_sheet_are_equal_on_a_cylinder(steps: int) -> None:
     angles = np.radians(60.0) * np.arange(1, steps + 1) / steps
     path = np.stack([0.0 * angles, np.sin(angles), np.cos(angles)], axis=1) * radius
     contact = rolled_along(shape, radius * FRONT, path)
-    assert contact.on_sheet == pytest.approx([0.0, radius * np.radians(60.0)], abs=1e-5)
+    assert contact.position_sheet_m == pytest.approx([0.0, radius * np.radians(60.0)], abs=1e-5)
     back = contact
     for point in [*path[::-1][1:], radius * FRONT]:
-        back = rolled(back, shape.closest(point))
-    assert back.on_sheet == pytest.approx([0.0, 0.0], abs=1e-9)
+        back = roll_contact(back, shape.closest(point))
+    assert back.position_sheet_m == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_the_way_is_a_straight_line_on_the_unrolled_cylinder() -> None:
@@ -100,8 +100,8 @@ def test_the_way_is_a_straight_line_on_the_unrolled_cylinder() -> None:
     angle = np.radians(40.0) * share
     path = np.stack([0.03 * share, radius * np.sin(angle), radius * np.cos(angle)], axis=1)
     contact = rolled_along(shape, radius * FRONT, path)
-    assert contact.on_sheet == pytest.approx([0.03, radius * np.radians(40.0)], abs=1e-7)
-    assert spin_rad(contact.axes, np.eye(3)) == pytest.approx(0.0, abs=1e-9)
+    assert contact.position_sheet_m == pytest.approx([0.03, radius * np.radians(40.0)], abs=1e-7)
+    assert measure_spin_rad(contact.axes, np.eye(3)) == pytest.approx(0.0, abs=1e-9)
 
 
 @given(
@@ -128,7 +128,7 @@ def test_on_a_sphere_a_closed_triangle_turns_the_sheet_by_its_solid_angle(
 def test_on_a_plane_the_sheet_rests_and_the_finger_goes_over_it() -> None:
     shape = PlaneShape(0.2, 0.2)
     contact = rolled_along(shape, np.zeros(3), np.array([[0.01, 0.0, 0.0], [0.01, 0.02, 0.0]]))
-    assert contact.on_sheet == pytest.approx([0.01, 0.02])
+    assert contact.position_sheet_m == pytest.approx([0.01, 0.02])
     assert contact.object_from_sheet == pytest.approx(np.eye(4))
     assert rolling_twist(contact, np.array([0.1, 0.05, 0.0])) == pytest.approx(np.zeros(6))
 
@@ -145,7 +145,7 @@ SHAPES: list[Shape] = [
 def test_a_rolling_sheet_neither_slips_nor_spins(shape: Shape) -> None:
     """Its point that touches is at rest, and it does not turn about the normal there."""
     start = shape.closest(np.array([0.004, 0.01, 0.2]))
-    contact = tangent(np.eye(3), start, WIDE)
+    contact = make_tangent_contact(np.eye(3), start, WIDE)
     rate = contact.axes[:, :2] @ np.array([0.03, 0.05])
     twist = rolling_twist(contact, rate)
     middle = contact.object_from_sheet[:3, 3]
@@ -157,13 +157,13 @@ def test_a_rolling_sheet_neither_slips_nor_spins(shape: Shape) -> None:
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
 def test_twists_lead_along_the_poses(shape: Shape) -> None:
     start = shape.closest(np.array([0.004, 0.01, 0.2]))
-    ready = tangent(np.eye(3), start, WIDE)
+    ready = make_tangent_contact(np.eye(3), start, WIDE)
     rate = ready.axes[:, :2] @ np.array([0.03, 0.05])
     step_s = 0.004
     later = shape.closest(start.point + step_s * rate, previous=start.point)
     for twist, there in (
-        (tangent_twist(ready, rate, np.eye(3), WIDE), tangent(np.eye(3), later, WIDE)),
-        (rolling_twist(ready, rate), rolled(ready, later)),
+        (tangent_twist(ready, rate, np.eye(3), WIDE), make_tangent_contact(np.eye(3), later, WIDE)),
+        (rolling_twist(ready, rate), roll_contact(ready, later)),
     ):
         ahead = moved(ready.object_from_sheet, twist, step_s)
         assert ahead == pytest.approx(there.object_from_sheet, abs=3e-5)
@@ -180,7 +180,7 @@ def test_what_is_presented_is_within_the_tilt_and_as_far_as_it_goes(
     tilt = math.radians(tilt_deg)
     start = shape.closest(np.array([0.0, 0.0, 0.2]))
     found = shape.closest(0.2 * unit(place), previous=start.point)
-    allowed, limited = within_tilt(shape, start, found, FRONT, tilt)
+    allowed, limited = limit_tilt(shape, start, found, FRONT, tilt)
     leaning = angle_between(allowed.normal, FRONT)
     assert leaning <= tilt + 1e-9
     assert limited == (angle_between(found.normal, FRONT) > tilt)
@@ -188,11 +188,12 @@ def test_what_is_presented_is_within_the_tilt_and_as_far_as_it_goes(
         assert leaning > tilt - math.radians(3.0)
 
 
-def reach(**changes: float) -> Reach:
-    return Reach(
+def limits(**changes: float) -> ContactLimits:
+    return ContactLimits(
         **{
-            "front": FRONT, "tilt_rad": 1.2, "spin_rad": 0.3, "half_width_m": 0.09,
-            "half_height_m": 0.09, "touch_m": 0.0005, "release_m": 0.003, "deepest_m": 0.07,
+            "front": FRONT, "max_tilt_rad": 1.2, "max_spin_rad": 0.3, "half_width_m": 0.09,
+            "half_height_m": 0.09, "contact_on_m": 0.0005, "contact_off_m": 0.003,
+            "max_depth_m": 0.07,
             **changes,
         }  # type: ignore[arg-type]  # one dictionary of both kinds of value
     )  # fmt: skip
@@ -201,7 +202,7 @@ def reach(**changes: float) -> Reach:
 def test_the_sheet_is_not_turned_too_far_and_is_free_again_after_a_lift() -> None:
     """Round and round on a sphere's cap rolling turns the sheet; arms cannot."""
     radius = 0.05
-    encounter = Encounter(SphereShape(radius), np.eye(3), reach())
+    encounter = ContactStateMachine(SphereShape(radius), np.eye(3), limits())
     reasons = set()
     for turn in np.linspace(0.0, 6.0 * np.pi, 700):
         lean = min(0.6, turn)
@@ -210,23 +211,23 @@ def test_the_sheet_is_not_turned_too_far_and_is_free_again_after_a_lift() -> Non
             (radius - 0.001) * place, np.zeros(3), encounter.contact.object_from_sheet
         )
         reasons.add(shown.reason)
-        assert abs(spin_rad(shown.contact.axes, np.eye(3))) <= 0.3 + 1e-9
-    assert BEYOND_SPIN in reasons
+        assert abs(measure_spin_rad(shown.contact.axes, np.eye(3))) <= 0.3 + 1e-9
+    assert "beyond_spin" in reasons
     lifted = encounter.step(
         (radius + 0.02) * place, np.zeros(3), encounter.contact.object_from_sheet
     )
     assert lifted.phase == "approach"
-    assert spin_rad(lifted.contact.axes, np.eye(3)) == pytest.approx(0.0, abs=1e-9)
+    assert measure_spin_rad(lifted.contact.axes, np.eye(3)) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_convex_object_needs_no_lift() -> None:
     for shape in SHAPES:
-        contact = tangent(np.eye(3), shape.closest(np.array([0.0, 0.01, 0.2])), WIDE)
-        assert rim_lift_m(shape, contact) < 1e-9
+        contact = make_tangent_contact(np.eye(3), shape.closest(np.array([0.0, 0.01, 0.2])), WIDE)
+        assert compute_rim_lift_m(shape, contact) < 1e-9
 
 
 class Bowl(Convex):
-    """What `rim_lift_m` asks of a shape: here, one that is hollow all around."""
+    """What `compute_rim_lift_m` asks of a shape: here, one that is hollow all around."""
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         return 0.002 * radius_m / 0.03
@@ -234,8 +235,8 @@ class Bowl(Convex):
 
 def test_over_a_hollow_the_sheet_stands_off_by_the_rim_and_depth_counts_from_there() -> None:
     bottom = np.array([0.0, 0.0, -0.06])
-    contact = Contact(bottom, FRONT, -np.diag([1.0, 1.0, 0.0]) / 0.06, np.eye(3), np.zeros(2))
-    lift = rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for its rise only
+    contact = SheetContact(bottom, FRONT, -np.diag([1.0, 1.0, 0.0]) / 0.06, np.eye(3), np.zeros(2))
+    lift = compute_rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for its rise only
     assert lift == pytest.approx(0.002)
     lifted = replace(contact, lift_m=lift)
     assert lifted.object_from_sheet[:3, 3] == pytest.approx([0.0, 0.0, -0.058])

@@ -17,7 +17,6 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.rigid import angle_between, apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import make_shape
-from flexsheet.nodes.planner.encounter import BEYOND_SPIN
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 from flexsheet.nodes.twin.gestures import GESTURES
@@ -162,9 +161,9 @@ def test_the_planner_follows_gestures_on_every_scene(name: str, gesture: str) ->
         apply(object_from_world, np.array([motion.at(float(time_s))[0] for time_s in times]))
     ).height_m
     touching = [one for one, height in zip(sent, below, strict=True) if height < -2e-4][10:]
-    shown = [one.presentation for one in touching]
+    shown = [one.command for one in touching]
     held = {one.reason for one in shown if one.phase != "contact"}
-    assert held <= ({BEYOND_SPIN} if gesture == "circle" and name in ROUND else set())
+    assert held <= ({"beyond_spin"} if gesture == "circle" and name in ROUND else set())
     first_held = next((i for i, one in enumerate(shown) if one.phase != "contact"), len(touching))
     off = [
         angle_between(one.motion.world_from_sheet[:3, 2], one.normal_world)

@@ -351,7 +351,7 @@ OTHERS = ("stroker", "arm_left_bridge", "tools", "", "planner ", "PLANNER", "pla
 def target() -> SheetTarget:
     return SheetTarget(
         phase="contact",
-        reason="",
+        reason="ok",
         valid_at_ns=5,
         world_from_sheet=np.eye(4),
         twist_world=np.zeros(6),

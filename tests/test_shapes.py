@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
 from flexsheet.nodes.models.shapes import (
-    SHAPES,
+    GEOMETRIES,
     CylinderShape,
     EllipsoidShape,
     Nearest,
@@ -301,7 +301,7 @@ def test_shapes_are_made_by_name() -> None:
     assert made == CYLINDER
     with pytest.raises(KeyError):
         make_shape({"shape": "torus"})
-    assert set(SHAPES) == {"cylinder", "sphere", "plane", "ellipsoid", "rounded_box", "mesh"}
+    assert set(GEOMETRIES) == {"cylinder", "sphere", "plane", "ellipsoid", "rounded_box", "mesh"}
 
 
 @given(st.floats(-3.0, 3.0))

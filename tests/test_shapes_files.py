@@ -17,7 +17,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.wire import decode, encode
-from flexsheet.nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape, make_shape
+from flexsheet.nodes.models.shapes import GEOMETRIES, MeshError, SmoothMeshShape, make_shape
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
@@ -96,7 +96,7 @@ def test_the_largest_mesh_fits_the_scene_topic() -> None:
 def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[str, Any]) -> None:
     scene = load_scene(scene_file(tmp_path, geometry))
     shape = make_shape(dict(scene.object.geometry))
-    assert type(shape) is SHAPES[geometry["shape"]]
+    assert type(shape) is GEOMETRIES[geometry["shape"]].make_shape
     again = decode(encode(scene, HEADER), Scene)[0]
     assert make_shape(dict(again.object.geometry)) == shape
 

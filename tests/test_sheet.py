@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexsheet.nodes.arm_bridge.limiter import SheetLimits
 from flexsheet.nodes.models.rigid import is_rigid, rotation_from_rpy, transform, transform_from_rpy
 from flexsheet.nodes.models.sheet import (
     corners,
@@ -18,8 +19,10 @@ from flexsheet.nodes.models.sheet import (
     sheet_from_edges,
     stretch_for_edge_force,
 )
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
-PAPER = {"young_modulus_pa": 1e6, "height_m": 0.24, "thickness_m": 0.001}
+PAPER = {"young_modulus_pa": 1e6, "width_m": 0.24, "height_m": 0.24, "thickness_m": 0.001}
 
 angles = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 places = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
@@ -30,6 +33,25 @@ places = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0
 )
 def test_edge_force_agrees_with_membrane_elements(stretch: float, force: float) -> None:
     assert edge_force_n(stretch, **PAPER) == pytest.approx(force, rel=0.02)
+
+
+@pytest.mark.parametrize("height_m", [0.15, 0.24, 0.33])
+def test_the_arms_limit_and_the_planners_model_give_the_same_edge_force(height_m: float) -> None:
+    limits = SheetLimits(
+        width_m=0.24,
+        height_m=height_m,
+        thickness_m=0.001,
+        young_modulus_pa=1e6,
+        longest_m=0.3,
+        max_edge_force_n=20.0,
+        max_twist_rad=0.1,
+        min_flange_distance_m=0.1,
+        workspace_min_m=np.full(3, -1.0),
+        workspace_max_m=np.ones(3),
+    )
+    model = ScaledSheetModel(Rubber(0.24, height_m, 0.001, 1e6))
+    flat = model.evaluate(1.05, np.zeros(1), position_m=(0.0, 0.0), finger_radius_m=0.007)
+    assert limits.force_n(1.05 * 0.24) == pytest.approx(float(flat.edge_force_n[0]), rel=1e-12)
 
 
 def test_a_slack_sheet_pulls_at_nothing() -> None:

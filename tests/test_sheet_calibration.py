@@ -33,11 +33,11 @@ from flexsheet.messages.sheet_calibration import (
 )
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, make_model
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-from flexsheet.nodes.planner.sheet_force import law_for, rubber_of
+from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)
-NOMINAL = rubber_of(SCENE.sheet)
+NOMINAL = make_rubber(SCENE.sheet)
 RADIUS = 0.007
 
 
@@ -54,7 +54,7 @@ def pushes_of(
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:
-        pressed = law.evaluate(stretch, np.array(depths), place_m=CENTRE, finger_radius_m=RADIUS)
+        pressed = law.evaluate(stretch, np.array(depths), position_m=CENTRE, finger_radius_m=RADIUS)
         for depth, force, pull in zip(depths, pressed.force_n, pressed.edge_force_n, strict=True):
             pushes.append(
                 MeasuredPush(
@@ -159,7 +159,7 @@ def test_a_table_keeps_what_the_law_leaves() -> None:
     for push in rows:
         stretch = push.edge_distance_m / NOMINAL.width_m
         pressed = table.evaluate(
-            stretch, np.array([push.depth_m]), place_m=CENTRE, finger_radius_m=RADIUS
+            stretch, np.array([push.depth_m]), position_m=CENTRE, finger_radius_m=RADIUS
         )
         assert pressed.force_n[0] == pytest.approx(push.force_n, rel=0.02)
 
@@ -167,7 +167,7 @@ def test_a_table_keeps_what_the_law_leaves() -> None:
 def test_a_table_needs_all_combinations() -> None:
     rows = pushes_of(ScaledSheetModel(NOMINAL))
     moved = MeasuredPush(
-        rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, place_m=(0.03, 0.0)
+        rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, position_m=(0.03, 0.0)
     )
     used = np.ones(len(rows) + 1, dtype=bool)
     with pytest.raises(SheetModelFitError, match="every combination"):
@@ -192,7 +192,7 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
     rows, lines = read_rows(file, SCENE.sheet, RADIUS)
     assert lines == [3, 4, 6]
     assert rows[0] == MeasuredPush(pytest.approx(0.2448), 0.005, 0.09, 0.007, edge_force_n=5.1)  # type: ignore[arg-type]  # compares as a float
-    assert rows[1].place_m == pytest.approx((0.0, -0.012))
+    assert rows[1].position_m == pytest.approx((0.0, -0.012))
     assert rows[1].edge_force_n is None
     assert rows[2].finger_radius_m == pytest.approx(0.008)
 
@@ -250,11 +250,13 @@ def test_the_twin_is_known_by_its_pushes(twin_calibration: SheetCalibration) -> 
     assert found.slack_width_m.value == pytest.approx(0.24, abs=0.0006)
     assert found.cubic_ratio.value == pytest.approx(1.0, abs=0.2)
     assert found.residual_rms_ratio < 0.07
-    law = law_for(SCENE.sheet, found)
+    law = make_force_model(SCENE.sheet, found)
     assert isinstance(law, TabulatedSheetModel)
     for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
         true = twin_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
-        pressed = law.evaluate(stretch, np.array([depth]), place_m=CENTRE, finger_radius_m=RADIUS)
+        pressed = law.evaluate(
+            stretch, np.array([depth]), position_m=CENTRE, finger_radius_m=RADIUS
+        )
         assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
 
 
@@ -263,10 +265,10 @@ def test_the_file_gives_back_the_law(twin_calibration: SheetCalibration, tmp_pat
     save_sheet_calibration(twin_calibration, file, comment="made so")
     assert file.read_text().splitlines()[1] == "# made so"
     again = load_sheet_calibration(file)
-    one, two = law_for(SCENE.sheet, twin_calibration), law_for(SCENE.sheet, again)
+    one, two = make_force_model(SCENE.sheet, twin_calibration), make_force_model(SCENE.sheet, again)
     depths = np.linspace(0.001, 0.04, 9)
     answers = [
-        law.evaluate(1.037, depths, place_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
+        law.evaluate(1.037, depths, position_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
         for law in (one, two)
     ]
     assert np.array_equal(answers[0], answers[1])
@@ -304,7 +306,7 @@ def test_a_foreign_file_is_refused(tmp_path: Path, content: str) -> None:
 def test_another_sheets_calibration_is_refused(twin_calibration: SheetCalibration) -> None:
     other = SCENE.sheet.model_copy(update={"width_m": 0.3})
     with pytest.raises(CalibrationMismatchError, match=r"width_m 0\.24, the scene"):
-        law_for(other, twin_calibration)
+        make_force_model(other, twin_calibration)
 
 
 def test_the_command_fits_rows_and_tells(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
     LinearSheetModel,
     MembraneSheetModel,
-    Place,
     ScaledSheetModel,
     SheetForceModel,
+    SheetPosition,
     depth_for_force,
     flat_edge_force_n,
     interpolated_inverse,
@@ -47,19 +47,19 @@ def force(
     law: SheetForceModel,
     stretch: float,
     depth: float,
-    place: Place = CENTRE,
+    place: SheetPosition = CENTRE,
     radius: float = RADIUS,
 ) -> float:
-    pressed = law.evaluate(stretch, np.array([depth]), place_m=place, finger_radius_m=radius)
+    pressed = law.evaluate(stretch, np.array([depth]), position_m=place, finger_radius_m=radius)
     return float(pressed.force_n[0])
 
 
-def true_push(stretch: float, depth: float, place: Place = CENTRE) -> tuple[float, float]:
+def true_push(stretch: float, depth: float, place: SheetPosition = CENTRE) -> tuple[float, float]:
     """Force and edge force by the twin, on a mesh that is good to 1.5 % and quick."""
     return twin_push(SHEET, stretch, depth, place, RADIUS, cells=24)
 
 
-CASES: tuple[tuple[float, float, Place], ...] = (
+CASES: tuple[tuple[float, float, SheetPosition], ...] = (
     (1.0, 0.020, CENTRE),
     (1.02, 0.006, CENTRE),
     (1.04, 0.010, CENTRE),
@@ -82,7 +82,7 @@ def test_within_its_range_a_law_is_as_exact_as_it_says(
 ) -> None:
     judged = 0
     for (stretch, depth, place), true in zip(CASES, true_forces, strict=True):
-        if law.invalid_reason(stretch, depth, place_m=place, finger_radius_m=RADIUS):
+        if law.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS):
             continue
         judged += 1
         assert force(law, stretch, depth, place) == pytest.approx(float(true), rel=bound)
@@ -94,7 +94,7 @@ def test_outside_its_range_the_linear_law_is_wrong_and_says_so() -> None:
     for stretch, depth in ((1.04, 0.002), (1.04, 0.040), (1.0, 0.020)):
         true = true_push(stretch, depth)[0]
         assert abs(force(law, stretch, depth) / true - 1.0) > 0.5
-        assert law.invalid_reason(stretch, depth, place_m=CENTRE, finger_radius_m=RADIUS)
+        assert law.invalid_reason(stretch, depth, position_m=CENTRE, finger_radius_m=RADIUS)
 
 
 @pytest.mark.parametrize(
@@ -110,24 +110,26 @@ def test_outside_its_range_the_linear_law_is_wrong_and_says_so() -> None:
     ],
 )
 def test_the_scaled_law_says_where_it_ends(
-    stretch: float, depth: float, place: Place, radius: float
+    stretch: float, depth: float, place: SheetPosition, radius: float
 ) -> None:
     law = ScaledSheetModel(RUBBER)
-    assert law.invalid_reason(stretch, depth, place_m=place, finger_radius_m=radius)
+    assert law.invalid_reason(stretch, depth, position_m=place, finger_radius_m=radius)
     assert np.isfinite(force(law, stretch, depth, place, radius))
 
 
 def test_a_sheet_of_another_form_is_outside() -> None:
     tall = Rubber(0.24, 0.36, 0.001, 1e6)
     for law in (LinearSheetModel(tall), ScaledSheetModel(tall)):
-        assert "square" in law.invalid_reason(1.05, 0.012, place_m=CENTRE, finger_radius_m=RADIUS)
+        assert "square" in law.invalid_reason(
+            1.05, 0.012, position_m=CENTRE, finger_radius_m=RADIUS
+        )
 
 
 def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
     law = ScaledSheetModel(RUBBER)
     assert force(law, 1.0, 0.02) == pytest.approx(8.0 * force(law, 1.0, 0.01), rel=1e-9)
     path = MembraneSheetModel(RUBBER, cells=20).evaluate(
-        1.0, np.array([0.01, 0.02]), place_m=CENTRE, finger_radius_m=RADIUS
+        1.0, np.array([0.01, 0.02]), position_m=CENTRE, finger_radius_m=RADIUS
     )
     assert path.force_n[1] / path.force_n[0] == pytest.approx(8.0, rel=0.06)
     true = [true_push(1.0, depth)[0] for depth in (0.01, 0.02)]
@@ -138,7 +140,9 @@ def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
 def test_the_pushed_sheet_pulls_harder_at_its_clamps(stretch: float) -> None:
     law = ScaledSheetModel(RUBBER)
     flat, pulled = (true_push(stretch, depth)[1] for depth in (1e-4, 0.04))
-    pressed = law.evaluate(stretch, np.array([0.0, 0.04]), place_m=CENTRE, finger_radius_m=RADIUS)
+    pressed = law.evaluate(
+        stretch, np.array([0.0, 0.04]), position_m=CENTRE, finger_radius_m=RADIUS
+    )
     assert pressed.edge_force_n == pytest.approx([flat, pulled], rel=0.03)
     assert pulled > flat + 2.0
 
@@ -148,10 +152,10 @@ places = st.tuples(st.floats(-0.06, 0.06), st.floats(-0.09, 0.09))
 
 @given(st.floats(1.0, 1.13), places, st.floats(0.005, 0.01), st.sampled_from(SIMPLE))
 def test_force_and_slope_rise_and_agree(
-    stretch: float, place: Place, radius: float, law: SheetForceModel
+    stretch: float, place: SheetPosition, radius: float, law: SheetForceModel
 ) -> None:
     depths = np.linspace(0.002, 0.05, 200)
-    pressed = law.evaluate(stretch, depths, place_m=place, finger_radius_m=radius)
+    pressed = law.evaluate(stretch, depths, position_m=place, finger_radius_m=radius)
     assert (np.diff(pressed.force_n) >= 0.0).all()
     assert (np.diff(pressed.edge_force_n) >= 0.0).all()
     middle = 0.5 * (pressed.stiffness_n_per_m[1:] + pressed.stiffness_n_per_m[:-1])
@@ -173,7 +177,7 @@ def test_modulus_and_thickness_scale_the_force_and_the_size_scales_out(
 
 
 @given(places, st.floats(1.0, 1.13))
-def test_left_is_as_right_and_up_as_down(place: Place, stretch: float) -> None:
+def test_left_is_as_right_and_up_as_down(place: SheetPosition, stretch: float) -> None:
     for law in SIMPLE:
         there = force(law, stretch, 0.01, (-place[0], -place[1]))
         assert force(law, stretch, 0.01, place) == pytest.approx(there)
@@ -192,11 +196,13 @@ def test_no_depth_presses_nothing_and_what_is_not_finite_is_refused(law: SheetFo
 
 @settings(max_examples=30)
 @given(st.floats(1.0, 1.13), places, st.sampled_from(SIMPLE[1:]))
-def test_depth_for_force_is_the_inverse(stretch: float, place: Place, law: SheetForceModel) -> None:
+def test_depth_for_force_is_the_inverse(
+    stretch: float, place: SheetPosition, law: SheetForceModel
+) -> None:
     depths = np.array([0.0, 1e-4, 0.002, 0.011, 0.03, 0.049])
-    asked = law.evaluate(stretch, depths, place_m=place, finger_radius_m=RADIUS).force_n
+    asked = law.evaluate(stretch, depths, position_m=place, finger_radius_m=RADIUS).force_n
     found = depth_for_force(
-        law, stretch, asked, deepest_m=0.05, place_m=place, finger_radius_m=RADIUS
+        law, stretch, asked, max_depth_m=0.05, position_m=place, finger_radius_m=RADIUS
     )
     assert found == pytest.approx(depths, rel=2e-3)
 
@@ -212,8 +218,8 @@ def test_an_inverse_ends_where_its_grid_does() -> None:
 def test_a_table_gives_back_its_entries_and_takes_over_the_law_between() -> None:
     base = ScaledSheetModel(RUBBER)
 
-    def measured(stretch: float, depths: Floats, place: Place) -> Floats:
-        pressed = base.evaluate(stretch, depths, place_m=place, finger_radius_m=RADIUS)
+    def measured(stretch: float, depths: Floats, place: SheetPosition) -> Floats:
+        pressed = base.evaluate(stretch, depths, position_m=place, finger_radius_m=RADIUS)
         wave = 1.0 + 0.1 * np.sin(100.0 * depths) + place[0] - 0.5 * place[1] + stretch - 1.0
         result: Floats = pressed.force_n * wave
         return result
@@ -233,9 +239,9 @@ def test_a_table_gives_back_its_entries_and_takes_over_the_law_between() -> None
     for stretch, depth, place in ((1.05, 0.002, (0.03, 0.0)), (1.035, 0.017, (-0.04, 0.05))):
         true = measured(stretch, np.array([depth]), (abs(place[0]), abs(place[1])))[0]
         assert force(table, stretch, depth, place) == pytest.approx(true, rel=2e-3)
-        assert not table.invalid_reason(stretch, depth, place_m=place, finger_radius_m=RADIUS)
+        assert not table.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS)
     depths = np.linspace(0.001, 0.06, 400)
-    pressed = table.evaluate(1.04, depths, place_m=(0.01, 0.02), finger_radius_m=RADIUS)
+    pressed = table.evaluate(1.04, depths, position_m=(0.01, 0.02), finger_radius_m=RADIUS)
     middle = 0.5 * (pressed.stiffness_n_per_m[1:] + pressed.stiffness_n_per_m[:-1])
     slope = np.diff(pressed.force_n) / np.diff(depths)
     assert np.abs(slope / middle - 1.0).max() < 0.05
@@ -245,7 +251,7 @@ def test_a_table_gives_back_its_entries_and_takes_over_the_law_between() -> None
         (1.05, 0.01, (0.07, 0.0)),
         (1.05, 0.01, (0.0, 0.1)),
     ):
-        assert table.invalid_reason(stretch, depth, place_m=place, finger_radius_m=RADIUS)
+        assert table.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS)
         assert np.isfinite(force(table, stretch, depth, place))
 
 
@@ -295,7 +301,7 @@ def test_the_curve_has_no_kink() -> None:
     depths = np.geomspace(0.001, 0.06, 2000)
     slopes = (
         ScaledSheetModel(RUBBER)
-        .evaluate(1.05, depths, place_m=CENTRE, finger_radius_m=RADIUS)
+        .evaluate(1.05, depths, position_m=CENTRE, finger_radius_m=RADIUS)
         .stiffness_n_per_m
     )
     assert all(abs(after / before - 1.0) < 0.01 for before, after in pairwise(slopes))

@@ -43,7 +43,7 @@ RADIUS = 0.007
 def test_it_agrees_with_the_twins_elements(stretch: float, place: tuple[float, float]) -> None:
     depths = np.array([0.005, 0.020])
     path = push_path(
-        RUBBER, stretch_ratio=stretch, depths_m=depths, place_m=place, finger_radius_m=RADIUS
+        RUBBER, stretch_ratio=stretch, depths_m=depths, position_m=place, finger_radius_m=RADIUS
     )
     true = [twin_push(SHEET, stretch, float(depth), place, RADIUS, cells=24) for depth in depths]
     assert path.forces_n == pytest.approx([one[0] for one in true], rel=0.04)
@@ -52,7 +52,7 @@ def test_it_agrees_with_the_twins_elements(stretch: float, place: tuple[float, f
 
 def test_a_push_leaves_the_finger_where_it_is_and_the_clamps_where_they_are() -> None:
     path = push_path(
-        RUBBER, stretch_ratio=1.05, depths_m=[0.03], place_m=(0.02, 0.03), finger_radius_m=RADIUS
+        RUBBER, stretch_ratio=1.05, depths_m=[0.03], position_m=(0.02, 0.03), finger_radius_m=RADIUS
     )
     sheet = path.positions[0]
     assert sheet[..., 2].min() == pytest.approx(-0.03, abs=1e-4)
@@ -105,15 +105,15 @@ def test_near_the_free_edge_and_the_clamp_there_is_an_answer() -> None:
             RUBBER,
             stretch_ratio=1.05,
             depths_m=[0.01, 0.03],
-            place_m=place,
+            position_m=place,
             finger_radius_m=RADIUS,
             cells=20,
         )
         assert 0.0 < path.forces_n[0] < path.forces_n[1]
     law = MembraneSheetModel(RUBBER)
-    assert law.invalid_reason(1.05, 0.02, place_m=(0.0, 0.112), finger_radius_m=RADIUS)
-    assert law.invalid_reason(1.05, 0.001, place_m=(0.0, 0.0), finger_radius_m=RADIUS)
-    assert not law.invalid_reason(1.05, 0.02, place_m=(0.05, 0.05), finger_radius_m=RADIUS)
+    assert law.invalid_reason(1.05, 0.02, position_m=(0.0, 0.112), finger_radius_m=RADIUS)
+    assert law.invalid_reason(1.05, 0.001, position_m=(0.0, 0.0), finger_radius_m=RADIUS)
+    assert not law.invalid_reason(1.05, 0.02, position_m=(0.05, 0.05), finger_radius_m=RADIUS)
 
 
 def test_mooneys_rubber_softens_when_stretched() -> None:
@@ -137,7 +137,7 @@ def test_mooneys_rubber_softens_when_stretched() -> None:
         ({"depths_m": [0.02, 0.01]}, "ascend"),
         ({"depths_m": [-0.01]}, "ascend"),
         ({"depths_m": [np.nan]}, "ascend"),
-        ({"place_m": (0.13, 0.0)}, "not on the sheet"),
+        ({"position_m": (0.13, 0.0)}, "not on the sheet"),
         ({"stretch_ratio": 0.0}, "above zero"),
         ({"stretch_ratio": np.nan}, "above zero"),
         ({"finger_radius_m": -1.0}, "above zero"),

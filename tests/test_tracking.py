@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
-from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter, Kalman, Tremor
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
@@ -235,7 +235,7 @@ def test_tremor_dies_out_when_nothing_keeps_it_up() -> None:
 )
 def test_an_even_path_is_met_everywhere(lead_s: float, velocity: float) -> None:
     path = np.array([0.1, 0.0, 0.0]) + velocity * 0.01 * np.arange(13)[:, None]
-    position, speed = path_at(path, 0.01, lead_s)
+    position, speed = interpolate_path(path, 0.01, lead_s)
     assert position == pytest.approx(np.array([0.1, 0.0, 0.0]) + velocity * lead_s, abs=1e-12)
     assert speed == pytest.approx(np.full(3, velocity), abs=1e-9)
 
@@ -244,14 +244,14 @@ def test_a_swing_is_met_between_the_points() -> None:
     times = 0.01 * np.arange(13)
     path = np.column_stack([np.sin(2 * np.pi * 10 * times)] * 3)
     for lead_s in np.linspace(0.0, 0.12, 100):
-        assert path_at(path, 0.01, lead_s)[0][0] == pytest.approx(
+        assert interpolate_path(path, 0.01, lead_s)[0][0] == pytest.approx(
             np.sin(2 * np.pi * 10 * lead_s), abs=0.02
         )
 
 
 def test_a_path_of_one_point_is_refused() -> None:
     with pytest.raises(ValueError, match="two are needed"):
-        path_at(np.zeros((1, 3)), 0.01, 0.0)
+        interpolate_path(np.zeros((1, 3)), 0.01, 0.0)
 
 
 # The gate

@@ -33,7 +33,7 @@ from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
-from flexsheet.nodes.planner.force_table import law_by
+from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
@@ -474,10 +474,10 @@ SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
 
 
 def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_path: Path) -> None:
-    law, told = law_by(SCENE, "table", tmp_path)
+    law, told = load_force_model(SCENE, "table", tmp_path)
     assert law.name == "scaled"
     assert "flexsheet precompute" in told
-    assert law_by(SCENE, "linear", tmp_path)[0].name == "linear"
+    assert load_force_model(SCENE, "linear", tmp_path)[0].name == "linear"
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.2, False), (3.9, False), (4.1, True), (40.0, True)])

@@ -41,7 +41,7 @@ class SheetModelFitError(FlexsheetError, ValueError):
 class MeasuredPush:
     """Hold one measured push.
 
-    place_m: on the stretched sheet.
+    position_m: on the stretched sheet.
     edge_force_n: None if not measured.
     """
 
@@ -49,7 +49,7 @@ class MeasuredPush:
     depth_m: float
     force_n: float
     finger_radius_m: float
-    place_m: tuple[float, float] = (0.0, 0.0)
+    position_m: tuple[float, float] = (0.0, 0.0)
     edge_force_n: float | None = None
 
 
@@ -173,11 +173,11 @@ def _predict(
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
-        key = (push.edge_distance_m, push.place_m, push.finger_radius_m)
+        key = (push.edge_distance_m, push.position_m, push.finger_radius_m)
         groups.setdefault(key, []).append(number)
     for (distance, place, radius), numbers in groups.items():
         depths = np.array([pushes[number].depth_m for number in numbers])
-        pressed = law.evaluate(distance / width_m, depths, place_m=place, finger_radius_m=radius)
+        pressed = law.evaluate(distance / width_m, depths, position_m=place, finger_radius_m=radius)
         forces[numbers], edges[numbers] = pressed.force_n, pressed.edge_force_n
     return forces, edges
 
@@ -226,8 +226,8 @@ def tabulate_pushes(
     for push, ratio, good in zip(pushes, ratios, used, strict=True):
         key = (
             round(push.edge_distance_m / nominal_width_m, 4),
-            round(abs(push.place_m[0]), 4),
-            round(abs(push.place_m[1]), 4),
+            round(abs(push.position_m[0]), 4),
+            round(abs(push.position_m[1]), 4),
         )
         if good and push.force_n > 3.0 * FORCE_NOISE_N:
             cells.setdefault(key, []).append((push.depth_m, float(ratio)))

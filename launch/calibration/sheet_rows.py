@@ -160,7 +160,7 @@ def _push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: float) ->
         depth_m=1e-3 * values["depth_mm"],
         force_n=values["force_n"],
         finger_radius_m=1e-3 * values.get("finger_radius_mm", 1e3 * finger_radius_m),
-        place_m=(1e-3 * values.get("x_mm", 0.0), 1e-3 * values.get("y_mm", 0.0)),
+        position_m=(1e-3 * values.get("x_mm", 0.0), 1e-3 * values.get("y_mm", 0.0)),
         edge_force_n=values.get("edge_force_n"),
     )
 
@@ -194,7 +194,7 @@ def simulate_rows(
                 depth_m=depth,
                 force_n=force + float(rng.normal(0.0, noise_n)),
                 finger_radius_m=scene.finger.radius_m,
-                place_m=place,
+                position_m=place,
                 edge_force_n=pull + float(rng.normal(0.0, 10.0 * noise_n)),
             )
         )

@@ -122,9 +122,9 @@ def fitted(
         SheetCalibration,
         SheetTable,
     )
-    from flexsheet.nodes.planner.sheet_force import rubber_of
+    from flexsheet.nodes.planner.sheet_force import make_rubber
 
-    fit = fit_sheet_model(pushes, rubber_of(scene.sheet), with_mooney=with_mooney)
+    fit = fit_sheet_model(pushes, make_rubber(scene.sheet), with_mooney=with_mooney)
     numbers = {
         name: Fitted(value=value, standard_deviation=deviation)
         for name, value, deviation in zip(

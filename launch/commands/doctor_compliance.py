@@ -52,11 +52,11 @@ def compliance(
     from flexsheet.messages.scene import UnfitGeometryError
     from flexsheet.messages.sheet_calibration import load_sheet_calibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
-    from flexsheet.nodes.planner.sheet_force import law_for
+    from flexsheet.nodes.planner.sheet_force import make_force_model
 
     scene = load_scene(scene_file)
     try:
-        law = law_for(
+        law = make_force_model(
             scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
         )
         with words.status("working out the soft body"):

@@ -151,12 +151,15 @@ def push(
     """Errors of the picture on a pushed sheet (section VI-C, Fig. 13).
 
     As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
-    all of the push.  `--set planner.presents=curve` has it yield.
+    all of the push.  `--set planner.compliance_mode=force_curve` has it comply.
     """
     from flexsheet.launch.experiments.image import pushed_at
     from flexsheet.launch.experiments.run import settings_of_type
 
-    settings = [*settings_of_type(launch_file, "planner", "presents=stretch"), *(settings or ())]
+    settings = [
+        *settings_of_type(launch_file, "planner", "compliance_mode=stiffness"),
+        *(settings or ()),
+    ]
     bag, series = result_folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
     _photograph(series, bag, launch_file, settings, map_file=map_file, as_json=as_json)
 

@@ -38,7 +38,7 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
         "flexsheet launch launch/demo.yaml",
         "flexsheet launch launch/demo.yaml --console --record session.mcap",
         "flexsheet launch lab.yaml --host arm_left",
-        "flexsheet launch launch/demo.yaml --set planner.lead_s=0.02 --dry-run",
+        "flexsheet launch launch/demo.yaml --set planner.prediction_horizon_s=0.02 --dry-run",
     )
 )
 def launch(

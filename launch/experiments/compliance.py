@@ -26,7 +26,12 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import transform_from_rpy
-from flexsheet.nodes.planner.compliance import FELT_N, GOOD_RATIO, WEBER_RATIO, WEBER_RATIO_BARE
+from flexsheet.nodes.planner.compliance import (
+    FORCE_JND_FLOOR_N,
+    TARGET_ERROR_RATIO,
+    WEBER_RATIO,
+    WEBER_RATIO_BARE,
+)
 from flexsheet.nodes.twin.membrane import Rubber, solve
 from flexsheet.nodes.twin.paths import map_to_surface
 
@@ -62,10 +67,12 @@ class Hold:
 class Press:
     """Hold one path of the finger with its intervals at rest; empty for the moving press.
 
-    surface, normal: (3,) of the undeformed object at the pushed position, in the world.
+    place: name of the pushed position.  surface, normal: (3,) of the undeformed object there, in
+    the world.
     """
 
     path: FingerPath
+    place: str
     surface: Floats
     normal: Floats
     holds: tuple[Hold, ...]
@@ -87,9 +94,9 @@ def _make_held_press(scene: Scene, along_m: float, around_m: float, depths: Floa
         holds.append(Hold(float(depth), begin_s + HOLD_S - EVALUATED_S, begin_s + HOLD_S))
     times.append(times[-1] + (HOVER_M - heights[-1]) / PUSH_M_PER_S)
     heights.append(HOVER_M)
-    label = f"press at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
+    place = f"at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
     way = np.column_stack([times, heights])
-    return _make_press(scene, label, (along_m, around_m), way, tuple(holds))
+    return _make_press(scene, place, (along_m, around_m), way, tuple(holds))
 
 
 def _make_moving_press(scene: Scene, deepest_m: float) -> Press:
@@ -100,19 +107,19 @@ def _make_moving_press(scene: Scene, deepest_m: float) -> Press:
 
 
 def _make_press(
-    scene: Scene, label: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
+    scene: Scene, place: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
 ) -> Press:
     """Make a press; way: times (s) and heights above the surface (m), (n, 2)."""
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
-        label=label,
+        label=f"press {place}" if holds else place,
         times_s=np.ascontiguousarray(way[:, 0]),
         positions_world_m=surface + np.outer(way[:, 1], normal),
         wander_m=0.0,
         tremor_m=0.0,
     )
-    return Press(path, surface, normal, holds)
+    return Press(path, place, surface, normal, holds)
 
 
 def compliance_procedure(progress: Progress) -> Procedure:
@@ -185,12 +192,12 @@ class PresentedForce:
     depth_m: float
     wanted_n: float
     presented_n: float
-    retreat_m: float
+    normal_offset_m: float
 
     @property
     def error_ratio(self) -> float:
         """Return the relative error; desired forces below the JND floor count as that floor."""
-        return (self.presented_n - self.wanted_n) / max(self.wanted_n, FELT_N)
+        return (self.presented_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
 
 
 class ForceReference:
@@ -229,7 +236,7 @@ class ForceReference:
             depth_m=depth_m,
             wanted_n=self._wanted_n(at_ns, depth_m),
             presented_n=float(pressed.finger_force_n @ press.normal),
-            retreat_m=float((press.surface - middle) @ press.normal),
+            normal_offset_m=float((press.surface - middle) @ press.normal),
         )
 
     def _wanted_n(self, at_ns: int, depth_m: float) -> float:
@@ -258,7 +265,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         begin_ns, end_ns = recorded.windows_ns[label]
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, HELD_SAMPLES) * 1e9)
-            held.append(_row(label, hold, [reference.evaluate(int(at), press) for at in times]))
+            held.append(_row(press, hold, [reference.evaluate(int(at), press) for at in times]))
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
     errors = np.array([row["error_percent"] for row in held])
@@ -266,7 +273,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     return {
         "rows": held,
         "worst_percent": float(np.abs(errors).max()),
-        "aimed_percent": 100.0 * GOOD_RATIO,
+        "aimed_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {
             "speed_mm_per_s": 1e3 * PUSH_M_PER_S,
@@ -290,16 +297,16 @@ def _evaluate_moving(
 ) -> Iterator[PresentedForce]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
         felt = reference.evaluate(at_ns, press)
-        if max(felt.wanted_n, felt.presented_n) >= FELT_N:
+        if max(felt.wanted_n, felt.presented_n) >= FORCE_JND_FLOOR_N:
             yield felt
 
 
-def _row(label: str, hold: Hold, felt: Sequence[PresentedForce]) -> dict[str, Any]:
+def _row(press: Press, hold: Hold, felt: Sequence[PresentedForce]) -> dict[str, Any]:
     return {
-        "place": label.removeprefix("press "),
+        "place": press.place,
         "depth_mm": 1e3 * hold.depth_m,
         "wanted_n": float(np.mean([one.wanted_n for one in felt])),
         "presented_n": float(np.mean([one.presented_n for one in felt])),
         "error_percent": 100.0 * float(np.mean([one.error_ratio for one in felt])),
-        "retreat_mm": 1e3 * float(np.mean([one.retreat_m for one in felt])),
+        "retreat_mm": 1e3 * float(np.mean([one.normal_offset_m for one in felt])),
     }

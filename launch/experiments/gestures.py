@@ -23,7 +23,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.types import FingerPath, Fingertip, TwinFinger
-from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.twin import gestures as twin_gestures
 from flexsheet.nodes.twin.finger import FingerPathError
 from flexsheet.nodes.twin.paths import recorded_path
@@ -208,7 +208,10 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
     if lead_s == 0.0:
         return _rows([tip.position_world_m for tip in tips])
     return _rows(
-        [path_at(tip.predicted_path_world_m, tip.prediction_step_s, lead_s)[0] for tip in tips]
+        [
+            interpolate_path(tip.predicted_path_world_m, tip.prediction_step_s, lead_s)[0]
+            for tip in tips
+        ]
     )
 
 

@@ -364,29 +364,31 @@ def sheet_errors(
     finger: SampledMotion,
     edges: tuple[SampledMotion, SampledMotion],
     times_ns: NDArray[np.int64],
-    retreat_m: Floats | float = 0.0,
+    normal_offset_m: Floats | float = 0.0,
     *,
     shape: Shape | None = None,
 ) -> tuple[Floats, Floats]:
     """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any shape of object.
 
     D is the object's point nearest to the finger.  The sheet presents the undeformed surface, so
-    the push depth is no error.  retreat_m (n,): commanded depth of the sheet below that surface.
-    On a cylinder, delta theta is the angle about its axis, as in the paper; on others, the angle
-    between the normals.  shape: that of the scene, if the caller has it.
+    the push depth is no error.  normal_offset_m (n,): commanded depth of the sheet below that
+    surface.  On a cylinder, delta theta is the angle about its axis, as in the paper; on others,
+    the angle between the normals.  shape: that of the scene, if the caller has it.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
     if not isinstance(scene.object.geometry, Cylinder):
         foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
         centre, normal = sheet_planes(edges, world_from_object, times_ns)
-        on_surface = foot.point - np.broadcast_to(retreat_m, len(points))[:, None] * foot.normal
+        on_surface = (
+            foot.point - np.broadcast_to(normal_offset_m, len(points))[:, None] * foot.normal
+        )
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
         off = on_surface - project_presented_point(foot, centre, normal)
         return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
-    radius = cylinder_of(scene).radius_m - retreat_m
+    radius = cylinder_of(scene).radius_m - normal_offset_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
     presented_points, presented_angles = find_presented_points(
         edges, world_from_object, times_ns, points[:, 0]

@@ -13,14 +13,14 @@ from flexsheet.nodes import cache
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel
 from flexsheet.nodes.planner.compliance import (
-    GOOD_RATIO,
+    TARGET_ERROR_RATIO,
     WEBER_RATIO,
     WEBER_RATIO_BARE,
     Compliance,
     ObjectCurve,
     fit_compliance,
-    pull_of,
-    unsureness,
+    force_uncertainty_ratio,
+    make_stretch_limits,
 )
 
 Floats = NDArray[np.float64]
@@ -48,14 +48,14 @@ def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
 
 
 def scene_compliance(
-    scene: Scene, law: SheetForceModel, curve: ObjectCurve, *, deepest_m: float | None = None
+    scene: Scene, law: SheetForceModel, curve: ObjectCurve, *, max_depth_m: float | None = None
 ) -> Compliance:
-    """What the planner presents; deepest_m: of the push, else the scene's."""
+    """What the planner presents; max_depth_m: of the push, else the scene's."""
     return fit_compliance(
         curve,
         law,
-        pull_of(scene.sheet, law),
-        deepest_m=scene.working_range.push_depth_m if deepest_m is None else deepest_m,
+        make_stretch_limits(scene.sheet, law),
+        max_depth_m=scene.working_range.push_depth_m if max_depth_m is None else max_depth_m,
         finger_radius_m=scene.finger.radius_m,
         usable_half_height_m=scene.sheet.usable_half_height_m,
         position_error_m=scene.tolerances.sheet_position_m,
@@ -65,9 +65,9 @@ def scene_compliance(
 def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) -> dict[str, Any]:
     """What `flexsheet doctor compliance --json` prints."""
     shown = scene_compliance(scene, law, curve)
-    depths = shown.deepest_m * np.array(SHOWN_SHARES)
-    wanted, presented = curve.force_n(depths), shown.presented(depths)
-    retreat = shown.retreat_m(depths)
+    depths = shown.max_depth_m * np.array(SHOWN_SHARES)
+    wanted, presented = curve.force_n(depths), shown.rendered_force_n(depths)
+    retreat = shown.normal_offset_m(depths)
     rows = [
         {
             "depth_mm": 1e3 * float(depth),
@@ -84,9 +84,11 @@ def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) ->
         "largest_edge_force_n": float(shown.centre.edge_force_n.max()),
         "advance_per_depth": shown.centre.advance_per_depth,
         "worst_error_ratio": float(np.abs(shown.centre.error_ratio).max()),
-        "aimed_ratio": GOOD_RATIO,
+        "aimed_ratio": TARGET_ERROR_RATIO,
         "weber_ratio": [WEBER_RATIO, WEBER_RATIO_BARE],
-        "force_change_by_place_ratio": unsureness(shown.centre, scene.tolerances.sheet_position_m),
+        "force_change_by_place_ratio": force_uncertainty_ratio(
+            shown.centre, scene.tolerances.sheet_position_m
+        ),
         "note": shown.note,
         "rows": rows,
     }

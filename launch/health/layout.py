@@ -35,7 +35,12 @@ from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
-from flexsheet.nodes.planner.rolling import Contact, rolled, rolling_twist, tangent
+from flexsheet.nodes.planner.rolling import (
+    SheetContact,
+    make_tangent_contact,
+    roll_contact,
+    rolling_twist,
+)
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -155,7 +160,7 @@ def touches(scene: Scene) -> list[Touch]:
     home = world_from_object[:3, :3].T
     most = np.array([0.5 * scene.sheet.width_m - CLAMP_MARGIN_M, scene.sheet.usable_half_height_m])
     found = _seen(scene, world_from_object, shape.closest)
-    ready = [tangent(home, one, float(most[0])) for one in found]
+    ready = [make_tangent_contact(home, one, float(most[0])) for one in found]
     begun = ready[:: max(1, len(ready) // STARTS)]
     turn = np.kron(np.eye(2), world_from_object[:3, :3])
     result = []
@@ -223,15 +228,17 @@ def _seen(
 
 
 def _ways_to_lie(
-    waiting: Contact, begun: Sequence[Contact], found: Nearest, most: Floats
-) -> Iterator[Contact]:
+    waiting: SheetContact, begun: Sequence[SheetContact], found: Nearest, most: Floats
+) -> Iterator[SheetContact]:
     """The sheet held ready at a point, and as it lies there after the longest rolls."""
     yield waiting
-    rolls = [rolled(contact, found) for contact in begun]
-    on_sheet = np.array([contact.on_sheet for contact in rolls])
-    chosen = {int(pick(on_sheet[:, axis])) for axis in (0, 1) for pick in (np.argmin, np.argmax)}
+    rolls = [roll_contact(contact, found) for contact in begun]
+    position_sheet_m = np.array([contact.position_sheet_m for contact in rolls])
+    chosen = {
+        int(pick(position_sheet_m[:, axis])) for axis in (0, 1) for pick in (np.argmin, np.argmax)
+    }
     for index in sorted(chosen):
-        yield replace(rolls[index], on_sheet=np.clip(on_sheet[index], -most, most))
+        yield replace(rolls[index], position_sheet_m=np.clip(position_sheet_m[index], -most, most))
 
 
 def samples_of(scene: Scene, touch_places: Sequence[Touch]) -> Samples:
@@ -244,6 +251,7 @@ def samples_of(scene: Scene, touch_places: Sequence[Touch]) -> Samples:
     longest = stretch_for_edge_force(
         sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )

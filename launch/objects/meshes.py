@@ -20,7 +20,7 @@ from flexsheet.launch.objects.textures import put_image
 from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Mesh, Positive, Scene
-from flexsheet.nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
+from flexsheet.nodes.models.shapes import GEOMETRIES, MeshError, SmoothMeshShape
 from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
 from flexsheet.nodes.models.shapes.triangles import (
     MAX_TRIANGLES,
@@ -33,7 +33,7 @@ from flexsheet.nodes.models.shapes.triangles import (
 
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
-SHAPE_NAMES = (*(name for name in SHAPES if name != "mesh"), MESH_FILE)
+SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
 """Shapes of a scene file; a mesh is given as a file, not as arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20

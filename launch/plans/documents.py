@@ -73,7 +73,7 @@ MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapp
 """Pydantic's error types whose texts name a class instead of a mapping."""
 
 Key = tuple[str | int, ...]
-"""Path of a value in a document: ("nodes", "planner", "parameters", "touch_m")."""
+"""Path of a value in a document: ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)

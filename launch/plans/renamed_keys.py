@@ -14,6 +14,15 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
         "largest_depth_m": "max_depth_m",
         "lead_s": "prediction_horizon_s",
     },
+    "planner": {
+        "arrival_s": "actuation_delay_s",
+        "largest_spin_rad": "max_spin_rad",
+        "lead_s": "prediction_horizon_s",
+        "oldest_s": "max_age_s",
+        "presents": "compliance_mode",
+        "release_m": "contact_off_m",
+        "touch_m": "contact_on_m",
+    },
     "recorder": {"also": "include", "waits": "start_paused"},
     "renderer": {
         "lead_s": "prediction_horizon_s",
@@ -53,6 +62,7 @@ LAUNCH_KEYS: Mapping[str, str] = {
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
+    "compliance_mode": {"curve": "force_curve", "stretch": "stiffness"},
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
     "sheet_force": {"cubic": "scaled"},
     "tracking": {"exponential": "one_euro", "hand": "singer_tremor"},

@@ -123,6 +123,7 @@ class ArmGeometry:
         force = edge_force_n(
             distance / limits.width_m,
             young_modulus_pa=limits.young_modulus_pa,
+            width_m=limits.width_m,
             height_m=limits.height_m,
             thickness_m=limits.thickness_m,
         )

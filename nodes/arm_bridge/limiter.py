@@ -78,6 +78,7 @@ class SheetLimits:
         return edge_force_n(
             length_m / self.width_m,
             young_modulus_pa=self.young_modulus_pa,
+            width_m=self.width_m,
             height_m=self.height_m,
             thickness_m=self.thickness_m,
         )

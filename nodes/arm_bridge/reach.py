@@ -213,6 +213,7 @@ def _margins(
             edge_force_n(
                 stretch,
                 young_modulus_pa=limits.young_modulus_pa,
+                width_m=limits.width_m,
                 height_m=limits.height_m,
                 thickness_m=limits.thickness_m,
             )

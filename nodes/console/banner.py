@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from html import escape
 
-from flexsheet.messages.types import ArmMode, ArmState, SheetTarget
+from flexsheet.messages.types import ArmMode, ArmState, SheetReason, SheetTarget
 from flexsheet.nodes.console.panels import MODES, words
 
 
@@ -31,6 +31,23 @@ GROUNDS = {
 """Class of the banner's background in page.css."""
 
 FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
+SHEET_REASON_TEXTS: dict[SheetReason, str] = {
+    "ok": "",
+    "fingertip_invalid": "the fingertip is not tracked",
+    "fingertip_not_finite": "the fingertip is not finite",
+    "fingertip_too_old": "the fingertip is too old",
+    "fingertip_in_future": "the fingertip is stamped in the future",
+    "implausible_input": "the finger is too far away or too fast",
+    "ambiguous_side": "the finger is inside the object, on no definite side",
+    "through_object": "the finger has passed through the object",
+    "past_object_edge": "the finger is past the object's edge",
+    "beyond_tilt": "the finger is beyond the tilt of the sheet",
+    "beyond_spin": "the sheet has rotated too far about its normal; lift the finger",
+    "past_sheet_width": "the finger is past the sheet's usable width",
+    "past_sheet_height": "the finger is past the sheet's usable height",
+    "concave_contact": "the object is concave there, and the flat sheet rests on the rim",
+}
+
 STILL_STOPPED = "the arms are still stopped"
 
 
@@ -176,8 +193,5 @@ def _explain(state: GraphState, shown: BannerState) -> str:
         case "approach":
             return "The sheet waits in front of the finger."
         case _:
-            return (
-                f"The sheet holds its pose: {sheet.reason}."
-                if sheet.reason
-                else "The sheet holds its pose."
-            )
+            text = SHEET_REASON_TEXTS[sheet.reason]
+            return f"The sheet holds its pose: {text}." if text else "The sheet holds its pose."

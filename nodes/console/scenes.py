@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from flexsheet.messages.scene import Geometry, Scene
 from flexsheet.nodes.models.rigid import rotation_from_rpy
+from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 
 Floats = NDArray[np.float64]
-Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
@@ -91,6 +91,7 @@ def max_stretch_ratio(scene: Scene) -> float:
     strongest = stretch_for_edge_force(
         sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
@@ -110,47 +111,14 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
     """Scale a shape about its origin; a plane is unchanged."""
     if not (np.isfinite(ratio) and ratio > 0.0):
         raise SceneChoiceError(f"size: factor {ratio} is not a positive number")
-    changes: dict[str, Any]
-    match geometry:
-        case Cylinder():
-            changes = {"radius_m": ratio * geometry.radius_m, "length_m": geometry.length_m}
-        case Sphere():
-            changes = {"radius_m": ratio * geometry.radius_m}
-        case Ellipsoid():
-            changes = {"semi_axes_m": tuple(ratio * side for side in geometry.semi_axes_m)}
-        case RoundedBox():
-            changes = {
-                "size_m": tuple(ratio * side for side in geometry.size_m),
-                "edge_radius_m": ratio * geometry.edge_radius_m,
-            }
-        case Mesh():
-            changes = {
-                "vertices_m": ratio * geometry.vertices_m,
-                "smoothing_m": ratio * geometry.smoothing_m,
-            }
-        case Plane():
-            return geometry
+    changes = GEOMETRIES[geometry.shape].scale(geometry, ratio)
     return _with(geometry, **changes)  # type: ignore[no-any-return]  # of the same type
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent (m) of a shape towards the user (world z) from its origin.
+    """Return the extent (m) of the touchable surface towards the user (world z) from its origin.
 
     world_from_object: rotation (3, 3). A cylinder is measured at its side: its ends are not
     touched.
     """
-    towards = world_from_object[2]
-    match geometry:
-        case Cylinder():
-            return geometry.radius_m * float(np.hypot(towards[1], towards[2]))
-        case Sphere():
-            return geometry.radius_m
-        case Ellipsoid():
-            return float(np.linalg.norm(np.array(geometry.semi_axes_m) * towards))
-        case RoundedBox():
-            core = 0.5 * np.array(geometry.size_m) - geometry.edge_radius_m
-            return float(core @ np.abs(towards)) + geometry.edge_radius_m
-        case Mesh():
-            return float((geometry.vertices_m @ towards).max())
-        case Plane():
-            return 0.0
+    return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

@@ -22,7 +22,7 @@ from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from flexsheet.nodes.fem_solver.precompute_table import TableSpec
 from flexsheet.nodes.fem_solver.table import Table, TableSoftBody
 from flexsheet.nodes.models import rigid
-from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
@@ -209,4 +209,6 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
     """Return the expected fingertip position (3,), m, world, `horizon_s` after its exposure."""
-    return path_at(fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s)[0]
+    return interpolate_path(
+        fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
+    )[0]

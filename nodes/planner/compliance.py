@@ -1,20 +1,19 @@
-"""How the sheet is stretched and moved so that it yields to the finger as the object would.
+"""Choose the sheet's stretch and normal offset, so that it renders the object's force.
 
-A finger `d` deep in the object, if the sheet stood in the object's tangent plane, would push the
-sheet in by `d`, and only at one depth would the sheet answer with the object's force.  So the sheet
-is also moved along its normal: it retreats by r(d) (or, below zero, comes towards the finger), and
-the indentation that is left, i = d - r, is the one at which the sheet's law gives the object's
-force:
+A finger at depth `d` in the object would indent a sheet in the object's tangent plane by `d`.  The
+sheet would then give the object's force at one depth only.  So the sheet also moves along its
+normal: by an offset r(d) behind the tangent plane (in front of it where r is negative).  The
+remaining indentation i = d - r is the one at which the sheet's model gives the object's force:
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-A retreat takes work from a finger that pushes while the sheet lags behind, so it damps; an advance
-gives it work: with lag t and sheet stiffness k, as a damper of -k a t would.  Hence the bound a on
-the advance, and hence the choice of the stretch: the least one that presents the curve without an
-advance, or with the smallest.
+While the sheet lags behind, a growing offset takes energy from a finger that pushes, so it damps.
+An advance (r falls with d) adds energy.  With a lag t and a sheet stiffness k it acts as a damper
+of -k a t, where a is the advance per depth.  Therefore the advance is bounded.  The stretch is the
+least one that renders the curve without an advance, or else the one with the smallest advance.
 
-While a push is hardly felt the sheet does not come towards the finger: one that only strokes, and
-what the camera adds to its height, must not be answered.
+Below the threshold of touch the sheet does not advance.  Otherwise it would respond to the noise of
+the camera while a finger only strokes.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from scipy.interpolate import BSpline, PchipInterpolator
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.sheet import (
     edge_force_for_stiffness,
     edge_force_n,
@@ -35,50 +35,53 @@ from flexsheet.nodes.models.sheet import (
 )
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
-    Place,
     SheetForceModel,
+    SheetPosition,
     depth_for_force,
     interpolated_inverse,
 )
 
 Floats = NDArray[np.float64]
 
-RESERVE = 0.85
-"""Share of the largest edge force and strain that is planned with.
+USABLE_FRACTION = 0.85
+"""Fraction of the maximum edge force and strain that is planned with.
 
-The bridges stop the arms where commanded or measured poses reach the limits themselves; two arms
-that move are never exactly as far apart as planned (one sees the other a cycle or two late).
+The bridges stop the arms where commanded or measured poses reach the limits.  Two moving arms are
+never exactly as far apart as planned, since each sees the other a cycle or two late.
 """
 
-FELT_N = 0.05
-"""Forces below this are not compared, but as if they were this large: those of the first 2 mm into
-an object of 4 kPa, which the soft body itself knows to a tenth at best."""
+FORCE_JND_FLOOR_N = 0.05
+"""Lower bound on the reference of relative force errors.  Smaller forces are known to a tenth at
+best: those of the first 2 mm in an object of 4 kPa."""
 
-QUIET_N, ANSWERED_N = 0.25 * FELT_N, FELT_N
-"""Up to the first force, the object's or the sheet's, the sheet does not come towards the finger;
-from the second on as far as it takes."""
+DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
+"""Up to the first force, of the object or the sheet, the sheet does not advance; from the second on
+it advances fully."""
 
-QUIET_M, ANSWERED_M = 0.3e-3, 1.2e-3
-"""The same for depths: a third of a millimetre may be a fingertip that lies on the object."""
+DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
+"""The same for depths: a third of a millimetre may be a fingertip that rests on the object."""
 
-GOOD_RATIO = 0.10
-"""Error of the presented force, over the wanted, that is aimed for."""
+TARGET_ERROR_RATIO = 0.10
+"""Relative error of the rendered force that is aimed for."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""Least relative difference of stiffness that people notice: with the skin's deformation as a cue
-(Bergmann Tiest & Kappers 2009), and without work or terminal force as a cue (Tan et al. 1995)."""
+"""Smallest relative difference of stiffness that people notice.  The first: with the deformation of
+the skin as a cue (Bergmann Tiest & Kappers 2009); the second: without work or terminal force as a
+cue (Tan et al. 1995)."""
 
-ADVANCE_PER_DEPTH = 0.5
-"""How far the sheet may come towards the finger per depth of push: presents up to 1.5 times the
-sheet's own stiffness, and with 10 ms of lag at 100 N/m takes 0.5 N s/m of damping, less than a
-finger has."""
+MAX_ADVANCE_PER_DEPTH = 0.5
+"""Maximum advance of the sheet per depth of the push.
 
-CANDIDATES = 17
-"""Stretches that are tried between the least and the largest."""
+It renders up to 1.5 times the sheet's own stiffness.  With a lag of 10 ms at 100 N/m it removes
+0.5 N s/m of damping, less than a finger has.
+"""
+
+STRETCH_CANDIDATES = 17
+"""Number of stretches that are tried between minimum and maximum."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
-    """A force curve that is no curve; the message says what is wrong with it."""
+    """Raised for force curves that are not finite, not ascending, or too short."""
 
     code = "force-curve"
     remedy = "Give force over depth from zero, rising, without repeated depths."
@@ -86,9 +89,9 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """The object's force over depth: rows (n,) from (0, 0), depths ascending, forces not falling.
+    """Hold the object's force over depth: rows (n,) from (0, 0), ascending.
 
-    Between the rows a monotone cubic; beyond the last a straight line at the last slope.
+    Between the rows it is a monotone cubic, beyond the last a straight line with the last slope.
     """
 
     depths_m: Floats
@@ -96,35 +99,35 @@ class ObjectCurve:
     _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """UnfitCurveError unless there are two rows or more, finite and in order."""
+        """Raise UnfitCurveError unless there are two or more finite, ascending rows."""
         depths, forces = self.depths_m, self.forces_n
         if depths.ndim != 1 or len(depths) < 2 or depths.shape != forces.shape:
             raise UnfitCurveError(
-                f"a force curve of {depths.shape} depths and {forces.shape} forces; it takes as "
-                "many forces as depths, two or more"
+                f"force curve: {depths.shape} depths and {forces.shape} forces; give as many "
+                "forces as depths, two or more"
             )
         if not (np.isfinite(depths).all() and np.isfinite(forces).all()):
-            raise UnfitCurveError("a force curve has entries that are not finite")
+            raise UnfitCurveError("force curve: entries are not finite")
         if depths[0] != 0.0 or forces[0] != 0.0:
             raise UnfitCurveError(
-                f"a force curve begins at {depths[0]:g} m, {forces[0]:g} N; it must begin at 0, 0"
+                f"force curve: the first row is {depths[0]:g} m, {forces[0]:g} N; it must be 0, 0"
             )
         if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
-            raise UnfitCurveError("a force curve's depths must ascend and its forces not fall")
+            raise UnfitCurveError("force curve: depths must ascend and forces must not fall")
         object.__setattr__(self, "_curve", PchipInterpolator(depths, forces))
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """From `SoftBody.force_curve`: (n, 2) depth and force."""
+        """Make the curve of `SoftBody.force_curve`: (n, 2) depth and force."""
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     @classmethod
-    def linear(cls, stiffness_n_per_m: float, deepest_m: float) -> ObjectCurve:
-        """Of a spring."""
-        return cls(np.array([0.0, deepest_m]), np.array([0.0, stiffness_n_per_m * deepest_m]))
+    def linear(cls, stiffness_n_per_m: float, max_depth_m: float) -> ObjectCurve:
+        """Make the curve of a spring."""
+        return cls(np.array([0.0, max_depth_m]), np.array([0.0, stiffness_n_per_m * max_depth_m]))
 
     def force_n(self, depths_m: Floats) -> Floats:
-        """Forces (n,) at depths (n,); 0 before the touch."""
+        """Return forces (n,) at depths (n,); 0 for negative depths."""
         last = self.depths_m[-1]
         inside = self._curve(np.clip(depths_m, 0.0, last))
         beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
@@ -133,42 +136,48 @@ class ObjectCurve:
 
 
 @dataclass(frozen=True, slots=True)
-class Pull:
-    """What the sheet and the arms that hold it may be asked for."""
+class StretchLimits:
+    """Hold the limits of the sheet and of the arms that stretch it."""
 
-    least_stretch: float
-    largest_stretch: float
+    min_stretch_ratio: float
+    max_stretch_ratio: float
     edge_force_n: float
-    advance_per_depth: float = ADVANCE_PER_DEPTH
+    max_advance_per_depth: float = MAX_ADVANCE_PER_DEPTH
 
 
-def pull_of(sheet: SheetSpec, law: SheetForceModel) -> Pull:
-    """The scene's limits less the reserve; a pushed sheet pulls harder, see `present`."""
-    force = RESERVE * sheet.max_edge_force_n
+def make_stretch_limits(sheet: SheetSpec, model: SheetForceModel) -> StretchLimits:
+    """Return the usable fraction of the scene's limits, for the flat sheet.
+
+    A push adds edge force; `render_force` limits that.
+    """
+    force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
-    low, high = least, max(least, 1.0 + RESERVE * (sheet.max_stretch_ratio - 1.0))
-    if _flat_pull_n(law, high) > force:
+    low, high = least, max(least, 1.0 + USABLE_FRACTION * (sheet.max_stretch_ratio - 1.0))
+    if _flat_edge_force_n(model, high) > force:
         for _ in range(40):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if _flat_pull_n(law, middle) > force else (middle, high)
+            low, high = (
+                (low, middle) if _flat_edge_force_n(model, middle) > force else (middle, high)
+            )
         high = low
-    return Pull(least, high, force)
+    return StretchLimits(least, high, force)
 
 
-def _flat_pull_n(law: SheetForceModel, stretch_ratio: float) -> float:
-    """Force (N) on each clamp of the unpushed sheet."""
-    pressed = law.evaluate(
-        stretch_ratio, np.zeros(1), place_m=CENTRE, finger_radius_m=0.03 * law.rubber.width_m
+def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
+    """Return the force (N) on each clamp of the sheet without a push."""
+    flat = model.evaluate(
+        stretch_ratio, np.zeros(1), position_m=CENTRE, finger_radius_m=0.03 * model.rubber.width_m
     )
-    return float(pressed.edge_force_n[0])
+    return float(flat.edge_force_n[0])
 
 
 @dataclass(frozen=True, slots=True)
-class Presented:
-    """What a stretch presents at one place, a row per depth (n,).
+class RenderedForce:
+    """Hold what a stretch renders at one position, a row per depth (n,).
 
-    edge_force_n: on each clamp.  advance_per_depth: the fastest that the sheet comes towards the
-    finger.  pull_bound: whether the arms' pull kept the sheet from pressing as it should.
+    edge_force_n: on each clamp.
+    advance_per_depth: maximum advance of the sheet towards the finger.
+    force_limited: whether the limit of the edge force reduced the indentation.
     """
 
     depths_m: Floats
@@ -178,291 +187,301 @@ class Presented:
     indentation_m: Floats
     edge_force_n: Floats
     advance_per_depth: float
-    pull_bound: bool
+    force_limited: bool
 
     @property
-    def retreat_m(self) -> Floats:
+    def normal_offset_m(self) -> Floats:
         return self.depths_m - self.indentation_m
 
     @property
     def error_ratio(self) -> Floats:
-        """(n,) presented over wanted, less one; 0 where neither can be felt."""
-        felt = np.maximum(self.wanted_n, self.force_n) >= FELT_N
-        difference = (self.force_n - self.wanted_n) / np.maximum(self.wanted_n, FELT_N)
+        """Rendered over wanted force, minus one (n,); 0 where neither can be felt."""
+        felt = np.maximum(self.wanted_n, self.force_n) >= FORCE_JND_FLOOR_N
+        difference = (self.force_n - self.wanted_n) / np.maximum(self.wanted_n, FORCE_JND_FLOOR_N)
         result: Floats = np.where(felt, difference, 0.0)
         return result
 
 
 _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
-DEPTH_SHARES = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
-"""Depths, over the deepest, at which the retreat is worked out: denser where contact grows.
+DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
+"""Depths, over the maximum, at which the offset is computed: denser where contact begins.
 
-They are the places of the control points of a quadratic B-spline on `_KNOTS` (Greville), which then
-is smooth (C1) and has no steeper slope than the straight lines between its control points: bounds
-on the slope at these depths hold everywhere, as they would not for a curve through the points.
+They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, where its control points lie.
+The spline is C1, and its slope is bounded by those between its control points.  So bounds on the
+slope at these depths hold everywhere; a spline through the points would not guarantee that.
 """
 
-PULL_BEND = 0.1
-"""Share of the largest indentation over which it is approached, not met with a kink."""
+SATURATION_FRACTION = 0.1
+"""Fraction of the maximum indentation over which the curve bends smoothly towards the maximum."""
 
 
-def present(
+def render_force(
     curve: ObjectCurve,
-    law: SheetForceModel,
-    pull: Pull,
+    model: SheetForceModel,
+    limits: StretchLimits,
     *,
     stretch_ratio: float,
-    deepest_m: float,
-    place_m: Place = CENTRE,
+    max_depth_m: float,
+    position_m: SheetPosition = CENTRE,
     finger_radius_m: float,
-) -> Presented:
-    """The best that this stretch can do for the curve at this place, within the pull.
+) -> RenderedForce:
+    """Return the best approximation of the curve with this stretch at this position.
 
-    The indentation never makes the clamps pull harder than `pull.edge_force_n` (beyond, the sheet
-    gives way with the finger), and grows by at most 1 + `pull.advance_per_depth` per depth.
+    The indentation never makes the edge force exceed its limit; beyond that the sheet moves with
+    the finger.  It grows by at most 1 + `limits.max_advance_per_depth` per depth.
     """
-    depths = deepest_m * DEPTH_SHARES
+    depths = max_depth_m * DEPTH_FRACTIONS
     wanted = curve.force_n(depths)
-    asked = depth_for_force(
-        law,
+    ideal = depth_for_force(
+        model,
         stretch_ratio,
         wanted,
-        deepest_m=(1.0 + pull.advance_per_depth) * deepest_m,
-        place_m=place_m,
+        max_depth_m=(1.0 + limits.max_advance_per_depth) * max_depth_m,
+        position_m=position_m,
         finger_radius_m=finger_radius_m,
     )
-    own = law.evaluate(stretch_ratio, depths, place_m=place_m, finger_radius_m=finger_radius_m)
-    asked = _quietly(depths, asked, np.maximum(wanted, own.force_n))
-    furthest = _indentation_for_pull(
-        law,
-        pull.edge_force_n,
+    without_offset = model.evaluate(
+        stretch_ratio, depths, position_m=position_m, finger_radius_m=finger_radius_m
+    )
+    ideal = _apply_deadband(depths, ideal, np.maximum(wanted, without_offset.force_n))
+    max_indentation = _indentation_for_edge_force(
+        model,
+        limits.edge_force_n,
         stretch_ratio=stretch_ratio,
-        deepest_m=deepest_m,
-        place_m=place_m,
+        max_depth_m=max_depth_m,
+        position_m=position_m,
         finger_radius_m=finger_radius_m,
     )
-    held = _bent(asked, furthest)
-    growth = (1.0 + pull.advance_per_depth) * depths
-    indentation = growth + np.minimum.accumulate(held - growth)
-    pressed = law.evaluate(
-        stretch_ratio, indentation, place_m=place_m, finger_radius_m=finger_radius_m
+    saturated = _saturate(ideal, max_indentation)
+    max_growth = (1.0 + limits.max_advance_per_depth) * depths
+    indentation = max_growth + np.minimum.accumulate(saturated - max_growth)
+    rendered = model.evaluate(
+        stretch_ratio, indentation, position_m=position_m, finger_radius_m=finger_radius_m
     )
-    steps = np.diff(indentation) / np.diff(depths)
-    return Presented(
+    slopes = np.diff(indentation) / np.diff(depths)
+    return RenderedForce(
         depths_m=depths,
         wanted_n=wanted,
-        force_n=pressed.force_n,
-        stiffness_n_per_m=pressed.stiffness_n_per_m,
+        force_n=rendered.force_n,
+        stiffness_n_per_m=rendered.stiffness_n_per_m,
         indentation_m=indentation,
-        edge_force_n=pressed.edge_force_n,
-        advance_per_depth=max(0.0, float(steps.max()) - 1.0),
-        pull_bound=bool(asked.max() > (1.0 - PULL_BEND) * furthest),
+        edge_force_n=rendered.edge_force_n,
+        advance_per_depth=max(0.0, float(slopes.max()) - 1.0),
+        force_limited=bool(ideal.max() > (1.0 - SATURATION_FRACTION) * max_indentation),
     )
 
 
-def _indentation_for_pull(
-    law: SheetForceModel,
-    edge_n: float,
+def _indentation_for_edge_force(
+    model: SheetForceModel,
+    edge_force_n: float,
     *,
     stretch_ratio: float,
-    deepest_m: float,
-    place_m: Place,
+    max_depth_m: float,
+    position_m: SheetPosition,
     finger_radius_m: float,
 ) -> float:
-    """The indentation (m) at which the clamps pull with `edge_n`; 0 if they do so unpushed."""
-    grid = 2.0 * deepest_m * DEPTH_SHARES[1:]
-    flat = _flat_pull_n(law, stretch_ratio)
-    if flat >= edge_n:
-        # Reached by rounding only: `pull_of` keeps the flat sheet within the pull.
-        return 0.0 if flat > edge_n * (1.0 + 1e-6) else float(grid[0])
-    pulled = law.evaluate(stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m)
-    added = pulled.edge_force_n - flat
-    if added[-1] <= edge_n - flat:
+    """Return the indentation (m) at which the clamps carry this force; 0 if the flat sheet does."""
+    grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
+    flat = _flat_edge_force_n(model, stretch_ratio)
+    if flat >= edge_force_n:
+        # Equality is due to rounding: `make_stretch_limits` keeps the flat sheet within the limit.
+        return 0.0 if flat > edge_force_n * (1.0 + 1e-6) else float(grid[0])
+    pushed = model.evaluate(
+        stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
+    )
+    added = pushed.edge_force_n - flat
+    if added[-1] <= edge_force_n - flat:
         return float(grid[-1])
-    return float(interpolated_inverse(grid, added, np.array([edge_n - flat]))[0])
+    return float(interpolated_inverse(grid, added, np.array([edge_force_n - flat]))[0])
 
 
-def _quietly(depths: Floats, asked: Floats, forces_n: Floats) -> Floats:
-    """Indentations (n,) as asked, but beyond the depths only as far as forces are felt (C1)."""
-    felt = _smoothstep((forces_n - QUIET_N) / (ANSWERED_N - QUIET_N))
-    deep = _smoothstep((depths - QUIET_M) / (ANSWERED_M - QUIET_M))
-    beyond = np.maximum(asked - depths, 0.0)
-    return np.asarray(asked - (1.0 - felt * deep) * beyond)
+def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
+    """Remove the advance from indentations (n,) whose depth or force cannot be felt (C1)."""
+    force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
+    depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
+    advance = np.maximum(indentation - depths, 0.0)
+    return np.asarray(indentation - (1.0 - force_weight * depth_weight) * advance)
 
 
-def _smoothstep(values: Floats) -> Floats:
-    """From 0 at 0 to 1 at 1, level at both (C1)."""
-    share = np.clip(values, 0.0, 1.0)
-    return np.asarray(share * share * (3.0 - 2.0 * share))
+def _fade(values: Floats, start: float, end: float) -> Floats:
+    return smoothstep(np.clip((values - start) / (end - start), 0.0, 1.0))
 
 
-def _bent(asked: Floats, furthest: float) -> Floats:
-    """Follows `asked`, then bends (C1) towards `furthest` and never passes it."""
-    if furthest <= 0.0:
-        return np.zeros_like(asked)
-    knee, span = (1.0 - PULL_BEND) * furthest, PULL_BEND * furthest
-    over = np.maximum(asked - knee, 0.0)
-    result: Floats = np.minimum(asked, knee) - span * np.expm1(-over / span)
+def _saturate(indentation: Floats, maximum: float) -> Floats:
+    """Limit indentations (n,) to a maximum, which they approach smoothly (C1)."""
+    if maximum <= 0.0:
+        return np.zeros_like(indentation)
+    knee, span = (1.0 - SATURATION_FRACTION) * maximum, SATURATION_FRACTION * maximum
+    over = np.maximum(indentation - knee, 0.0)
+    result: Floats = np.minimum(indentation, knee) - span * np.expm1(-over / span)
     return result
 
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """One object presented by one stretch: where the sheet goes for each depth of the finger.
+    """Hold how one object is rendered with one stretch: the sheet's offset for each depth.
 
-    stretch_ratio: constant over the push.  note: empty, or what the sheet cannot present and by
-    how much.  centre: the whole push at the sheet's middle.
+    stretch_ratio: constant over the push.
+    note: what the sheet cannot render and by how much; empty if nothing.
+    centre: the whole push at the sheet's centre.
     """
 
     stretch_ratio: float
     note: str
-    centre: Presented
-    law: SheetForceModel
-    pull: Pull
+    centre: RenderedForce
+    model: SheetForceModel
+    limits: StretchLimits
     finger_radius_m: float
     _nodes: tuple[Floats, Floats]
     _indentation: BSpline = field(repr=False)
     _growth: BSpline = field(repr=False)
 
     @property
-    def deepest_m(self) -> float:
-        """To here the push was worked out; deeper the sheet goes with the finger."""
+    def max_depth_m(self) -> float:
+        """Maximum depth of the fit; deeper the sheet moves with the finger."""
         return float(self.centre.depths_m[-1])
 
-    def indentation_m(self, depths_m: Floats | float, place_m: Place = CENTRE) -> Floats:
-        """How deep the finger shall push the sheet in, (n,), with the finger at depths (n,)."""
-        depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.deepest_m)
-        result: Floats = self._indentation(depths) @ self._weights(place_m)
+    def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
+        """Return the sheet's indentation (n,) with the finger at depths (n,)."""
+        depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.max_depth_m)
+        result: Floats = self._indentation(depths) @ self._weights(position_m)
         return result
 
-    def retreat_m(self, depths_m: Floats | float, place_m: Place = CENTRE) -> Floats:
-        """How far behind the object's tangent plane the sheet shall be, (n,); below 0: before it.
+    def normal_offset_m(
+        self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
+    ) -> Floats:
+        """Return the sheet's distance (n,) behind the object's tangent plane; negative before it.
 
-        Smooth (C1) in the depth, continuous in the place; 0 while the finger does not touch.
+        It is smooth (C1) in the depth and continuous in the position, and 0 without contact.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
-        result: Floats = depths - self.indentation_m(depths, place_m)
+        result: Floats = depths - self.indentation_m(depths, position_m)
         return result
 
-    def retreat_per_depth(self, depth_m: float, place_m: Place = CENTRE) -> float:
-        """How fast the retreat grows with the depth: from -`pull.advance_per_depth` to 1."""
+    def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
+        """Return the offset's slope: from -`limits.max_advance_per_depth` to 1."""
         if depth_m <= 0.0:
             return 0.0
-        if depth_m >= self.deepest_m:
+        if depth_m >= self.max_depth_m:
             return 1.0
-        return 1.0 - float(self._growth(depth_m) @ self._weights(place_m))
+        return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
 
-    def presented(self, depths_m: Floats, place_m: Place = CENTRE) -> Floats:
-        """The force (n,), N, that the sheet then answers with, by its law."""
-        return self.law.evaluate(
+    def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
+        """Return the sheet's force (n,), N, at depths (n,), by its model."""
+        return self.model.evaluate(
             self.stretch_ratio,
-            self.indentation_m(depths_m, place_m),
-            place_m=place_m,
+            self.indentation_m(depths_m, position_m),
+            position_m=position_m,
             finger_radius_m=self.finger_radius_m,
         ).force_n
 
-    def _weights(self, place_m: Place) -> Floats:
-        """Of the nodes (9,): linear in x^2 and y^2 between them, as the sheet is even.
+    def _weights(self, position_m: SheetPosition) -> Floats:
+        """Return the nodes' weights (9,): linear in x^2 and y^2, since the sheet is symmetric.
 
-        None is negative, so that what holds at the nodes (pull, advance, no step back) holds
+        No weight is negative.  So the bounds that hold at the nodes (force, advance, monotony) hold
         between them.
         """
-        along = [_shares(nodes, abs(at)) for nodes, at in zip(self._nodes, place_m, strict=True)]
-        return np.outer(*along).ravel()
+        weights = [
+            _interpolate_squares(nodes, abs(at))
+            for nodes, at in zip(self._nodes, position_m, strict=True)
+        ]
+        return np.outer(*weights).ravel()
 
 
-def _shares(nodes: Floats, at: float) -> Floats:
-    """Weights (n,) of the nodes (n,) at a place: linear in the square, constant beyond the last."""
+def _interpolate_squares(nodes: Floats, at: float) -> Floats:
+    """Return weights (n,) of nodes (n,): linear in the square, constant beyond the last node."""
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
-    share = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
+    t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
     weights = np.zeros(len(nodes))
-    weights[upper - 1], weights[upper] = 1.0 - share, share
+    weights[upper - 1], weights[upper] = 1.0 - t, t
     return weights
 
 
 def fit_compliance(
     curve: ObjectCurve,
-    law: SheetForceModel,
-    pull: Pull,
+    model: SheetForceModel,
+    limits: StretchLimits,
     *,
-    deepest_m: float,
+    max_depth_m: float,
     finger_radius_m: float,
     usable_half_height_m: float,
     position_error_m: float,
 ) -> Compliance:
-    """The stretch and the retreat that present the curve best to pushes of `deepest_m`.
+    """Return the stretch and the offset that best render the curve for pushes to `max_depth_m`.
 
-    position_error_m: how exactly the sheet is held in place (the scene's tolerance); an object so
-    soft that this much changes its force beyond what people notice is noted as such.
+    position_error_m: the scene's tolerance of the sheet's position.  The note reports an object
+        that is so soft that this error changes its force noticeably.
     """
-    stretches = np.linspace(pull.least_stretch, pull.largest_stretch, CANDIDATES)
+    stretches = np.unique(
+        np.linspace(limits.min_stretch_ratio, limits.max_stretch_ratio, STRETCH_CANDIDATES)
+    )
     tried = [
-        present(
+        render_force(
             curve,
-            law,
-            pull,
+            model,
+            limits,
             stretch_ratio=float(stretch),
-            deepest_m=deepest_m,
+            max_depth_m=max_depth_m,
             finger_radius_m=finger_radius_m,
         )
-        for stretch in np.unique(stretches)
+        for stretch in stretches
     ]
-    worst = [float(np.abs(one.error_ratio).max()) for one in tried]
-    allowed = max(min(worst) + 0.01, 0.02)
+    max_errors = [float(np.abs(one.error_ratio).max()) for one in tried]
+    allowed = max(min(max_errors) + 0.01, 0.02)
     chosen = min(
-        (number for number, error in enumerate(worst) if error <= allowed),
+        (number for number, error in enumerate(max_errors) if error <= allowed),
         key=lambda number: (round(tried[number].advance_per_depth, 2), number),
     )
-    return compliance_at(
+    return fit_at_stretch(
         curve,
-        law,
-        pull,
-        stretch_ratio=float(np.unique(stretches)[chosen]),
-        deepest_m=deepest_m,
+        model,
+        limits,
+        stretch_ratio=float(stretches[chosen]),
+        max_depth_m=max_depth_m,
         finger_radius_m=finger_radius_m,
         usable_half_height_m=usable_half_height_m,
         position_error_m=position_error_m,
     )
 
 
-def compliance_at(
+def fit_at_stretch(
     curve: ObjectCurve,
-    law: SheetForceModel,
-    pull: Pull,
+    model: SheetForceModel,
+    limits: StretchLimits,
     *,
     stretch_ratio: float,
-    deepest_m: float,
+    max_depth_m: float,
     finger_radius_m: float,
     usable_half_height_m: float,
     position_error_m: float,
 ) -> Compliance:
-    """The retreat for a curve at a given stretch: for an object that feels otherwise elsewhere."""
-    rubber = law.rubber
+    """Return the offset that renders the curve with a given stretch; see `fit_compliance`."""
+    rubber = model.rubber
     xs = 0.5 * rubber.width_m * np.array([0.0, 0.3, 0.5])
     ys = min(usable_half_height_m, 0.4 * rubber.height_m) * np.array([0.0, 0.6, 1.0])
     at_nodes = [
-        present(
+        render_force(
             curve,
-            law,
-            pull,
+            model,
+            limits,
             stretch_ratio=stretch_ratio,
-            deepest_m=deepest_m,
-            place_m=(float(x), float(y)),
+            max_depth_m=max_depth_m,
+            position_m=(float(x), float(y)),
             finger_radius_m=finger_radius_m,
         )
         for x in xs
         for y in ys
     ]
     indentation = BSpline(
-        deepest_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
+        max_depth_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
     )
     return Compliance(
         stretch_ratio=stretch_ratio,
         note=_note(at_nodes[0], position_error_m),
         centre=at_nodes[0],
-        law=law,
-        pull=pull,
+        model=model,
+        limits=limits,
         finger_radius_m=finger_radius_m,
         _nodes=(xs, ys),
         _indentation=indentation,
@@ -470,71 +489,73 @@ def compliance_at(
     )
 
 
-def _note(shown: Presented, position_error_m: float) -> str:
-    """What the sheet cannot present of a push, and by how much; empty if it can."""
-    error = shown.error_ratio
-    off = np.abs(error) > GOOD_RATIO
+def _note(rendered: RenderedForce, position_error_m: float) -> str:
+    """Return what the sheet cannot render of a push, and by how much; empty if nothing."""
+    error = rendered.error_ratio
+    off = np.abs(error) > TARGET_ERROR_RATIO
     if off.any():
-        # Where it is off by most newtons: that is what a finger will notice first.
-        at = int(np.argmax(np.where(off, np.abs(shown.force_n - shown.wanted_n), 0.0)))
+        # The largest difference in newtons is the first that a finger notices.
+        at = int(np.argmax(np.where(off, np.abs(rendered.force_n - rendered.wanted_n), 0.0)))
         cause = (
-            "the arms may not pull harder"
-            if shown.pull_bound
-            else "the sheet may not come towards the finger faster"
+            "the edge force is at its limit"
+            if rendered.force_limited
+            else "the sheet's advance towards the finger is at its limit"
         )
         kind, than = ("stiffer", "too soft") if error[at] < 0.0 else ("softer", "too stiff")
         return (
             f"object is {kind} than the sheet can present: {100 * abs(error[at]):.0f} % {than} at "
-            f"{1e3 * shown.depths_m[at]:.0f} mm ({shown.force_n[at]:.2f} of "
-            f"{shown.wanted_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; {cause}; "
+            f"{1e3 * rendered.depths_m[at]:.0f} mm ({rendered.force_n[at]:.2f} of "
+            f"{rendered.wanted_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; {cause}; "
             f"people notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
         )
-    unsure = unsureness(shown, position_error_m)
-    if unsure > WEBER_RATIO:
+    uncertainty = force_uncertainty_ratio(rendered, position_error_m)
+    if uncertainty > WEBER_RATIO:
         return (
-            f"object is softer than the sheet presents surely: {1e3 * position_error_m:g} mm of "
-            f"the sheet's place is {100 * unsure:.0f} % of the force at "
-            f"{1e3 * shown.depths_m[-1]:.0f} mm; people notice {100 * WEBER_RATIO:.0f} to "
+            f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
+            f"sheet's position is {100 * uncertainty:.0f} % of the force at "
+            f"{1e3 * rendered.depths_m[-1]:.0f} mm; people notice {100 * WEBER_RATIO:.0f} to "
             f"{100 * WEBER_RATIO_BARE:.0f} %"
         )
     return ""
 
 
-def unsureness(shown: Presented, position_error_m: float) -> float:
-    """The relative change of the deepest push's force by an error of the sheet's place."""
-    change = float(shown.stiffness_n_per_m[-1]) * position_error_m
-    return change / max(float(shown.wanted_n[-1]), 1e-9)
+def force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
+    """Return the relative change of the force at maximum depth by an error of the position."""
+    change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
+    return change / max(float(rendered.wanted_n[-1]), 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class StretchChoice:
-    """A stretch that presents an object's stiffness; `note` says so where the sheet cannot."""
+    """Hold a stretch that renders an object's stiffness; `note` reports where it cannot."""
 
     stretch_ratio: float
     note: str
 
 
 def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
-    """Least and largest stretch: the scene's, and what the arms may pull, less the reserve."""
-    strongest = stretch_for_edge_force(
-        RESERVE * sheet.max_edge_force_n,
+    """Return minimum and maximum stretch: the scene's, within the usable edge force."""
+    at_max_force = stretch_for_edge_force(
+        USABLE_FRACTION * sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    longest = 1.0 + RESERVE * (sheet.max_stretch_ratio - 1.0)
-    return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(longest, strongest))
+    at_max_strain = 1.0 + USABLE_FRACTION * (sheet.max_stretch_ratio - 1.0)
+    return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(at_max_strain, at_max_force))
 
 
-def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
-    """The stretch for an object of that stiffness (N/m, small pushes) when the sheet only tilts.
+def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
+    """Return the stretch for an object of that stiffness (N/m, small pushes), without an offset.
 
-    By the linear law: it knows neither the object's curve nor the fingertip.
+    It follows from the linear model, which knows neither the object's curve nor the fingertip.
     """
     least, largest = stretch_range(sheet)
     wanted = stretch_for_edge_force(
         edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
@@ -542,13 +563,14 @@ def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     force = edge_force_n(
         stretch,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    presented = push_stiffness_n_per_m(force, width_m=sheet.width_m)
+    rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     note = ""
     if wanted < least:
-        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {presented:.0f}"
+        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {rendered:.0f}"
     elif wanted > largest:
-        note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {presented:.0f}"
+        note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {rendered:.0f}"
     return StretchChoice(stretch, note)

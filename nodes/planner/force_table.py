@@ -21,7 +21,7 @@ from flexsheet.nodes.models.sheet.force_models import (
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-from flexsheet.nodes.planner.sheet_force import membrane_table, rubber_of
+from flexsheet.nodes.planner.sheet_force import make_rubber, membrane_table
 
 VERSION = 1
 """Version of the computation; another version computes the table again."""
@@ -32,7 +32,7 @@ FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
 """Sample points, over the sheet's width and height."""
 
-LAWS: dict[str, Callable[[Rubber], SheetForceModel]] = {
+FORCE_MODELS: dict[str, Callable[[Rubber], SheetForceModel]] = {
     "linear": LinearSheetModel,
     "scaled": ScaledSheetModel,
 }
@@ -40,7 +40,7 @@ LAWS: dict[str, Callable[[Rubber], SheetForceModel]] = {
 
 def table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
     """Describe the cache file of the scene's table."""
-    rubber = rubber_of(scene.sheet)
+    rubber = make_rubber(scene.sheet)
     depends_on = {
         "version": VERSION,
         "finger_radius_m": scene.finger.radius_m,
@@ -72,7 +72,7 @@ def load_or_compute(
         table_cache(scene),
         cache_dir,
         lambda: membrane_table(
-            rubber_of(sheet),
+            make_rubber(sheet),
             stretches=np.array(ends),
             xs_m=sheet.width_m * XS,
             ys_m=sheet.height_m * YS,
@@ -82,17 +82,18 @@ def load_or_compute(
     )
 
 
-def law_by(
+def load_force_model(
     scene: Scene, method: SheetForceMethod, cache_dir: Path | None
 ) -> tuple[SheetForceModel, str]:
-    """The scene's ideal sheet by a method, and what to say of it: a table that nobody made yet is
-    stood in for by the scaled law."""
-    rubber = rubber_of(scene.sheet)
+    """Return the force model of the scene's ideal sheet, and a note for the operator.
+
+    The scaled model replaces a table that is not cached.
+    """
+    rubber = make_rubber(scene.sheet)
     if method != "table":
-        return LAWS[method](rubber), method
+        return FORCE_MODELS[method](rubber), method
     table = load_cached(table_cache(scene), cache_dir)
     if table is None:
-        return ScaledSheetModel(
-            rubber
-        ), "scaled; there is no table of the sheet's force: run flexsheet precompute"
+        note = "scaled; the table of the sheet's force is not computed: run flexsheet precompute"
+        return ScaledSheetModel(rubber), note
     return table, method

@@ -1,4 +1,4 @@
-"""Decides where the sheet shall be: from the fingertip to the sheet's target."""
+"""Wire the planner: fingertips and soft body in, sheet targets out."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from flexsheet.messages.methods import SheetForceMethod, chosen
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import Fingertip, SheetTarget, SoftBody
-from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
-from flexsheet.nodes.planner.force_table import law_by
-from flexsheet.nodes.planner.lead import next_lead_s
-from flexsheet.nodes.planner.motion import Plan, Planned
-from flexsheet.nodes.planner.order import Order
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
+from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.sheet_force import law_for
-from flexsheet.nodes.planner.yielding import Yielding
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.planner.timing import MonotonicTimestampFilter, next_horizon_s
+from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 
-FIRST_LEAD_S = 0.05
-CLOCK_SLACK_S = 0.005
-"""A fingertip from further in the future than this is no measurement."""
+FIRST_HORIZON_S = 0.05
+MAX_FUTURE_S = 0.005
+"""A fingertip that is stamped further in the future is refused."""
 
 
 def _is_finite(fingertip: Fingertip) -> bool:
@@ -34,7 +33,7 @@ def _is_finite(fingertip: Fingertip) -> bool:
 
 
 class Planner(Node):
-    """Publishes one sheet target per fingertip; the same inputs give the same bytes."""
+    """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
     parameters: PlannerParameters
     scene: Input[Scene]
@@ -43,95 +42,101 @@ class Planner(Node):
     sheet_target: Output[SheetTarget]
 
     async def setup(self) -> None:
-        self._plan: Plan | None = None
-        self._yielding: Yielding | None = None
-        self._order = Order()
+        self._trajectory: SheetTrajectoryPlanner | None = None
+        self._compliance: ComplianceController | None = None
+        self._timestamps = MonotonicTimestampFilter()
         self._writer = ("", 0)
         self._first_step_s = 0.0
-        given = self.parameters
-        self._lead_s = FIRST_LEAD_S if given.lead_s is None else given.lead_s
-        self._late, self._law = 0, ""
-        path = given.sheet_calibration
+        fixed_s = self.parameters.prediction_horizon_s
+        self._horizon_s = FIRST_HORIZON_S if fixed_s is None else fixed_s
+        self._late_count, self._model_note = 0, ""
+        path = self.parameters.sheet_calibration
         self._calibration: SheetCalibration | None = None
         if path is not None:
             self._calibration = load_sheet_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
-        # An object that cannot be presented must not leave the last one's plan in force.
-        self._plan = self._yielding = None
-        self._plan = Plan(scene, self.parameters.settings())
+        # If the new object cannot be presented, the last object's plan must not stay in use.
+        self._trajectory = self._compliance = None
+        self._trajectory = SheetTrajectoryPlanner(scene, self.parameters.trajectory_settings())
         if self._calibration is None:
             method: SheetForceMethod = chosen(
                 self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
             )
-            law, self._law = law_by(scene, method, self.parameters.cache_dir)
+            model, self._model_note = load_force_model(scene, method, self.parameters.cache_dir)
         else:
-            law, self._law = law_for(scene.sheet, self._calibration), "as calibrated"
-        self._yielding = Yielding(scene, law, self.parameters.presents)
+            model, self._model_note = make_force_model(scene.sheet, self._calibration), "calibrated"
+        self._compliance = ComplianceController(scene, model, self.parameters.compliance_mode)
         self._first_step_s = 1.0 / scene.camera.rate_hz
-        self._order = Order()
+        self._timestamps = MonotonicTimestampFilter()
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
-        if self._yielding is not None and self._plan is not None:
-            self._yielding.take(soft_body, touching=self._plan.touching)
-            self._tell()
+        if self._compliance is not None and self._trajectory is not None:
+            self._compliance.update(soft_body, in_contact=self._trajectory.in_contact)
+            self._update_note()
 
-    def _tell(self) -> None:
-        late = f"{self._late} fingertips came out of order and were left out" if self._late else ""
-        presented = self._yielding.note if self._yielding is not None else ""
-        law = f"sheet's force: {self._law}"
-        self.note = "; ".join(filter(None, (presented, late, law)))
+    def _update_note(self) -> None:
+        late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
+        compliance = self._compliance.note if self._compliance is not None else ""
+        model = f"sheet force model: {self._model_note}"
+        self.note = "; ".join(filter(None, (compliance, late, model)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
-        plan, yielding = self._plan, self._yielding
-        if plan is None or yielding is None:
+        trajectory, compliance = self._trajectory, self._compliance
+        if trajectory is None or compliance is None:
             return
         writer = (header.clock_id, header.epoch)
         if writer != self._writer:
-            # The triangulator was started anew, and its times with it.
-            self._writer, self._order = writer, Order()
+            # The triangulator has restarted, possibly with another clock.
+            self._writer, self._timestamps = writer, MonotonicTimestampFilter()
         source_ns = header.source_ns
-        step_s = self._order.step_s(source_ns, self._first_step_s)
+        step_s = self._timestamps.update(source_ns, self._first_step_s)
         if step_s is None:
-            self._late += 1
-            self._tell()
+            self._late_count += 1
+            self._update_note()
             return
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
-            planned = plan.hold(f"fingertip: {fingertip.reason}", step_s)
+            planned = trajectory.hold("fingertip_invalid", step_s)
         elif not _is_finite(fingertip):
-            planned = plan.hold("fingertip: numbers that are not finite", step_s)
-        elif not -CLOCK_SLACK_S <= age_s <= self.parameters.oldest_s:
-            planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
+            planned = trajectory.hold("fingertip_not_finite", step_s)
+        elif age_s > self.parameters.max_age_s:
+            planned = trajectory.hold("fingertip_too_old", step_s)
+        elif age_s < -MAX_FUTURE_S:
+            planned = trajectory.hold("fingertip_in_future", step_s)
         else:
-            if self.parameters.lead_s is None:
-                before_s = self._lead_s
-                furthest_s = (
-                    len(fingertip.predicted_path_world_m) - 1
-                ) * fingertip.prediction_step_s
-                self._lead_s = next_lead_s(before_s, age_s + self.parameters.arrival_s, furthest_s)
-                step_s += self._lead_s - before_s
-            point, velocity = path_at(
-                fingertip.predicted_path_world_m, fingertip.prediction_step_s, self._lead_s
+            step_s += self._adapt_horizon(fingertip, age_s)
+            point, velocity = interpolate_path(
+                fingertip.predicted_path_world_m, fingertip.prediction_step_s, self._horizon_s
             )
-            planned = plan.follow_finger(point, velocity, yielding, step_s)
+            planned = trajectory.follow_finger(point, velocity, compliance, step_s)
         self._publish(planned, source_ns)
 
-    def _publish(self, planned: Planned, source_ns: int) -> None:
-        shown = planned.presentation
+    def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:
+        """Update the prediction horizon and return its change (s)."""
+        if self.parameters.prediction_horizon_s is not None:
+            return 0.0
+        before_s = self._horizon_s
+        max_s = (len(fingertip.predicted_path_world_m) - 1) * fingertip.prediction_step_s
+        wanted_s = age_s + self.parameters.actuation_delay_s
+        self._horizon_s = next_horizon_s(before_s, wanted_s, max_s)
+        return self._horizon_s - before_s
+
+    def _publish(self, planned: PlannedStep, source_ns: int) -> None:
+        command = planned.command
         self.sheet_target.publish(
             SheetTarget(
-                phase=shown.phase,
-                reason=shown.reason,
-                valid_at_ns=source_ns + round(self._lead_s * 1e9),
+                phase=command.phase,
+                reason=command.reason,
+                valid_at_ns=source_ns + round(self._horizon_s * 1e9),
                 world_from_sheet=planned.motion.world_from_sheet,
                 twist_world=planned.motion.twist_world,
                 stretch_ratio=planned.motion.stretch_ratio,
                 contact_world_m=planned.contact_world_m,
                 normal_world=planned.normal_world,
                 contact_sheet_m=planned.contact_sheet_m,
-                push_depth_m=shown.push_depth_m,
-                retreat_m=planned.retreat_m,
+                push_depth_m=command.push_depth_m,
+                normal_offset_m=planned.normal_offset_m,
             ),
             source_ns=source_ns,
         )

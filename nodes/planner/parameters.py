@@ -1,4 +1,4 @@
-"""What can be set of the planner, and the bounds that follow from it."""
+"""Define the planner's parameters, and the limits that follow from them."""
 
 from __future__ import annotations
 
@@ -12,58 +12,67 @@ from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import SheetCalibrationFile
-from flexsheet.nodes.planner.easing import JerkBounds
-from flexsheet.nodes.planner.motion import PlanSettings
-from flexsheet.nodes.planner.yielding import Presents
+from flexsheet.nodes.planner.compliance_controller import ComplianceMode
+from flexsheet.nodes.planner.jerk_limiter import JerkBounds
+from flexsheet.nodes.planner.trajectory import TrajectorySettings
 
 
 class PlannerParameters(NodeParameters):
-    lead_s: NonNegative | None = Field(
+    prediction_horizon_s: NonNegative | None = Field(
         default=None,
-        description="how far ahead of the exposure the sheet is planned; "
-        "null: as long as fingertips take, and arrival_s",
+        description="time from the exposure for which the sheet is planned; null: the "
+        "fingertips' mean age plus actuation_delay_s",
     )
-    arrival_s: NonNegative = Field(
-        default=0.036, description="from a fingertip's publication until the sheet gets there"
+    actuation_delay_s: NonNegative = Field(
+        default=0.036, description="time from a fingertip's publication until the sheet moves"
     )
-    presents: Presents = Field(
-        default="curve",
-        description="of the object: its force curve, by stretch and by yielding along the normal; "
-        "or its stiffness, by stretch alone, as the paper does",
+    compliance_mode: ComplianceMode = Field(
+        default="force_curve",
+        description="force_curve: render the object's force over depth, by stretch and normal "
+        "offset; stiffness: render its stiffness by the stretch alone, as the paper does",
     )
     sheet_calibration: SheetCalibrationFile | None = Field(
-        default=None, description="from calibrate sheet; null: ideal rubber of the scene's modulus"
+        default=None,
+        description="file of `calibrate sheet`; null: ideal rubber with the scene's modulus",
     )
     sheet_force: SheetForceMethod | Literal["auto"] = Field(
         default="auto",
-        description="by what ideal rubber is told; auto: as the scene's methods say, else scaled; "
-        "a calibration brings its own",
+        description="force model of ideal rubber; auto: that of the scene's methods, else scaled; "
+        "a calibration has its own model",
     )
     cache_dir: Path | None = Field(
-        default=None, description="of the sheet's force table; null: the user's cache"
+        default=None, description="folder of the sheet's force table; null: the user's cache"
     )
-    touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
-    release_m: Positive = Field(default=0.003, description="contact ends this far from the object")
-    oldest_s: Positive = Field(default=0.1, description="an older fingertip is not followed")
+    contact_on_m: float = Field(
+        default=0.0005, description="distance from the sheet at which contact begins"
+    )
+    contact_off_m: Positive = Field(
+        default=0.003, description="distance from the sheet at which contact ends"
+    )
+    max_age_s: Positive = Field(default=0.1, description="maximum age of a fingertip in use")
     tilt_margin_rad: NonNegative = Field(
-        default=0.14, description="how far past the scene's tilt the sheet still follows"
+        default=0.14, description="angle by which the sheet may exceed the scene's tilt"
     )
-    largest_spin_rad: Positive = Field(
-        default=0.35, description="most that rolling may turn the sheet about its normal"
+    max_spin_rad: Positive = Field(
+        default=0.35, description="maximum rotation of the sheet about its normal by rolling"
     )
-    speed_m_per_s: Positive = 0.18
-    acceleration_m_per_s2: Positive = 2.0
-    turn_rad_per_s: Positive = 2.0
-    turn_acceleration_rad_per_s2: Positive = 12.0
-    stretch_rate_per_s: Positive = 0.03
-    stretch_acceleration_per_s2: Positive = 0.3
-    jerk_m_per_s3: Positive = 60.0
-    turn_jerk_rad_per_s3: Positive = 1000.0
-    stretch_jerk_per_s3: Positive = 9.0
+    speed_m_per_s: Positive = Field(default=0.18, description="maximum, of the sheet's centre")
+    acceleration_m_per_s2: Positive = Field(default=2.0, description="maximum, of the centre")
+    turn_rad_per_s: Positive = Field(default=2.0, description="maximum angular speed")
+    turn_acceleration_rad_per_s2: Positive = Field(
+        default=12.0, description="maximum angular acceleration"
+    )
+    stretch_rate_per_s: Positive = Field(default=0.03, description="maximum, of the stretch ratio")
+    stretch_acceleration_per_s2: Positive = Field(
+        default=0.3, description="maximum, of the stretch ratio"
+    )
+    jerk_m_per_s3: Positive = Field(default=60.0, description="maximum, of the sheet's centre")
+    turn_jerk_rad_per_s3: Positive = Field(default=1000.0, description="maximum angular jerk")
+    stretch_jerk_per_s3: Positive = Field(default=9.0, description="maximum, of the stretch ratio")
 
-    def settings(self) -> PlanSettings:
-        """What the planner's plan is bound to."""
-        return PlanSettings(
+    def trajectory_settings(self) -> TrajectorySettings:
+        """Return the limits of the planned trajectory."""
+        return TrajectorySettings(
             SheetBounds(
                 self.speed_m_per_s,
                 self.acceleration_m_per_s2,
@@ -73,8 +82,8 @@ class PlannerParameters(NodeParameters):
                 self.stretch_acceleration_per_s2,
             ),
             JerkBounds(self.jerk_m_per_s3, self.turn_jerk_rad_per_s3, self.stretch_jerk_per_s3),
-            touch_m=self.touch_m,
-            release_m=self.release_m,
+            contact_on_m=self.contact_on_m,
+            contact_off_m=self.contact_off_m,
             tilt_margin_rad=self.tilt_margin_rad,
-            spin_rad=self.largest_spin_rad,
+            max_spin_rad=self.max_spin_rad,
         )

@@ -1,10 +1,11 @@
-"""A flat sheet on a smooth object: tangent, rolling without slip or spin, never turned too far.
+"""Compute the contact of a flat sheet with a smooth object: tangent, or rolling on it.
 
-All in the object's frame.  The sheet's frame has x from the left edge to the right, y along the
-edges and z out of the object; a place on the sheet is (x, y) in it.  Rolling carries the sheet's
-axes along the contact's path by parallel transport, and the contact's way on the sheet is the
-path's development: the arc AB on the object is as long as A'B on the sheet (the paper's Fig. 7b,
-for any smooth shape; do Carmo, Differential Geometry of Curves and Surfaces, section 4-4).
+All vectors are in the object's frame.  The sheet's frame has x from the left edge to the right, y
+along the edges and z out of the object; a point on the sheet is (x, y) in it.  Rolling without slip
+or spin moves the sheet's axes along the contact's path by parallel transport.  The contact's path
+on the sheet is the development of that on the object: the arc AB is as long as A'B on the sheet
+(the paper's Fig. 7b, for any smooth shape).  Source: do Carmo, Differential Geometry of Curves and
+Surfaces, section 4-4.
 """
 
 from __future__ import annotations
@@ -20,171 +21,177 @@ from flexsheet.nodes.models.shapes import Nearest, Shape
 
 Floats = NDArray[np.float64]
 
-FINEST = 1.0 / 512.0
-"""Share of the way to which the last place within the tilt is found."""
+MIN_STEP_RATIO = 1.0 / 512.0
+"""Resolution of the search for the last point within the tilt, over the distance searched."""
 
-FINEST_INSIDE, NEAR_THE_TILT_RAD = FINEST / 4.0**5, np.radians(1.0)
-"""Where the way passes what is far inside, a step along it is many degrees on the surface: to this
-share then, until the tilt is near."""
+MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
+"""Resolution where the search passes far inside the object: a step there is many degrees on the
+surface.  It applies until the tilt is within this angle of the limit."""
 
 RIM_RADIUS_M = 0.03
-"""So far around it is looked whether the object rises above its own tangent plane."""
+"""Radius around the contact within which the object may rise above the tangent plane."""
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
-    """Where the sheet touches: a surface point with its normal and shape operator, and the sheet.
+class SheetContact:
+    """Hold where the sheet touches the object.
 
-    axes: (3, 3), the sheet's as columns, the third the normal.
-    on_sheet: (x, y) m of the touching point on the sheet.
-    lift_m: how far the plane stands off the point, where the object is hollow there.
+    point, normal: (3,) of the surface.
+    shape_operator: (3, 3), 1/m.
+    axes: (3, 3), the sheet's as columns; the third is the normal.
+    position_sheet_m: (x, y) of the contact on the sheet.
+    lift_m: distance of the sheet's plane from the point, where the object is concave.
     """
 
     point: Floats
     normal: Floats
     shape_operator: Floats
     axes: Floats
-    on_sheet: Floats
+    position_sheet_m: Floats
     lift_m: float = 0.0
 
     @property
-    def place(self) -> Nearest:
-        """The surface point, as a shape found it."""
-        nowhere = np.zeros((), dtype=bool)
-        return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, nowhere, nowhere)
+    def nearest(self) -> Nearest:
+        """The surface point in the form that shapes return."""
+        no = np.zeros((), dtype=bool)
+        return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, no, no)
 
     @property
     def object_from_sheet(self) -> Floats:
-        """The sheet's pose (4, 4), its frame at its middle."""
-        off_plane = np.append(self.on_sheet, -self.lift_m)
-        return transform(self.axes, self.point - self.axes @ off_plane)
+        """The sheet's pose (4, 4), with its frame at its centre."""
+        contact_sheet = np.append(self.position_sheet_m, -self.lift_m)
+        return transform(self.axes, self.point - self.axes @ contact_sheet)
 
     def height_m(self, finger: Floats) -> float:
-        """Of a point (3,) over the sheet's plane; negative behind it."""
+        """Return the height of a point (3,) above the sheet's plane, negative below it."""
         return float((finger - self.point) @ self.normal) - self.lift_m
 
 
-def turned(axes: Floats, normal: Floats) -> Floats:
-    """Axes (3, 3) after the least rotation that takes their third to `normal`, exactly orthogonal.
+def transport_axes(axes: Floats, normal: Floats) -> Floats:
+    """Rotate axes (3, 3) by the least rotation that takes their third to `normal`.
 
-    That is parallel transport along the shorter arc between both normals; opposite ones have none.
+    That is parallel transport along the shorter arc between both normals; it is undefined for
+    opposite ones.  The result is exactly orthogonal.
     """
     both = axes[:, 2] + normal
-    # A reflection that takes minus the third axis to the normal; with the one across the third
-    # axis before it, which leaves the others alone, it is the least rotation (Householder).
+    # Two reflections (Householder): one takes the negated third axis to the normal; the one across
+    # the plane of the first two axes leaves those unchanged.  Together: the least rotation.
     result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
     result[:, 2] = normal
     return result
 
 
-def rolled(contact: Contact, found: Nearest) -> Contact:
-    """The contact after the sheet has rolled to another surface point, a short step away.
+def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
+    """Return the contact after the sheet has rolled to another surface point, a short step away.
 
-    The way on the sheet is the chord, seen half way between both tangent planes and stretched from
-    chord to arc: exact on circles, and of third order in the angle rolled elsewhere.
+    The displacement on the sheet is the chord in the plane half way between both tangent planes,
+    scaled from chord to arc.  It is exact on circles, and of third order in the angle elsewhere.
     """
-    axes = turned(contact.axes, found.normal)
-    middle = turned(contact.axes, _unit(contact.normal + found.normal))
+    axes = transport_axes(contact.axes, found.normal)
+    middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
     chord = found.point - contact.point
     half_angle = 0.5 * angle_between(contact.normal, found.normal)
-    arc_of_chord = 1.0 if half_angle < 1e-9 else half_angle / np.sin(half_angle)
-    way = arc_of_chord * (chord @ middle[:, :2])
-    return Contact(
+    arc_over_chord = 1.0 if half_angle < 1e-9 else half_angle / np.sin(half_angle)
+    displacement = arc_over_chord * (chord @ middle[:, :2])
+    return SheetContact(
         found.point,
         found.normal,
         found.shape_operator,
         axes,
-        contact.on_sheet + way,
+        contact.position_sheet_m + displacement,
         contact.lift_m,
     )
 
 
-def tangent(home: Floats, found: Nearest, half_width_m: float) -> Contact:
-    """The sheet held ready at a surface point, its axes as little turned from `home` as can be.
+def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> SheetContact:
+    """Return the contact of a sheet that waits at a surface point, for a finger that approaches.
 
-    The finger will meet the sheet's middle line; along x the sheet's middle stays over the
-    object's, as far as the sheet reaches.
+    Its axes are those of `home` (3, 3), transported to the normal.  The contact is on the sheet's
+    horizontal centre line.  Along x the sheet's centre stays over the object's, within the sheet.
     """
-    axes = turned(home, found.normal)
+    axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
-    return Contact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
+    return SheetContact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
 
 
-def rolling_twist(contact: Contact, rate: Floats) -> Floats:
-    """Twist (6,) of the rolling sheet's middle while the contact moves at `rate` (3,) m/s.
+def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
+    """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
-    Without spin the sheet turns by n x dn; without slip its point that touches is at rest.
+    Without spin the sheet rotates by n x dn; without slip its point in contact is at rest.
     """
-    along = rate - contact.normal * (rate @ contact.normal)
-    turning = cross(contact.normal, contact.shape_operator @ along)
-    x, y = contact.on_sheet
-    to_middle = contact.lift_m * contact.normal - x * contact.axes[:, 0] - y * contact.axes[:, 1]
-    return np.concatenate([cross(turning, to_middle), turning])
+    tangential = rate - contact.normal * (rate @ contact.normal)
+    angular = cross(contact.normal, contact.shape_operator @ tangential)
+    x, y = contact.position_sheet_m
+    to_centre = contact.lift_m * contact.normal - x * contact.axes[:, 0] - y * contact.axes[:, 1]
+    return np.concatenate([cross(angular, to_centre), angular])
 
 
-def tangent_twist(contact: Contact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
-    """Twist (6,) of the sheet held ready while the point under the finger moves at `rate`.
+def tangent_twist(contact: SheetContact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
+    """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
 
-    Its axes stay turned from `home` by the least rotation, which spins them about the normal n by
-    -(h x n) dn / (1 + h n) besides n x dn, h the third of home.
+    Its axes follow from `home` by the least rotation.  Besides n x dn, that rotates them about the
+    normal n by -(h x n) dn / (1 + h n), where h is the third axis of home.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
-    along = rate - normal * (rate @ normal)
-    turn_rate = contact.shape_operator @ along
+    tangential = rate - normal * (rate @ normal)
+    normal_rate = contact.shape_operator @ tangential
     front = home[:, 2]
-    spin = -(cross(front, normal) @ turn_rate) / (1.0 + front @ normal)
-    turning = cross(normal, turn_rate) + spin * normal
-    x_axis_rate = cross(turning, axes[:, 0])
-    ahead = float(axes[:, 0] @ point)
-    x = min(max(ahead, -half_width_m), half_width_m)
-    x_rate = x_axis_rate @ point + axes[:, 0] @ along if x == ahead else 0.0
-    shift = along - x_rate * axes[:, 0] - x * x_axis_rate + contact.lift_m * turn_rate
-    return np.concatenate([shift, turning])
+    spin = -(cross(front, normal) @ normal_rate) / (1.0 + front @ normal)
+    angular = cross(normal, normal_rate) + spin * normal
+    x_axis_rate = cross(angular, axes[:, 0])
+    unlimited_x = float(axes[:, 0] @ point)
+    x = min(max(unlimited_x, -half_width_m), half_width_m)
+    x_rate = x_axis_rate @ point + axes[:, 0] @ tangential if x == unlimited_x else 0.0
+    linear = tangential - x_rate * axes[:, 0] - x * x_axis_rate + contact.lift_m * normal_rate
+    return np.concatenate([linear, angular])
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """The cross product (3,), at a fraction of the library's cost."""
+    """Return the cross product (3,); np.cross is several times slower for one pair."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
-def spin_rad(axes: Floats, home: Floats) -> float:
-    """How far the sheet is turned about its normal from how it would be held ready there."""
-    ready = turned(home, axes[:, 2])
+def measure_spin_rad(axes: Floats, home: Floats) -> float:
+    """Return the rotation about the normal from the transported axes of `home` to `axes`."""
+    ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
 
 
-def within_tilt(
-    shape: Shape, start: Nearest, found: Nearest, front: Floats, tilt_rad: float
+def limit_tilt(
+    shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """The last point towards `found` whose normal is within the tilt, and whether it is another.
+    """Return the last point towards `found` whose normal is within the tilt.
 
-    start: surface point to come from, itself within the tilt.  The way is felt along the straight
-    line from there, in steps that grow, so that the side is kept on which the sheet is; a sheet
-    that is at the tilt already learns so from the first.
+    Also return whether it is another point than `found`.
+
+    start: the surface point from which the search starts, itself within the tilt.  The search
+        follows the straight line to `found` in growing steps and projects each onto the surface, so
+        that it stays on the sheet's side.  It begins with the finest step, which is enough for a
+        sheet that is at the limit already.
     """
-    most, near = np.cos(tilt_rad), np.cos(max(tilt_rad - NEAR_THE_TILT_RAD, 0.0))
-    if found.normal @ front >= most:
+    limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
+    if found.normal @ front >= limit:
         return found, False
-    reached, step = 0.0, FINEST
-    best, way = start, found.point - start.point
-    while step >= FINEST or (step >= FINEST_INSIDE and best.normal @ front > near):
-        there = shape.closest(start.point + (reached + step) * way, previous=start.point)
-        if there.normal @ front >= most:
-            best, reached = there, reached + step
+    reached, step = 0.0, MIN_STEP_RATIO
+    best, displacement = start, found.point - start.point
+    while step >= MIN_STEP_RATIO or (step >= MIN_INNER_STEP_RATIO and best.normal @ front > near):
+        tried = shape.closest(start.point + (reached + step) * displacement, previous=start.point)
+        if tried.normal @ front >= limit:
+            best, reached = tried, reached + step
             step = min(2.0 * step, 1.0 - reached)
         else:
             step *= 0.25
     return best, True
 
 
-def rim_lift_m(shape: Shape, contact: Contact) -> float:
-    """How far the tangent plane must stand off its point to clear the object around it (m).
+def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
+    """Return how far the tangent plane must be lifted to clear the object around the contact (m).
 
-    0 where the object is not hollow.  Around is as far as a finger pulls the sheet down with it.
+    It is 0 where the object is not concave.  `RIM_RADIUS_M` is how far a finger deforms the sheet.
     """
     return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 
 
-def _unit(vector: Floats) -> Floats:
+def _normalize(vector: Floats) -> Floats:
     return np.asarray(vector / sqrt(vector @ vector))

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Sphere
+from flexsheet.messages.scene import Cylinder, Geometry, Mesh, Plane
 from flexsheet.nodes.models.rigid import apply
-from flexsheet.nodes.models.shapes import MeshError, Shape
+from flexsheet.nodes.models.shapes import GEOMETRIES, CuboidMap, MeshError, Shape
 from flexsheet.nodes.models.shapes.triangles import (
     find_degenerate,
     nearest_in_triangles,
@@ -28,7 +28,6 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
-Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
 MIN_AROUND = 128
 """Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
@@ -89,7 +88,10 @@ def make_surface(
             found = shape.closest(points)
             points, normals = found.point, found.normal
         case _:
-            points, triangles = _inflate_cuboid(geometry, shape, spacing_m)
+            cuboid_map = GEOMETRIES[geometry.shape].cuboid_map
+            if cuboid_map is None:
+                raise ValueError(f'geometry "{geometry.shape}" has no cuboid_map to be drawn by')
+            points, triangles = _inflate_cuboid(cuboid_map(geometry, shape), spacing_m)
             normals = shape.closest(points).normal
     return ObjectSurface.placed(points, normals, triangles, world_from_object)
 
@@ -149,22 +151,13 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
     return np.column_stack([u.ravel(), v.ravel()]), triangles
 
 
-def _inflate_cuboid(
-    geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, spacing_m: float
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return a cuboid's surface grid mapped onto a rounder solid: points (n, 3), triangles (t, 3).
-
-    Onto a box by the nearest points; onto an ellipsoid by the map of a cube to the sphere that
-    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically).
-    """
-    if isinstance(geometry, RoundedBox):
-        half = 0.5 * np.array(geometry.size_m)
-        cells = [_cells(length, spacing_m) for length in geometry.size_m]
+def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
+    """Return a cuboid's surface grid mapped onto a solid: points (n, 3), triangles (t, 3)."""
+    if template.is_round:
+        quarter_m = 0.5 * np.pi * float(template.half_m.max())
+        cells = [max(_cells(quarter_m, spacing_m), MIN_AROUND // 4)] * 3
     else:
-        axes = geometry.semi_axes_m if isinstance(geometry, Ellipsoid) else (geometry.radius_m,) * 3
-        half = np.array(axes)
-        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), MIN_AROUND // 4)
-        cells = [quarter] * 3
+        cells = [_cells(2.0 * half, spacing_m) for half in template.half_m.tolist()]
     points, triangles, count = [], [], 0
     for axis in range(3):
         second, third = (axis + 1) % 3, (axis + 2) % 3
@@ -176,13 +169,7 @@ def _inflate_cuboid(
             triangles.append((faces if side > 0 else faces[:, ::-1]) + count)
             count += len(w)
     w, joined = np.unique(np.concatenate(points).round(12), axis=0, return_inverse=True)
-    if isinstance(geometry, RoundedBox):
-        onto = shape.closest(half * w).point
-    else:
-        square = w**2
-        beside, beyond = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
-        onto = half * w * np.sqrt(1.0 - 0.5 * (beside + beyond) + beside * beyond / 3.0)
-    return onto, joined.ravel()[np.concatenate(triangles)]
+    return template.surface(w), joined.ravel()[np.concatenate(triangles)]
 
 
 class VertexNormals:

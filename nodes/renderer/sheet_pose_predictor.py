@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
-from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
@@ -76,4 +76,6 @@ def predict_fingertip(
     if finger.message is None or not finger.message.valid or age_s > max_age_s:
         return None
     message = finger.message
-    return path_at(message.predicted_path_world_m, message.prediction_step_s, age_s + horizon_s)[0]
+    return interpolate_path(
+        message.predicted_path_world_m, message.prediction_step_s, age_s + horizon_s
+    )[0]

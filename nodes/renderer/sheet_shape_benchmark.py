@@ -89,7 +89,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 rubber,
                 stretch_ratio=stretch,
                 depths_m=np.array([depth]),
-                place_m=(float(sheet.pushed_point[0]), float(sheet.pushed_point[1])),
+                position_m=(float(sheet.pushed_point[0]), float(sheet.pushed_point[1])),
                 finger_radius_m=scene.finger.radius_m,
             )
             rows, columns = pushed.rest_m.shape[:2]

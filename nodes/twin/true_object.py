@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from flexsheet.messages.scene import Cylinder, Ellipsoid, Geometry, Mesh, Plane, Scene, Sphere
 from flexsheet.nodes.models.rigid import apply, transform_from_rpy
-from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ class TrueBody:
                 rest, triangles = _cut_up(vertices, coarse.astype(np.intp))
                 rest = shape.closest(rest).point
             case _:
-                rest, triangles = _star(_reach(geometry, shape))
+                rest, triangles = _star(_cast_rays(geometry, shape))
         self._rest, self._triangles = apply(world_from_object, rest), triangles
         owners = np.repeat(np.arange(len(triangles)), 3)
         self._of_vertices = csr_array(
@@ -204,16 +204,20 @@ def _star(vertices: Floats) -> tuple[Floats, Indices]:
     return vertices, np.concatenate([_strip(rows, AROUND), *caps])
 
 
-def _reach(geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape) -> Floats:
-    """Where rays from the centre along `_directions` leave a convex solid, (directions, 3)."""
+def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
+    """Return where rays from the centre along `_directions` leave the solid, (directions, 3).
+
+    Every point of the solid must be visible from its centre.
+    """
     away = _directions()
     match geometry:
         case Sphere(radius_m=radius):
             return radius * away
         case Ellipsoid(semi_axes_m=axes):
             return np.asarray(away / np.linalg.norm(away / np.array(axes), axis=1)[:, None])
-    # From outside, steps of the distance never pass the surface of a convex solid.
-    reach = np.full(len(away), float(np.linalg.norm(geometry.size_m)))
+    # From outside, steps of the distance never pass the surface.
+    low, high = GEOMETRIES[geometry.shape].bounds_m(geometry)
+    reach = np.full(len(away), float(np.linalg.norm(np.maximum(-low, high))))
     for _ in range(100):
         step = shape.signed_distance(reach[:, None] * away)
         reach -= step

@@ -2,8 +2,8 @@
 
 The definitions are those of `launch.experiments.stroke`; here they are applied to any session, in
 memory that does not grow with it.  Where the planner has the sheet comply, the reference is the
-object's surface lowered by the commanded `retreat_m`.  In the experiment's own strokes it is the
-surface itself, as in the paper.
+object's surface lowered by the commanded `normal_offset_m`.  In the experiment's own strokes it
+is the surface itself, as in the paper.
 """
 
 from __future__ import annotations
@@ -131,7 +131,9 @@ class SheetErrors:
                 self._contact, self._following = [], []
             case SheetTarget():
                 touches = float(message.phase == "contact")
-                self._contact.append((message.valid_at_ns, np.array([touches, message.retreat_m])))
+                self._contact.append(
+                    (message.valid_at_ns, np.array([touches, message.normal_offset_m]))
+                )
                 self._target_holds = message.phase in ("hold", "wait")
             case Fingertip() if message.valid:
                 self.measured.finger.append((source_ns, message.position_world_m))
@@ -193,8 +195,8 @@ class SheetErrors:
                 if any(run.stroke_s is not None for run in self.runs):
                     found = sheet_errors(scene, finger, edges, times_ns, shape=shape)
                     self._add_strokes(name, times_ns, *found)
-                touches, retreat_m = self._touched(times_ns)
-                found = sheet_errors(scene, finger, edges, times_ns, retreat_m, shape=shape)
+                touches, normal_offset_m = self._touched(times_ns)
+                found = sheet_errors(scene, finger, edges, times_ns, normal_offset_m, shape=shape)
                 self._add(name, times_ns[touches], found[0][touches], found[1][touches])
                 if name == "true":
                     local = apply(inverse(object_pose(scene)), finger.at(times_ns))
@@ -240,9 +242,9 @@ class SheetErrors:
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = make_motion(self._contact, "sheet_target")
-        touches, retreat_m = contact.at(times_ns).T
+        touches, normal_offset_m = contact.at(times_ns).T
         covered = contact.covers(times_ns)
-        return (touches > 0.999) & covered, np.where(covered, retreat_m, 0.0)
+        return (touches > 0.999) & covered, np.where(covered, normal_offset_m, 0.0)
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:

@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import (
     BaseSupport,
     Cylinder,
-    Ellipsoid,
     Geometry,
     Mesh,
     Plane,
-    RoundedBox,
     Scene,
-    Sphere,
     StripSupport,
     Support,
 )
@@ -36,7 +33,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 )
 from flexsheet.nodes.fem_solver.mesh.supports import select_fixed
 from flexsheet.nodes.models import rigid
-from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import volume_m3
 
 Floats = NDArray[np.float64]
@@ -224,24 +221,10 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
-    """Return the corners of the box around what is meshed."""
-    match spec.geometry:
-        case Cylinder(radius_m=radius, length_m=length):
-            half = np.array([0.5 * length, radius, radius])
-        case Sphere(radius_m=radius):
-            half = np.full(3, radius)
-        case Ellipsoid(semi_axes_m=axes):
-            half = np.array(axes)
-        case RoundedBox(size_m=size):
-            half = 0.5 * np.array(size)
-        case Plane(width_m=width, height_m=height):
-            margin = spec.slab_depth_m
-            x, y = 0.5 * width + margin, 0.5 * height + margin
-            return np.array([-x, -y, -margin]), np.array([x, y, 0.0])
-        case Mesh(vertices_m=vertices, triangles=triangles):
-            used = vertices[np.unique(triangles)]
-            return used.min(axis=0), used.max(axis=0)
-    return -half, half
+    """Return the corners of the box around what is meshed; a half-space's slab is wider."""
+    low, high = GEOMETRIES[spec.geometry.shape].bounds_m(spec.geometry)
+    margin = spec.slab_depth_m
+    return low - margin, high + np.array([margin, margin, 0.0])
 
 
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
@@ -267,11 +250,13 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
         half = 0.5 * np.array([geometry.width_m, geometry.height_m]) + 1e-9
         touchable = (normals[:, 2] > 0.0) & (np.abs(nodes[:, :2]) <= half).all(axis=1)
     else:
-        if isinstance(geometry, Mesh):
-            nodes, elements = fit_mesh(shape, *_box(spec), spec.grading)
-            _require_volume(geometry, nodes, elements, spec)
+        cuboid_map = GEOMETRIES[geometry.shape].cuboid_map
+        if cuboid_map is not None:
+            nodes, elements = mesh_by_map(cuboid_map(geometry, shape), shape, spec.grading)
         else:
-            nodes, elements = mesh_by_map(geometry, shape, spec.grading)
+            nodes, elements = fit_mesh(shape, *_box(spec), spec.grading)
+        if isinstance(geometry, Mesh):
+            _require_volume(geometry, nodes, elements, spec)
         skin = np.unique(boundary_faces(elements))
         normals = np.zeros_like(nodes)
         normals[skin] = shape.closest(nodes[skin]).normal

@@ -17,12 +17,11 @@ and for a rounded box the nearest point of its surface. Symmetric solids get sym
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Ellipsoid, Plane, RoundedBox, Sphere
+from flexsheet.messages.scene import Plane
 from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
 from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
 from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
@@ -37,14 +36,12 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     add_midside_nodes,
     orient_tetrahedra,
 )
-from flexsheet.nodes.models.shapes import Shape
+from flexsheet.nodes.models.shapes import CuboidMap, Shape
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-INNER = 0.8
-"""Half extents of an ellipsoid's inner lattice over its semi-axes."""
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
 """Widths of cells before bisection, in smallest elements, or a little less."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
@@ -55,51 +52,26 @@ MAX_SURPLUS_RATIO = 2.0
 """Lattices with more elements than this many times the fewest are not tried."""
 
 
-@dataclass(frozen=True, slots=True)
-class TemplateMap:
-    """A cuboid and its map: half extents (3,) of the solid, X(w) and c of the module's text."""
-
-    half_m: Floats
-    inner_m: Floats
-    surface: Callable[[Floats], Floats]
-
-    def positions(self, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-        """Return images (n, 3) of lattice vertices (n, 3), and the surface points (n, 3) outside
-        them."""
-        u = vertices / (CELL * half_cells)
-        weight = np.abs(u).max(axis=1, keepdims=True)
-        # The middle has no direction; any serves, because it has the maximum depth.
-        w = np.where(weight > 0.0, u / np.maximum(weight, 1e-300), np.array([0.0, 0.0, 1.0]))
-        outside = self.surface(w)
-        return self.inner_m * u + weight**2 * (outside - self.inner_m * w), outside
+def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
+    """Return images (n, 3) of lattice vertices (n, 3), and the surface points outside them."""
+    u = vertices / (CELL * half_cells)
+    weight = np.abs(u).max(axis=1, keepdims=True)
+    # The middle has no direction; any serves, because it has the maximum depth.
+    w = np.where(weight > 0.0, u / np.maximum(weight, 1e-300), np.array([0.0, 0.0, 1.0]))
+    outside = template.surface(w)
+    return template.inner_m * u + weight**2 * (outside - template.inner_m * w), outside
 
 
-def make_template_map(geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape) -> TemplateMap:
-    """Return the map of a geometry that has this shape."""
-    if isinstance(geometry, RoundedBox):
-        half = 0.5 * np.array(geometry.size_m)
-        return TemplateMap(half, half, lambda w: shape.closest(half * w).point)
-    if isinstance(geometry, Sphere):
-        half = np.full(3, geometry.radius_m)
-    else:
-        half = np.array(geometry.semi_axes_m)
-    return TemplateMap(half, INNER * half, lambda w: half * _cube_to_sphere(w))
-
-
-def mesh_by_map(
-    geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, grading: Grading
-) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), object's frame, and elements (e, 10) of a geometry that has this
-    shape."""
-    template = make_template_map(geometry, shape)
+def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Floats, Ints]:
+    """Return nodes (n, 3), object's frame, and elements (e, 10) of a shape with this map."""
 
     def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-        points, outside = template.positions(vertices, half_cells)
+        points, outside = map_lattice(template, vertices, half_cells)
         depth = np.linalg.norm(outside - points, axis=1)
         return points, grading.sizes(shape.closest(outside).normal, depth)
 
     # A lattice's outermost cells are compressed where its corners become round.
-    squeezed = 1.0 if isinstance(geometry, RoundedBox) else np.pi / 4
+    squeezed = np.pi / 4 if template.is_round else 1.0
     for corners, tetrahedra, on_hull in _map_lattices(
         squeezed * template.half_m, grading.element_m, positions
     ):
@@ -176,11 +148,3 @@ def _map_lattices(
         on_hull = (np.abs(vertices) == CELL * half_cells).any(axis=1)
         found.append((corners, orient_tetrahedra(corners, tetrahedra), on_hull))
     return sorted(found, key=lambda image: len(image[1]))
-
-
-def _cube_to_sphere(w: Floats) -> Floats:
-    """Map points (n, 3) of the surface of the cube -1..1 to the unit sphere."""
-    square = np.square(w)
-    second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
-    result: Floats = w * np.sqrt(1.0 - 0.5 * (second + third) + second * third / 3.0)
-    return np.asarray(result / np.linalg.norm(result, axis=1, keepdims=True))

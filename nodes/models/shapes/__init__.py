@@ -5,6 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from flexsheet.nodes.models.shapes.geometries import (
+    GEOMETRIES,
+    CuboidMap,
+    GeometryDescription,
+    map_nearest_points,
+    map_round_solid,
+)
 from flexsheet.nodes.models.shapes.smooth_mesh import SmoothMeshShape
 from flexsheet.nodes.models.shapes.solids import (
     CylinderShape,
@@ -23,15 +30,6 @@ from flexsheet.nodes.models.shapes.surface import (
 )
 from flexsheet.nodes.models.shapes.triangles import MeshError
 
-SHAPES: dict[str, type[Shape]] = {
-    "cylinder": CylinderShape,
-    "sphere": SphereShape,
-    "plane": PlaneShape,
-    "ellipsoid": EllipsoidShape,
-    "rounded_box": RoundedBoxShape,
-    "mesh": SmoothMeshShape,
-}
-
 
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
     """Make the shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
@@ -42,15 +40,17 @@ def make_shape(geometry: Mapping[str, Any]) -> Shape:
     Raises KeyError for an unknown name, and ValueError (MeshError) for dimensions that make no
     solid.
     """
-    measures = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
-    return SHAPES[geometry["shape"]](**measures)
+    dimensions = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
+    return GEOMETRIES[geometry["shape"]].make_shape(**dimensions)
 
 
 __all__ = [
-    "SHAPES",
+    "GEOMETRIES",
     "Convex",
+    "CuboidMap",
     "CylinderShape",
     "EllipsoidShape",
+    "GeometryDescription",
     "MeshError",
     "Nearest",
     "PlaneShape",
@@ -59,6 +59,8 @@ __all__ = [
     "SmoothMeshShape",
     "SphereShape",
     "make_shape",
+    "map_nearest_points",
+    "map_round_solid",
     "principal_curvatures",
     "projection_jacobian",
     "tightest_curvature",

@@ -6,7 +6,7 @@ the sheet's normal, its derivative over the depth, and the force on the clamps.
 
 By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
     `nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.  `invalid_reason` of
-    each tells where it does not hold.
+    each returns why it does not hold.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
-from flexsheet.nodes.models.sheet.tension import PUSH_FACTOR
+from flexsheet.nodes.models.sheet.tension import PUSH_FACTOR, edge_force_n, strain_measure
 
 Floats = NDArray[np.float64]
-Place = tuple[float, float]
+SheetPosition = tuple[float, float]
 
-CENTRE: Place = (0.0, 0.0)
+CENTRE: SheetPosition = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,12 @@ class SheetForceModel(Protocol):
     def rubber(self) -> Rubber: ...
 
     def evaluate(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depths_m: Floats,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> SheetForce:
         """Return the forces at depths (n,), m; a depth of zero or less gives no force.
 
@@ -57,42 +62,39 @@ class SheetForceModel(Protocol):
         ...
 
     def invalid_reason(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depth_m: float,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> str:
         """Return why the model does not hold there; empty where it does."""
         ...
 
 
-def strain_measure(stretch_ratio: float, mooney_share: float = 0.0) -> float:
-    """Return the nominal stress of simple tension over E: (s - s^-2)/3, for Mooney rubber times 1 -
-    m + m/s; 0 when slack."""
-    s = max(stretch_ratio, 1.0)
-    return (s - s**-2) / 3.0 * (1.0 - mooney_share + mooney_share / s)
-
-
-CLAMP_FACTOR, CLAMP_BY_HEIGHT = 1.004, 0.0735
-"""Edge force over that of simple tension.  It grows with height over width, since the clamps
-prevent the sheet from narrowing.  It is within 0.3 % of membrane FE for ratios from 0.5 to 1.5 and
-stretch to 1.12."""
-
-
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
     """Return the force (N) on each clamp of the unpushed sheet."""
-    clamped = CLAMP_FACTOR + CLAMP_BY_HEIGHT * rubber.height_m / rubber.width_m
-    modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.height_m
-    return clamped * modulus * strain_measure(stretch_ratio, rubber.mooney_share)
+    return edge_force_n(
+        stretch_ratio,
+        young_modulus_pa=rubber.young_modulus_pa,
+        width_m=rubber.width_m,
+        height_m=rubber.height_m,
+        thickness_m=rubber.thickness_m,
+        mooney_share=rubber.mooney_share,
+    )
 
 
 def _checked(
-    stretch_ratio: float, depths_m: Floats, place_m: Place, finger_radius_m: float
+    stretch_ratio: float, depths_m: Floats, position_m: SheetPosition, finger_radius_m: float
 ) -> Floats:
     """Return the depths, at least 0; ValueError unless all is finite and stretch and radius are
     positive."""
     depths = np.asarray(depths_m, dtype=np.float64)
-    numbers = (stretch_ratio, *place_m, finger_radius_m)
+    numbers = (stretch_ratio, *position_m, finger_radius_m)
     if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
         raise ValueError(
-            f"a push of {depths} m at {place_m}, stretch {stretch_ratio}, radius "
+            f"a push of {depths} m at {position_m}, stretch {stretch_ratio}, radius "
             f"{finger_radius_m} is not finite"
         )
     if stretch_ratio <= 0.0 or finger_radius_m <= 0.0:
@@ -100,11 +102,13 @@ def _checked(
     return np.maximum(depths, 0.0)
 
 
-def relative_position(rubber: Rubber, stretch_ratio: float, place_m: Place) -> tuple[float, float]:
+def relative_position(
+    rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
+) -> tuple[float, float]:
     """Return (|x|, |y|) of a position on the stretched sheet: 0 at the centre, 1 at clamp and free
     edge."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
-    return abs(place_m[0]) / half_width, abs(place_m[1]) / (0.5 * rubber.height_m)
+    return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 
 
 MAX_RELATIVE_X = 0.98
@@ -123,23 +127,33 @@ class LinearSheetModel:
     name: str = "linear"
 
     def evaluate(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depths_m: Floats,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
         edge = flat_edge_force_n(self.rubber, stretch_ratio)
-        x, _ = relative_position(self.rubber, stretch_ratio, place_m)
+        x, _ = relative_position(self.rubber, stretch_ratio, position_m)
         slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, MAX_RELATIVE_X) ** 2)
         return SheetForce(slope * depths, np.full(depths.shape, slope), np.full(depths.shape, edge))
 
     def invalid_reason(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depth_m: float,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> str:
         scaled = scaled_depth(self.rubber, stretch_ratio, depth_m)
         if stretch_ratio < 1.01:
             return "a slack sheet is not linear at all"
         if not LINEAR_FROM <= scaled <= LINEAR_TO:
             return "the line meets the curve of a fingertip at middle depths only"
-        x, y = relative_position(self.rubber, stretch_ratio, place_m)
+        x, y = relative_position(self.rubber, stretch_ratio, position_m)
         if max(x, y) > 0.34:
             return "too near to an edge"
         if stretch_ratio > MAX_STRETCH_RATIO:
@@ -228,11 +242,16 @@ class ScaledSheetModel:
     name: str = "scaled"
 
     def evaluate(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depths_m: Floats,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
         rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
-        x, y = relative_position(rubber, s, place_m)
+        x, y = relative_position(rubber, s, position_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
         strain = strain_measure(s, rubber.mooney_share)
         share = depths / rubber.width_m
@@ -271,14 +290,19 @@ class ScaledSheetModel:
         )
 
     def invalid_reason(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depth_m: float,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> str:
         rubber, stretch_ratio = self.rubber, self.stretch_scale * stretch_ratio
         if not 1.0 <= stretch_ratio <= MAX_STRETCH_RATIO:
             return f"stretch {stretch_ratio:.3f} is not from 1 to {MAX_STRETCH_RATIO:g}"
         if not 0.008 <= depth_m / rubber.width_m <= 0.21:
             return "the depth is not 0.8 to 21 % of the sheet's width"
-        x, y = relative_position(rubber, stretch_ratio, place_m)
+        x, y = relative_position(rubber, stretch_ratio, position_m)
         if x > 0.5 or y > 0.76:
             return "too near to an edge"
         return _invalid_sizes(rubber, finger_radius_m)
@@ -293,15 +317,20 @@ class MembraneSheetModel:
     name: str = "membrane"
 
     def evaluate(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depths_m: Floats,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
         wanted = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
         path = push_path(
             self.rubber,
             stretch_ratio=stretch_ratio,
             depths_m=wanted,
-            place_m=place_m,
+            position_m=position_m,
             finger_radius_m=finger_radius_m,
             cells=self.cells,
         )
@@ -312,11 +341,16 @@ class MembraneSheetModel:
         return SheetForce(path.forces_n[at], rise / run, path.edge_forces_n[at])
 
     def invalid_reason(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depth_m: float,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> str:
         if depth_m < 0.2 * finger_radius_m:
             return "the contact is smaller than the mesh"
-        x, y = relative_position(self.rubber, stretch_ratio, place_m)
+        x, y = relative_position(self.rubber, stretch_ratio, position_m)
         return "" if x <= 0.8 and y <= 0.9 else "the fingertip reaches over an edge"
 
 
@@ -329,18 +363,18 @@ def depth_for_force(
     stretch_ratio: float,
     forces_n: Floats,
     *,
-    deepest_m: float,
-    place_m: Place,
+    max_depth_m: float,
+    position_m: SheetPosition,
     finger_radius_m: float,
 ) -> Floats:
-    """Return the depths (n,) at which the model gives these forces, at most `deepest_m`.
+    """Return the depths (n,) at which the model gives these forces, at most `max_depth_m`.
 
     One call of the model at depths that are denser near 0, and linear interpolation of log force
     over log depth, which is nearly straight: within 1e-3 of the depth.
     """
-    grid = deepest_m * _INVERSE_GRID
+    grid = max_depth_m * _INVERSE_GRID
     pressed = law.evaluate(
-        stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m
+        stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
     ).force_n
     return interpolated_inverse(grid, pressed, np.asarray(forces_n, dtype=np.float64))
 

@@ -72,19 +72,21 @@ class IndentationBasis:
     modes: Floats
     coefficients: Floats
 
-    def offsets(self, stretch_ratio: float, place_m: tuple[float, float], depth_m: float) -> Floats:
+    def offsets(
+        self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
+    ) -> Floats:
         """Return the displacement (rows, columns, 3), m, from the flat, uniformly stretched sheet.
 
-        place_m: (x, y) of the fingertip over the sheet.
+        position_m: (x, y) of the fingertip over the sheet.
 
         Rows run along y and columns along x of the sheet's frame.  Outside the solved range, the
         nearest border of the range is taken (see `invalid_reason`).
         """
-        mirrored = (place_m[0] < 0.0, place_m[1] < 0.0)
+        mirrored = (position_m[0] < 0.0, position_m[1] < 0.0)
         weights = (
             _barycentric_weights(self.stretches, stretch_ratio),
-            _barycentric_weights(self.xs_m, abs(place_m[0])),
-            _barycentric_weights(self.ys_m, abs(place_m[1])),
+            _barycentric_weights(self.xs_m, abs(position_m[0])),
+            _barycentric_weights(self.ys_m, abs(position_m[1])),
             _barycentric_weights(self.roots, np.sqrt(max(depth_m, 0.0) / self.deepest_m)),
         )
         table = self.coefficients
@@ -97,16 +99,16 @@ class IndentationBasis:
             shape = shape[::-1] * [1.0, -1.0, 1.0]
         return np.asarray(shape)
 
-    def grid(self, stretch_ratio: float, place_m: tuple[float, float]) -> Floats:
+    def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
         """Return the same points (rows, columns, 2) in the flat, uniformly stretched sheet."""
         sheet, most_x, most_y = self.rubber, self.xs_m[-1], self.ys_m[-1]
-        focus_x = float(np.clip(place_m[0], -most_x, most_x)) / stretch_ratio
+        focus_x = float(np.clip(position_m[0], -most_x, most_x)) / stretch_ratio
         x = _grade_coordinates(focus_x, 0.5 * sheet.width_m)
-        y = _grade_coordinates(float(np.clip(place_m[1], -most_y, most_y)), 0.5 * sheet.height_m)
+        y = _grade_coordinates(float(np.clip(position_m[1], -most_y, most_y)), 0.5 * sheet.height_m)
         return np.stack(np.meshgrid(stretch_ratio * x, y), axis=-1)
 
     def invalid_reason(
-        self, stretch_ratio: float, place_m: tuple[float, float], depth_m: float
+        self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> str:
         """Return why a push is outside the solved range; empty where it is inside."""
         if not self.stretches[0] <= stretch_ratio <= self.stretches[-1]:
@@ -116,8 +118,8 @@ class IndentationBasis:
             )
         if depth_m > self.deepest_m:
             return f"push of {1e3 * depth_m:.0f} mm is deeper than {1e3 * self.deepest_m:.0f} mm"
-        if abs(place_m[0]) > self.xs_m[-1] or abs(place_m[1]) > self.ys_m[-1]:
-            x, y = 1e3 * place_m[0], 1e3 * place_m[1]
+        if abs(position_m[0]) > self.xs_m[-1] or abs(position_m[1]) > self.ys_m[-1]:
+            x, y = 1e3 * position_m[0], 1e3 * position_m[1]
             return f"push at ({x:.0f}, {y:.0f}) mm is too near to the sheet's edge"
         return ""
 
@@ -137,7 +139,7 @@ class IndentationCase:
 
     rubber: Rubber
     stretch_ratio: float
-    place_m: tuple[float, float]
+    position_m: tuple[float, float]
     depths_m: Floats
     finger_radius_m: float
     element_cells: int
@@ -201,14 +203,14 @@ def solve_indentation(push: IndentationCase) -> Floats:
         rubber,
         stretch_ratio=stretch,
         depths_m=push.depths_m,
-        place_m=push.place_m,
+        position_m=push.position_m,
         finger_radius_m=push.finger_radius_m,
         cells=push.element_cells,
     )
     rest = pushed.rest_m
     flat = np.stack([stretch * rest[..., 0], rest[..., 1], np.zeros(rest.shape[:2])], axis=-1)
-    x = _grade_coordinates(push.place_m[0] / stretch, 0.5 * rubber.width_m)
-    y = _grade_coordinates(push.place_m[1], 0.5 * rubber.height_m)
+    x = _grade_coordinates(push.position_m[0] / stretch, 0.5 * rubber.width_m)
+    y = _grade_coordinates(push.position_m[1], 0.5 * rubber.height_m)
     along_x, along_y = _linear_weights(rest[0, :, 0], x), _linear_weights(rest[:, 0, 1], y)
     offsets = pushed.positions - flat
     return np.asarray(np.einsum("Rr,Cc,drck->dRCk", along_y, along_x, offsets, optimize=True))

@@ -77,14 +77,14 @@ def push_path(
     *,
     stretch_ratio: float,
     depths_m: Sequence[float] | Floats,
-    place_m: tuple[float, float] = (0.0, 0.0),
+    position_m: tuple[float, float] = (0.0, 0.0),
     finger_radius_m: float,
     cells: int = CELLS,
 ) -> PushPath:
     """Solve the equilibria as a fingertip pushes to each of the ascending depths (n,), m.
 
     stretch_ratio: distance of the edges over the slack width.
-    place_m: (x, y) of the push on the stretched sheet, from its centre.
+    position_m: (x, y) of the push on the stretched sheet, from its centre.
 
     Raises ValueError for a position off the sheet or depths that do not ascend from 0, and
     NoEquilibriumError.
@@ -99,14 +99,17 @@ def push_path(
     if not stretch_ratio > 0.0 or not finger_radius_m > 0.0:
         raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above zero")
     focus = np.array(
-        [place_m[0] / stretch_ratio + 0.5 * rubber.width_m, place_m[1] + 0.5 * rubber.height_m]
+        [
+            position_m[0] / stretch_ratio + 0.5 * rubber.width_m,
+            position_m[1] + 0.5 * rubber.height_m,
+        ]
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
-        raise ValueError(f"place {place_m} is not on the sheet")
+        raise ValueError(f"place {position_m} is not on the sheet")
     grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
     state = _flat(grid, stretch_ratio)
     state = _solve_equilibrium(grid, state, None)
-    foot: Floats = np.array([*place_m, 0.0], dtype=np.float64)
+    foot: Floats = np.array([*position_m, 0.0], dtype=np.float64)
     sticking = np.zeros(len(state), dtype=bool)
     depth = 0.0
     rows: list[tuple[float, float, Floats]] = []

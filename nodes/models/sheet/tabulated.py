@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from flexsheet.nodes.models.sheet.force_models import Place, ScaledSheetModel, SheetForce
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForce, SheetPosition
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
-Measure = Callable[[float, Floats, Place], Floats]
+Measure = Callable[[float, Floats, SheetPosition], Floats]
 """Forces (n,) at a stretch ratio, depths (n,) and a position."""
 
 
@@ -56,14 +56,19 @@ class TabulatedSheetModel:
         return self.base.rubber
 
     def evaluate(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depths_m: Floats,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> SheetForce:
         pressed = self.base.evaluate(
-            stretch_ratio, depths_m, place_m=place_m, finger_radius_m=finger_radius_m
+            stretch_ratio, depths_m, position_m=position_m, finger_radius_m=finger_radius_m
         )
         ratios = _between(self.stretches, stretch_ratio, self.ratios)
-        ratios = _between(self.xs_m, abs(place_m[0]), np.moveaxis(ratios, 1, 0))
-        ratios = _between(self.ys_m, abs(place_m[1]), np.moveaxis(ratios, 1, 0))
+        ratios = _between(self.xs_m, abs(position_m[0]), np.moveaxis(ratios, 1, 0))
+        ratios = _between(self.ys_m, abs(position_m[1]), np.moveaxis(ratios, 1, 0))
         if len(self.depths_m) == 1:
             ratio, slope = np.full(pressed.force_n.shape, ratios[0]), np.zeros(1)
         else:
@@ -78,9 +83,14 @@ class TabulatedSheetModel:
         )
 
     def invalid_reason(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+        self,
+        stretch_ratio: float,
+        depth_m: float,
+        *,
+        position_m: SheetPosition,
+        finger_radius_m: float,
     ) -> str:
-        x, y = abs(place_m[0]), abs(place_m[1])
+        x, y = abs(position_m[0]), abs(position_m[1])
         asked = {
             "stretch": (stretch_ratio, self.stretches),
             "depth": (depth_m, self.depths_m),
@@ -122,7 +132,7 @@ def make_tabulated_model(
             for d, y in enumerate(ys_m):
                 place = (float(x), float(y))
                 scaled = base.evaluate(
-                    float(stretch), depths_m, place_m=place, finger_radius_m=finger_radius_m
+                    float(stretch), depths_m, position_m=place, finger_radius_m=finger_radius_m
                 )
                 ratios[a, :, c, d] = measure(float(stretch), depths_m, place) / scaled.force_n
                 done += 1

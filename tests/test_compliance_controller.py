@@ -21,10 +21,10 @@ from flexsheet.nodes.models.sheet.force_models import (
     make_model,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
-from flexsheet.nodes.planner.compliance import GOOD_RATIO, UnfitCurveError
-from flexsheet.nodes.planner.motion import withdrawn
-from flexsheet.nodes.planner.sheet_force import law_for, rubber_of
-from flexsheet.nodes.planner.yielding import Yielding
+from flexsheet.nodes.planner.compliance import TARGET_ERROR_RATIO, UnfitCurveError
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
+from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
+from flexsheet.nodes.planner.trajectory import offset_along_normal
 from tests.test_planner import FRAME_NS, SCENE, Table, in_world, on_cylinder, table
 from tests.twists import twist_between
 
@@ -79,15 +79,17 @@ async def test_a_finger_meets_the_objects_force_by_the_twins_sheet(
     force_n, pull_n = twin_push(
         SCENE.sheet, target.stretch_ratio, indentation_m, (float(x), float(y)), RADIUS, cells=24
     )
-    assert force_n == pytest.approx(float(object_force_n(np.array(depth_m), scale)), rel=GOOD_RATIO)
+    assert force_n == pytest.approx(
+        float(object_force_n(np.array(depth_m), scale)), rel=TARGET_ERROR_RATIO
+    )
     assert pull_n < SCENE.sheet.max_edge_force_n
-    assert desk.planner.note == "sheet's force: scaled"
+    assert desk.planner.note == "sheet force model: scaled"
 
 
 async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -> None:
     target = await pressed(await table(), -15.0, 0.03)
-    assert target.retreat_m > 0.005
-    assert stands_behind_m(target) == pytest.approx(target.retreat_m, abs=1e-6)
+    assert target.normal_offset_m > 0.005
+    assert stands_behind_m(target) == pytest.approx(target.normal_offset_m, abs=1e-6)
 
 
 @pytest.mark.parametrize("depth_m", [0.0002, 0.0004])
@@ -127,18 +129,18 @@ async def test_pushing_and_stroking_make_no_step_and_keep_the_bounds() -> None:
     velocities = np.diff(places, axis=0) / np.diff(times)[:, None]
     changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.diff(times)[1:]
     assert changes[5:].max() <= given.acceleration_m_per_s2 * (1.0 + 1e-3)
-    retreats = np.array([target.retreat_m for target in targets])
+    retreats = np.array([target.normal_offset_m for target in targets])
     assert retreats.max() > 0.005
 
 
 async def test_the_same_curve_again_changes_nothing_and_another_does() -> None:
-    yielding = Yielding(SCENE, law_for(SCENE.sheet), "curve")
-    yielding.take(soft_body(), touching=False)
-    first = yielding.retreat(0.03, (0.0, 0.0))
-    yielding.take(soft_body(1.005), touching=False)
-    assert yielding.retreat(0.03, (0.0, 0.0)) == first
-    yielding.take(soft_body(0.7), touching=False)
-    assert yielding.retreat(0.03, (0.0, 0.0))[0] > first[0]
+    compliance = ComplianceController(SCENE, make_force_model(SCENE.sheet), "force_curve")
+    compliance.update(soft_body(), in_contact=False)
+    first = compliance.normal_offset(0.03, (0.0, 0.0))
+    compliance.update(soft_body(1.005), in_contact=False)
+    assert compliance.normal_offset(0.03, (0.0, 0.0)) == first
+    compliance.update(soft_body(0.7), in_contact=False)
+    assert compliance.normal_offset(0.03, (0.0, 0.0))[0] > first[0]
 
 
 @pytest.mark.parametrize("law", [LinearSheetModel, ScaledSheetModel])
@@ -148,66 +150,69 @@ def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason(
     for depth_m in (0.002, 0.05):
         working_range = SCENE.working_range.model_copy(update={"push_depth_m": depth_m})
         scene = SCENE.model_copy(update={"working_range": working_range})
-        asked = law(rubber_of(scene.sheet))
-        yielding = Yielding(scene, asked, "curve")
-        yielding.take(soft_body(), touching=False)
-        indentation_m = depth_m - yielding.retreat(depth_m, (0.0, 0.0))[0]
+        asked = law(make_rubber(scene.sheet))
+        compliance = ComplianceController(scene, asked, "force_curve")
+        compliance.update(soft_body(), in_contact=False)
+        indentation_m = depth_m - compliance.normal_offset(depth_m, (0.0, 0.0))[0]
         why = asked.invalid_reason(
-            yielding.stretch_ratio, indentation_m, place_m=(0.0, 0.0), finger_radius_m=RADIUS
+            compliance.stretch_ratio, indentation_m, position_m=(0.0, 0.0), finger_radius_m=RADIUS
         )
-        assert bool(why) == ("law of the sheet's force" in yielding.note)
-        assert yielding.note.endswith(why)
+        assert bool(why) == ("outside the range of sheet force model" in compliance.note)
+        assert compliance.note.endswith(why)
         # All three are wrong about a push of a millimetre or two; deep, the line is.
         assert bool(why) == (depth_m < 0.01 or law is LinearSheetModel)
 
 
 async def test_in_touch_the_stretch_stays_and_the_retreat_makes_up_for_it() -> None:
-    law = law_for(SCENE.sheet)
-    yielding = Yielding(SCENE, law, "curve")
-    yielding.take(soft_body(), touching=False)
-    before, back = yielding.stretch_ratio, yielding.retreat(0.03, (0.0, 0.0))[0]
-    yielding.take(soft_body(0.3), touching=True)
-    assert yielding.stretch_ratio == before
-    assert yielding.retreat(0.03, (0.0, 0.0))[0] > back + 0.005
-    yielding.take(soft_body(0.29), touching=False)
-    assert yielding.stretch_ratio < before
+    law = make_force_model(SCENE.sheet)
+    compliance = ComplianceController(SCENE, law, "force_curve")
+    compliance.update(soft_body(), in_contact=False)
+    before, back = compliance.stretch_ratio, compliance.normal_offset(0.03, (0.0, 0.0))[0]
+    compliance.update(soft_body(0.3), in_contact=True)
+    assert compliance.stretch_ratio == before
+    assert compliance.normal_offset(0.03, (0.0, 0.0))[0] > back + 0.005
+    compliance.update(soft_body(0.29), in_contact=False)
+    assert compliance.stretch_ratio < before
 
 
 async def test_a_soft_body_that_tells_no_curve_leaves_all_as_it_is() -> None:
-    yielding = Yielding(SCENE, law_for(SCENE.sheet), "curve")
+    compliance = ComplianceController(SCENE, make_force_model(SCENE.sheet), "force_curve")
     untold = soft_body().model_copy(update={"force_curve": np.zeros((0, 2))})
-    yielding.take(untold, touching=False)
-    assert yielding.retreat(0.03, (0.0, 0.0)) == (0.0, 0.0)
-    assert yielding.stretch_ratio == SCENE.sheet.min_stretch_ratio
-    yielding.take(soft_body(), touching=False)
-    kept = yielding.retreat(0.03, (0.0, 0.0))
-    yielding.take(untold, touching=False)
+    compliance.update(untold, in_contact=False)
+    assert compliance.normal_offset(0.03, (0.0, 0.0)) == (0.0, 0.0)
+    assert compliance.stretch_ratio == SCENE.sheet.min_stretch_ratio
+    compliance.update(soft_body(), in_contact=False)
+    kept = compliance.normal_offset(0.03, (0.0, 0.0))
+    compliance.update(untold, in_contact=False)
     falling = soft_body().model_copy(
         update={"force_curve": np.array([[0.0, 0.0], [0.01, 2.0], [0.02, 1.0]])}
     )
-    with pytest.raises(UnfitCurveError, match="forces not fall"):
-        yielding.take(falling, touching=False)
-    assert yielding.retreat(0.03, (0.0, 0.0)) == kept
+    with pytest.raises(UnfitCurveError, match="forces must not fall"):
+        compliance.update(falling, in_contact=False)
+    assert compliance.normal_offset(0.03, (0.0, 0.0)) == kept
 
 
-@pytest.mark.parametrize(("scale", "words"), [(0.0005, "softer"), (30.0, "stiffer")])
+@pytest.mark.parametrize(("scale", "words"), [(0.0005, "too soft for"), (30.0, "stiffer than")])
 async def test_what_the_sheet_cannot_present_is_said(scale: float, words: str) -> None:
     desk = await table()
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
-    assert f"{words} than the sheet" in desk.planner.note
+    assert f"object is {words} the" in desk.planner.note
 
 
 async def test_a_calibrated_sheet_is_planned_with() -> None:
     thin = make_model(
-        rubber_of(SCENE.sheet),
+        make_rubber(SCENE.sheet),
         modulus_thickness_n_per_m=700.0,
         slack_width_m=SCENE.sheet.width_m,
         cubic_ratio=1.0,
         mooney_share=0.0,
     )
-    ideal, calibrated = (Yielding(SCENE, law, "curve") for law in (law_for(SCENE.sheet), thin))
-    for yielding in (ideal, calibrated):
-        yielding.take(soft_body(0.5), touching=False)
+    ideal, calibrated = (
+        ComplianceController(SCENE, law, "force_curve")
+        for law in (make_force_model(SCENE.sheet), thin)
+    )
+    for compliance in (ideal, calibrated):
+        compliance.update(soft_body(0.5), in_contact=False)
     assert calibrated.stretch_ratio > ideal.stretch_ratio
 
 
@@ -218,16 +223,18 @@ async def test_a_calibrated_sheet_is_planned_with() -> None:
     st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6),
 )
 def test_the_twist_of_a_withdrawn_sheet_is_how_it_moves(
-    retreat_m: float, rate: float, twist: list[float]
+    normal_offset_m: float, rate: float, twist: list[float]
 ) -> None:
     sheet = SheetMotion(np.eye(4), np.array(twist), 1.05, 0.0)
     step_s = 1e-4
-    shown = withdrawn(sheet, retreat_m, rate)
+    shown = offset_along_normal(sheet, normal_offset_m, rate)
     poses = []
     for time_s in (-step_s, step_s):
         pose = moved(sheet.world_from_sheet, sheet.twist_world, time_s)
         then = SheetMotion(pose, sheet.twist_world, 1.05, 0.0)
-        poses.append(withdrawn(then, retreat_m + rate * time_s, rate).world_from_sheet)
+        poses.append(
+            offset_along_normal(then, normal_offset_m + rate * time_s, rate).world_from_sheet
+        )
     assert shown.twist_world == pytest.approx(
         twist_between(poses[0], poses[1], 2.0 * step_s), abs=1e-6
     )

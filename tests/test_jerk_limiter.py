@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform, transform_from_rpy
-from flexsheet.nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
+from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -20,11 +20,11 @@ STEP_S = 1.0 / 60.0
 BOUNDS = SheetBounds(0.18, 2.0, 2.0, 10.0, 0.03, 0.3)
 JERKS = JerkBounds(60.0, 300.0, 9.0)
 EDGES = EdgeBound(0.175, 0.12)
-START = EasedMotion.at_rest(SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0))
+START = JerkLimitedState.at_rest(SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0))
 
 
-def on(now: EasedMotion, target: SheetMotion | None) -> EasedMotion:
-    return ease_sheet(now, target, bounds=BOUNDS, jerks=JERKS, edges=EDGES, step_s=STEP_S)
+def on(now: JerkLimitedState, target: SheetMotion | None) -> JerkLimitedState:
+    return step_sheet(now, target, bounds=BOUNDS, jerks=JERKS, edges=EDGES, step_s=STEP_S)
 
 
 def at(place: Floats, velocity: Floats | None = None) -> SheetMotion:

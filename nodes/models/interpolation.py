@@ -1,4 +1,4 @@
-"""Interpolate a predicted path: positions at equal time steps.
+"""Interpolate: a smooth step between two values, and predicted paths between their points.
 
 A predictor reports positions at 0, step, 2 step, ... seconds; a consumer asks for its own time.
 """
@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def path_at(path: Floats, step_s: float, lead_s: float) -> tuple[Floats, Floats]:
-    """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `lead_s` after its start.
+def smoothstep(t: Floats) -> Floats:
+    """Return 3 t^2 - 2 t^3 for t in 0..1: from 0 to 1 with zero slope at both ends (C1)."""
+    return np.asarray(t * t * (3.0 - 2.0 * t))
+
+
+def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats, Floats]:
+    """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `time_s` after its start.
 
     Between the points runs a cubic with central differences as slopes (Catmull and Rom 1974).  An
     oscillation of 10 Hz sampled every 10 ms is reproduced to a hundredth of its amplitude.  The
@@ -22,28 +27,28 @@ def path_at(path: Floats, step_s: float, lead_s: float) -> tuple[Floats, Floats]
     """
     count = len(path)
     if count < 2:
-        raise ValueError(f"a path of {count} points leads nowhere: two are needed")
-    place = lead_s / step_s
-    i = min(max(int(np.floor(place)), 0), count - 2)
-    share = place - i
+        raise ValueError(f"predicted path: {count} points; two or more are needed")
+    steps = time_s / step_s
+    i = min(max(int(np.floor(steps)), 0), count - 2)
+    t = steps - i
     begin, end = path[i], path[i + 1]
     begin_slope, end_slope = _slope(path, i), _slope(path, i + 1)
-    if share < 0.0:
-        return begin + share * begin_slope, begin_slope / step_s
-    if share > 1.0:
-        return end + (share - 1.0) * end_slope, end_slope / step_s
-    way = end - begin
-    square, cube = share * share, share * share * share
+    if t < 0.0:
+        return begin + t * begin_slope, begin_slope / step_s
+    if t > 1.0:
+        return end + (t - 1.0) * end_slope, end_slope / step_s
+    chord = end - begin
+    square, cube = t * t, t * t * t
     position = (
         begin
-        + (3.0 * square - 2.0 * cube) * way
-        + (cube - 2.0 * square + share) * begin_slope
+        + (3.0 * square - 2.0 * cube) * chord
+        + (cube - 2.0 * square + t) * begin_slope
         + (cube - square) * end_slope
     )
     velocity = (
-        6.0 * (share - square) * way
-        + (3.0 * square - 4.0 * share + 1.0) * begin_slope
-        + (3.0 * square - 2.0 * share) * end_slope
+        6.0 * (t - square) * chord
+        + (3.0 * square - 4.0 * t + 1.0) * begin_slope
+        + (3.0 * square - 2.0 * t) * end_slope
     ) / step_s
     return position, velocity
 

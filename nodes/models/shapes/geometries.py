@@ -1,0 +1,176 @@
+"""Describe each kind of geometry in one place, for all parts of the program that use it.
+
+The functions of a description take the dimensions of one geometry: an object with the fields of
+that kind, such as `scene.object.geometry` or the shape itself.  To add a kind of geometry, add its
+shape and its description to `GEOMETRIES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.models.shapes.smooth_mesh import SmoothMeshShape
+from flexsheet.nodes.models.shapes.solids import (
+    CylinderShape,
+    EllipsoidShape,
+    PlaneShape,
+    RoundedBoxShape,
+    SphereShape,
+)
+from flexsheet.nodes.models.shapes.surface import Shape
+
+Floats = NDArray[np.float64]
+
+INNER_RATIO = 0.8
+"""Half extents of the inner lattice of a round solid, over those of the solid."""
+
+
+@dataclass(frozen=True, slots=True)
+class CuboidMap:
+    """Map the surface of the cube -1..1 to the surface of a solid.
+
+    half_m: half extents (3,) of the solid.
+    inner_m: half extents (3,) of the undistorted lattice in its middle.
+    surface: points (n, 3) of the cube's surface to points (n, 3) of the solid's.
+    is_round: whether the whole surface is curved, like an ellipsoid's; else it has flat faces.
+    """
+
+    half_m: Floats
+    inner_m: Floats
+    surface: Callable[[Floats], Floats]
+    is_round: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryDescription:
+    """Describe one kind of geometry.
+
+    make_shape: makes the shape, which answers queries for nearest points, of the dimensions given
+        by keyword.
+    bounds_m: dimensions to the lower and the upper corner (3,) of the box around the touchable
+        surface and its solid; of a half-space, around the touchable rectangle.
+    extent_m: dimensions and a unit vector (3,) to how far the touchable surface extends from the
+        origin in that direction.
+    scale: dimensions and a ratio to the changed dimensions of the scaled geometry.
+    cuboid_map: dimensions and shape to the map for its meshes; None if its meshes are made in
+        another way.
+    """
+
+    make_shape: Callable[..., Shape]
+    bounds_m: Callable[[Any], tuple[Floats, Floats]]
+    extent_m: Callable[[Any, Floats], float]
+    scale: Callable[[Any, float], dict[str, Any]]
+    cuboid_map: Callable[[Any, Shape], CuboidMap] | None = None
+
+
+def map_round_solid(half_m: Floats) -> CuboidMap:
+    """Return the map of an ellipsoid about the origin."""
+    return CuboidMap(half_m, INNER_RATIO * half_m, lambda w: half_m * cube_to_sphere(w), True)
+
+
+def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
+    """Return the map of a box-like solid about the origin: the surface point nearest to the box."""
+    return CuboidMap(half_m, half_m, lambda w: shape.closest(half_m * w).point, False)
+
+
+def cube_to_sphere(w: Floats) -> Floats:
+    """Map points (n, 3) of the surface of the cube -1..1 to the unit sphere.
+
+    The map is smooth and nearly preserves areas:
+    (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically).
+    """
+    square = np.square(w)
+    second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
+    result: Floats = w * np.sqrt(1.0 - 0.5 * (second + third) + second * third / 3.0)
+    return np.asarray(result / np.linalg.norm(result, axis=1, keepdims=True))
+
+
+def _symmetric(half_m: Floats) -> tuple[Floats, Floats]:
+    return -half_m, half_m
+
+
+def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
+    return _symmetric(np.array([0.5 * cylinder.length_m, cylinder.radius_m, cylinder.radius_m]))
+
+
+def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
+    """Return the extent of the side; the end caps are not touchable."""
+    return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
+
+
+def _plane_bounds(plane: Any) -> tuple[Floats, Floats]:
+    return _symmetric(np.array([0.5 * plane.width_m, 0.5 * plane.height_m, 0.0]))
+
+
+def _box_extent(box: Any, direction: Floats) -> float:
+    core = 0.5 * np.array(box.size_m) - box.edge_radius_m
+    return float(core @ np.abs(direction)) + float(box.edge_radius_m)
+
+
+def _scale_box(box: Any, ratio: float) -> dict[str, Any]:
+    return {
+        "size_m": tuple(ratio * side for side in box.size_m),
+        "edge_radius_m": ratio * box.edge_radius_m,
+    }
+
+
+def _mesh_bounds(mesh: Any) -> tuple[Floats, Floats]:
+    used = mesh.vertices_m[np.unique(mesh.triangles)]
+    return used.min(axis=0), used.max(axis=0)
+
+
+def _scale_mesh(mesh: Any, ratio: float) -> dict[str, Any]:
+    return {"vertices_m": ratio * mesh.vertices_m, "smoothing_m": ratio * mesh.smoothing_m}
+
+
+GEOMETRIES: dict[str, GeometryDescription] = {
+    "cylinder": GeometryDescription(
+        CylinderShape,
+        bounds_m=_cylinder_bounds,
+        extent_m=_cylinder_extent,
+        scale=lambda cylinder, ratio: {"radius_m": ratio * cylinder.radius_m},
+    ),
+    "sphere": GeometryDescription(
+        SphereShape,
+        bounds_m=lambda sphere: _symmetric(np.full(3, sphere.radius_m)),
+        extent_m=lambda sphere, direction: float(sphere.radius_m),
+        scale=lambda sphere, ratio: {"radius_m": ratio * sphere.radius_m},
+        cuboid_map=lambda sphere, shape: map_round_solid(np.full(3, sphere.radius_m)),
+    ),
+    "ellipsoid": GeometryDescription(
+        EllipsoidShape,
+        bounds_m=lambda ellipsoid: _symmetric(np.array(ellipsoid.semi_axes_m)),
+        extent_m=lambda ellipsoid, direction: float(
+            np.linalg.norm(np.array(ellipsoid.semi_axes_m) * direction)
+        ),
+        scale=lambda ellipsoid, ratio: {
+            "semi_axes_m": tuple(ratio * axis for axis in ellipsoid.semi_axes_m)
+        },
+        cuboid_map=lambda ellipsoid, shape: map_round_solid(np.array(ellipsoid.semi_axes_m)),
+    ),
+    "plane": GeometryDescription(
+        PlaneShape,
+        bounds_m=_plane_bounds,
+        extent_m=lambda plane, direction: 0.0,
+        scale=lambda plane, ratio: {},
+    ),
+    "rounded_box": GeometryDescription(
+        RoundedBoxShape,
+        bounds_m=lambda box: _symmetric(0.5 * np.array(box.size_m)),
+        extent_m=_box_extent,
+        scale=_scale_box,
+        cuboid_map=lambda box, shape: map_nearest_points(0.5 * np.array(box.size_m), shape),
+    ),
+    "mesh": GeometryDescription(
+        SmoothMeshShape,
+        bounds_m=_mesh_bounds,
+        extent_m=lambda mesh, direction: float((mesh.vertices_m @ direction).max()),
+        scale=_scale_mesh,
+    ),
+}
+"""Descriptions by the name that scenes give in `object.geometry.shape`."""

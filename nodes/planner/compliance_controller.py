@@ -1,0 +1,119 @@
+"""Control how the sheet complies: fit its stretch and offset to the soft body under the finger."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
+from flexsheet.nodes.planner.compliance import (
+    FORCE_JND_FLOOR_N,
+    Compliance,
+    ObjectCurve,
+    choose_stretch,
+    fit_at_stretch,
+    fit_compliance,
+    make_stretch_limits,
+)
+
+Floats = NDArray[np.float64]
+
+ComplianceMode = Literal["force_curve", "stiffness"]
+
+EQUAL_RATIO = 0.02
+"""Relative difference below which two curves count as equal: a seventh of what people notice."""
+
+COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
+"""Depths at which curves are compared, over the maximum depth."""
+
+
+class ComplianceController:
+    """Compute the sheet's stretch and normal offset for the object under the finger.
+
+    mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
+        small pushes by the stretch alone, as the paper does.
+    """
+
+    def __init__(self, scene: Scene, model: SheetForceModel, mode: ComplianceMode) -> None:
+        self.stretch_ratio = scene.sheet.min_stretch_ratio
+        self.note = ""
+        self._scene, self._model, self._mode = scene, model, mode
+        self._limits = make_stretch_limits(scene.sheet, model)
+        self._compared_m = scene.working_range.push_depth_m * COMPARED_FRACTIONS
+        self._fitted_n: Floats | None = None
+        self._compliance: Compliance | None = None
+
+    def update(self, soft_body: SoftBody, *, in_contact: bool) -> None:
+        """Fit stretch and offset to the soft body under the finger.
+
+        In contact the stretch stays constant, because moving edges could be felt.
+
+        Raises UnfitCurveError for an invalid force curve; the last fit then stays in use.
+        """
+        if self._mode == "stiffness":
+            if soft_body.stiffness_n_per_m > 0.0:
+                choice = choose_stretch(soft_body.stiffness_n_per_m, self._scene.sheet)
+                self.stretch_ratio, self.note = choice.stretch_ratio, choice.note
+            return
+        rows = soft_body.force_curve
+        if len(rows) == 0:
+            return
+        forces_n = np.interp(self._compared_m, rows[:, 0], rows[:, 1])
+        if self._fitted_n is not None and _are_equal(forces_n, self._fitted_n):
+            return
+        self._fit(ObjectCurve.from_rows(rows), in_contact=in_contact)
+        self._fitted_n = forces_n
+
+    def _fit(self, curve: ObjectCurve, *, in_contact: bool) -> None:
+        scene = self._scene
+        fit = fit_compliance
+        if in_contact and self._compliance is not None:
+            fit = partial(fit_at_stretch, stretch_ratio=self._compliance.stretch_ratio)
+        fitted = fit(
+            curve,
+            self._model,
+            self._limits,
+            max_depth_m=scene.working_range.push_depth_m,
+            finger_radius_m=scene.finger.radius_m,
+            usable_half_height_m=scene.sheet.usable_half_height_m,
+            position_error_m=scene.tolerances.sheet_position_m,
+        )
+        self._compliance = fitted
+        self.stretch_ratio = fitted.stretch_ratio
+        self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted))))
+
+    def _range_note(self, fitted: Compliance) -> str:
+        """Return why the model does not hold for the deepest push at the sheet's centre, if so."""
+        max_depth_m = self._scene.working_range.push_depth_m
+        reason = self._model.invalid_reason(
+            fitted.stretch_ratio,
+            float(fitted.indentation_m(max_depth_m)),
+            position_m=CENTRE,
+            finger_radius_m=self._scene.finger.radius_m,
+        )
+        if not reason:
+            return ""
+        return f"outside the range of sheet force model {self._model.name}: {reason}"
+
+    def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
+        """Return the sheet's offset behind the tangent plane (m), and its slope over the depth.
+
+        depth_m: of the finger in the object.
+        position_m: (x, y) of the contact on the sheet.
+        """
+        if self._compliance is None or depth_m <= 0.0:
+            return 0.0, 0.0
+        return (
+            float(self._compliance.normal_offset_m(depth_m, position_m)),
+            self._compliance.offset_per_depth(depth_m, position_m),
+        )
+
+
+def _are_equal(forces_n: Floats, others_n: Floats) -> bool:
+    difference = np.abs(forces_n - others_n) / np.maximum(others_n, FORCE_JND_FLOOR_N)
+    return bool((difference < EQUAL_RATIO).all())

@@ -1,0 +1,168 @@
+"""Move the sheet towards a target with limited speed, acceleration and jerk.
+
+The state of a vector is its position, its mean velocity over the last step, and the acceleration at
+that time.  Each step first determines the desired velocity: towards the target, and slow enough to
+stop there.  Then it determines the acceleration that reaches this velocity without overshoot.  Then
+it moves the present acceleration towards that one as far as the jerk allows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.models.motion import (
+    EdgeBound,
+    SheetBounds,
+    SheetMotion,
+    closing_speed,
+    desired_velocity,
+)
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
+
+Floats = NDArray[np.float64]
+
+TAPER_FRACTION = 0.5
+"""Fraction of the jerk with which the acceleration decreases as the velocity is reached."""
+
+LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
+
+
+@dataclass(frozen=True, slots=True)
+class JerkBounds:
+    """Hold the maximum jerk of the sheet's centre, rotation and stretch ratio."""
+
+    jerk_m_per_s3: float
+    turn_jerk_rad_per_s3: float
+    stretch_jerk_per_s3: float
+
+
+@dataclass(frozen=True, slots=True)
+class JerkLimitedState:
+    """Hold a sheet's motion and the state from which the next step continues.
+
+    mean_velocity, acceleration: (7,) over the last step: linear, angular, stretch ratio.
+    """
+
+    sheet: SheetMotion
+    mean_velocity: Floats
+    acceleration: Floats
+
+    @staticmethod
+    def at_rest(sheet: SheetMotion) -> JerkLimitedState:
+        """Return the state of a sheet that is at rest in its pose."""
+        still = replace(sheet, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
+        return JerkLimitedState(still, np.zeros(7), np.zeros(7))
+
+
+def limit_jerk(
+    mean_velocity: Floats,
+    acceleration: Floats,
+    wanted_velocity: Floats,
+    *,
+    max_acceleration: float,
+    max_jerk: float,
+    step_s: float,
+) -> tuple[Floats, Floats]:
+    """Return mean velocity and acceleration (n,) of the next step towards a wanted velocity (n,).
+
+    The acceleration never exceeds its limit, and never changes by more than max_jerk step_s.
+    """
+    change = wanted_velocity - mean_velocity
+    size = float(np.linalg.norm(change))
+    goal = np.zeros_like(change)
+    if size > 0.0:
+        taper = closing_speed(np.array(size), TAPER_FRACTION * max_jerk, step_s)
+        goal = change * (min(float(taper), max_acceleration) / size)
+    step = goal - acceleration
+    length, max_length = float(np.linalg.norm(step)), max_jerk * step_s
+    if length > max_length:
+        step = step * (max_length / length)
+    after = acceleration + step
+    error = float(np.linalg.norm(after * step_s - change))
+    reached = length <= max_length and error <= 1e-12 * size
+    return wanted_velocity.copy() if reached else mean_velocity + after * step_s, after
+
+
+def step_sheet(
+    now: JerkLimitedState,
+    target: SheetMotion | None,
+    *,
+    bounds: SheetBounds,
+    jerks: JerkBounds,
+    edges: EdgeBound,
+    step_s: float,
+) -> JerkLimitedState:
+    """Return the sheet `step_s` (> 0) later, moved towards `target` at that time.
+
+    With the target None, the sheet is brought to rest.
+    """
+    wanted = (
+        np.zeros(7)
+        if target is None
+        else _desired_velocities(now.sheet, target, bounds, edges, step_s)
+    )
+    limits = (
+        (LINEAR, bounds.acceleration_m_per_s2, jerks.jerk_m_per_s3),
+        (ANGULAR, bounds.turn_acceleration_rad_per_s2, jerks.turn_jerk_rad_per_s3),
+        (STRETCH, bounds.stretch_acceleration_per_s2, jerks.stretch_jerk_per_s3),
+    )
+    mean, acceleration = np.empty(7), np.empty(7)
+    for part, max_acceleration, max_jerk in limits:
+        mean[part], acceleration[part] = limit_jerk(
+            now.mean_velocity[part],
+            now.acceleration[part],
+            wanted[part],
+            max_acceleration=max_acceleration,
+            max_jerk=max_jerk,
+            step_s=step_s,
+        )
+    before = now.sheet.world_from_sheet
+    pose = transform(
+        rotation_from_vector(mean[ANGULAR] * step_s) @ before[:3, :3],
+        before[:3, 3] + mean[LINEAR] * step_s,
+    )
+    # The mean is the velocity in the middle of the step.
+    final = mean + 0.5 * step_s * acceleration
+    sheet = SheetMotion(
+        pose,
+        final[:6].copy(),
+        now.sheet.stretch_ratio + float(mean[6]) * step_s,
+        float(final[6]),
+    )
+    return JerkLimitedState(sheet, mean, acceleration)
+
+
+def _desired_velocities(
+    now: SheetMotion, target: SheetMotion, bounds: SheetBounds, edges: EdgeBound, step_s: float
+) -> Floats:
+    """Return the desired mean velocities (7,) of the next step, within the edges' speed limit."""
+    displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
+    rotation = vector_from_rotation(
+        target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
+    )
+    linear = desired_velocity(
+        displacement,
+        target.twist_world[:3],
+        max_speed=bounds.speed_m_per_s,
+        max_acceleration=bounds.acceleration_m_per_s2,
+        step_s=step_s,
+    )
+    angular = desired_velocity(
+        rotation,
+        target.twist_world[3:],
+        max_speed=bounds.turn_rad_per_s,
+        max_acceleration=bounds.turn_acceleration_rad_per_s2,
+        step_s=step_s,
+    )
+    stretch_rate = desired_velocity(
+        np.array([target.stretch_ratio - now.stretch_ratio]),
+        np.array([target.stretch_rate_per_s]),
+        max_speed=bounds.stretch_rate_per_s,
+        max_acceleration=bounds.stretch_acceleration_per_s2,
+        step_s=step_s,
+    )
+    scale = edges.share(float(np.linalg.norm(linear)), float(np.linalg.norm(angular)))
+    return np.concatenate([scale * linear, scale * angular, stretch_rate])

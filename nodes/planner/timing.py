@@ -1,0 +1,51 @@
+"""Order fingertips by their exposures, and adapt the prediction horizon."""
+
+from __future__ import annotations
+
+RESTART_COUNT = 3
+"""Number of late fingertips in a row, with rising stamps, that indicate a clock step."""
+
+MIN_STEP_NS = 1_000_000
+"""Shortest interval between two exposures; no camera is faster."""
+
+AGE_WEIGHT = 0.05
+"""Weight of the newest age in the mean; at 60 Hz the mean spans a third of a second."""
+
+
+class MonotonicTimestampFilter:
+    """Pass fingertips in the order of their exposures.
+
+    A late fingertip is dropped, because the sheet has been planned past it.  `RESTART_COUNT` late
+    ones in a row mean that the clock has stepped back; the filter then restarts with the last one.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._late_ns: list[int] = []
+
+    def update(self, source_ns: int, first_step_s: float) -> float | None:
+        """Return the time (s) since the last passed fingertip; None if this one is dropped.
+
+        first_step_s: returned for the first fingertip and after a restart.
+        """
+        last_ns = self._last_ns
+        if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:
+            rising = not self._late_ns or source_ns > self._late_ns[-1]
+            self._late_ns = [*self._late_ns, source_ns] if rising else [source_ns]
+            if len(self._late_ns) < RESTART_COUNT:
+                return None
+            last_ns = None
+        self._last_ns, self._late_ns = source_ns, []
+        return first_step_s if last_ns is None else (source_ns - last_ns) * 1e-9
+
+
+def next_horizon_s(horizon_s: float, wanted_s: float, max_s: float) -> float:
+    """Return the prediction horizon (s) of the next target.
+
+    The horizon follows slowly, so that one late fingertip does not make the sheet's time jump.
+
+    horizon_s: of the last target.
+    wanted_s: from the exposure until the sheet reaches the target.
+    max_s: end of the fingertip's predicted path.
+    """
+    return horizon_s + AGE_WEIGHT * (min(max(wanted_s, 0.0), max_s) - horizon_s)

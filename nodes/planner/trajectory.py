@@ -1,0 +1,188 @@
+"""Plan the sheet's trajectory: the next motion of the sheet for each fingertip.
+
+`SheetTrajectoryPlanner` is deterministic: it reads stamps and measurements, and no clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Phase, SheetReason
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
+from flexsheet.nodes.planner.contact_state import (
+    ContactCommand,
+    ContactLimits,
+    ContactStateMachine,
+)
+from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
+
+Floats = NDArray[np.float64]
+
+EDGE_SPEED_FRACTION = 0.7
+"""Fraction of the tool speed that is planned with; the rest lets a late arm catch up."""
+
+EDGE_MARGIN_M = 0.03
+"""Minimum distance of a contact from a clamped edge; closer, the finger would push the clamp."""
+
+MAX_DEPTH_FRACTION = 1.4
+"""Depth, over the scene's push depth, beyond which a finger has passed through the object."""
+
+MAX_STEP_S = 0.1
+"""Gap after which the sheet restarts from rest at its last pose: the arms have stopped."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStep:
+    """Hold the result of one step, in the world frame.
+
+    contact_sheet_m: (x, y) of the contact on the sheet.
+    normal_offset_m: distance of the sheet behind the object's tangent plane.
+    """
+
+    motion: SheetMotion
+    command: ContactCommand
+    contact_world_m: Floats
+    normal_world: Floats
+    contact_sheet_m: Floats
+    normal_offset_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectorySettings:
+    """Hold the limits of the trajectory.
+
+    contact_on_m, contact_off_m: distances from the sheet at which contact begins and ends.
+    tilt_margin_rad: angle by which the sheet may exceed the scene's tilt.
+    max_spin_rad: maximum rotation of the sheet about its normal by rolling.
+    """
+
+    bounds: SheetBounds
+    jerks: JerkBounds
+    contact_on_m: float
+    contact_off_m: float
+    tilt_margin_rad: float
+    max_spin_rad: float
+
+
+class SheetTrajectoryPlanner:
+    """Plan the sheet's motion about one object."""
+
+    def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
+        """Raise UnpresentableError for an object that turns no side to the front."""
+        pose, sheet = scene.object.world_from_object, scene.sheet
+        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._object_from_world = inverse(self._world_from_object)
+        self._rotate_twist = np.kron(np.eye(2), self._world_from_object[:3, :3])
+        self._settings = settings
+        self._edges = EdgeBound(
+            EDGE_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s, 0.5 * sheet.height_m
+        )
+        self._contact_state = ContactStateMachine(
+            make_shape(dict(scene.object.geometry)),
+            self._object_from_world[:3, :3],
+            ContactLimits(
+                front=self._object_from_world[:3, 2],
+                max_tilt_rad=scene.working_range.tilt_rad + settings.tilt_margin_rad,
+                max_spin_rad=settings.max_spin_rad,
+                half_width_m=0.5 * sheet.width_m - EDGE_MARGIN_M,
+                half_height_m=sheet.usable_half_height_m,
+                contact_on_m=settings.contact_on_m,
+                contact_off_m=settings.contact_off_m,
+                max_depth_m=MAX_DEPTH_FRACTION * scene.working_range.push_depth_m,
+            ),
+        )
+        contact = self._contact_state.contact
+        self._command = ContactCommand("wait", "ok", contact, np.zeros(6), 0.0)
+        self._normal_offset_m = 0.0
+        home = self._world_from_object @ contact.object_from_sheet
+        self._state = JerkLimitedState.at_rest(
+            SheetMotion(home, np.zeros(6), sheet.min_stretch_ratio, 0.0)
+        )
+
+    def follow_finger(
+        self,
+        position_world: Floats,
+        velocity_world: Floats,
+        compliance: ComplianceController,
+        step_s: float,
+    ) -> PlannedStep:
+        """Return the sheet `step_s` later, moved towards the contact with a finger (m, m/s)."""
+        finger = apply(self._object_from_world, position_world)
+        velocity = self._object_from_world[:3, :3] @ velocity_world
+        object_from_sheet = self._object_from_world @ self.motion.world_from_sheet
+        command = self._contact_state.step(finger, velocity, object_from_sheet)
+        self._command = command
+        x, y = command.contact.position_sheet_m
+        self._normal_offset_m, per_depth = compliance.normal_offset(
+            command.push_depth_m, (float(x), float(y))
+        )
+        target = SheetMotion(
+            self._world_from_object @ command.contact.object_from_sheet,
+            self._rotate_twist @ command.twist,
+            compliance.stretch_ratio,
+            0.0,
+        )
+        depth_rate_m_per_s = -float(velocity @ command.contact.normal)
+        self._advance(
+            offset_along_normal(target, self._normal_offset_m, per_depth * depth_rate_m_per_s),
+            step_s,
+        )
+        return self._make_step(command)
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the finger was in contact when it was last seen."""
+        return self._command.phase in ("contact", "hold")
+
+    def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
+        """Return the sheet `step_s` later, while nothing is known of the finger: it stops."""
+        self._advance(None, step_s)
+        phase: Phase = "wait" if self._command.phase == "wait" else "hold"
+        return self._make_step(
+            replace(self._command, phase=phase, reason=reason, twist=np.zeros(6))
+        )
+
+    def _advance(self, target: SheetMotion | None, step_s: float) -> None:
+        if step_s > MAX_STEP_S:
+            self._state = JerkLimitedState.at_rest(self.motion)
+        self._state = step_sheet(
+            self._state,
+            target,
+            bounds=self._settings.bounds,
+            jerks=self._settings.jerks,
+            edges=self._edges,
+            step_s=min(step_s, MAX_STEP_S),
+        )
+
+    @property
+    def motion(self) -> SheetMotion:
+        """The sheet's planned pose and motion."""
+        return self._state.sheet
+
+    def _make_step(self, command: ContactCommand) -> PlannedStep:
+        contact_world = apply(self._world_from_object, command.contact.point)
+        contact_sheet = apply(inverse(self.motion.world_from_sheet), contact_world)[:2]
+        return PlannedStep(
+            self.motion,
+            command,
+            contact_world,
+            self._world_from_object[:3, :3] @ command.contact.normal,
+            np.ascontiguousarray(contact_sheet),
+            self._normal_offset_m,
+        )
+
+
+def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
+    """Move the sheet back along its normal by an offset that changes at the given rate."""
+    normal = sheet.world_from_sheet[:3, 2]
+    pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
+    pose[:3, 3] -= offset_m * normal
+    twist[:3] -= rate_m_per_s * normal + offset_m * np.cross(twist[3:], normal)
+    return replace(sheet, world_from_sheet=pose, twist_world=twist)
