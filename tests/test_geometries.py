@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import BaseSupport, Geometry, Part, Pose, Positive, Scene
-from flexsheet.nodes.console.scenes import edited, front_m
+from flexsheet.nodes.console.scenes import edit_scene, front_m
 from flexsheet.nodes.fem_solver.mesh import mesh_scene
 from flexsheet.nodes.models.shapes import (
     GEOMETRIES,
@@ -185,7 +185,7 @@ def test_a_scaled_geometry_is_larger_by_the_ratio(name: str) -> None:
 
 def test_a_scaled_object_keeps_its_front() -> None:
     material, sheet = SCENE.object.material, SCENE.sheet
-    larger = edited(
+    larger = edit_scene(
         SCENE,
         young_modulus_pa=material.young_modulus_pa,
         stretch_ratio=sheet.min_stretch_ratio,

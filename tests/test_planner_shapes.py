@@ -595,7 +595,7 @@ def test_a_tilt_beyond_a_right_angle_is_cut() -> None:
     """Two normals that both may be presented are never opposite."""
     shape = make_shape(SOLIDS["sphere"])
     for lean in (1.3, -1.3):
-        met = shown_to(shape, 0.08 * np.array([0.0, math.sin(2 * lean), -0.9]), tilt_rad=3.0)
+        met = shown_to(shape, 0.08 * np.array([0.0, math.sin(2 * lean), -0.9]), max_tilt_rad=3.0)
         assert angle_between(met.contact.normal, FRONT) <= contact_state.MAX_TILT_RAD + 1e-9
         assert np.isfinite(met.contact.object_from_sheet).all()
 
