@@ -120,7 +120,7 @@ def calibration(rendered: Pictures) -> StereoCalibration:
     return calibrate(rendered.left[:9], rendered.right[:9])
 
 
-def test_the_rig_that_drew_the_pictures_is_found(calibration: StereoCalibration) -> None:
+def test_calibration_recovers_the_rendering_rig(calibration: StereoCalibration) -> None:
     assert all(pair.used for pair in calibration.pairs)
     assert (calibration.width_px, calibration.height_px) == SIZE
     assert calibration.reprojection_rms_px < 0.1
@@ -136,7 +136,7 @@ def test_the_rig_that_drew_the_pictures_is_found(calibration: StereoCalibration)
     assert np.linalg.norm(rigid.vector_from_rotation(turn)) < 5e-3
 
 
-def test_held_out_pairs_are_measured_as_well_as_corners_are_found(
+def test_held_out_pairs_are_measured_within_corner_accuracy(
     rendered: Pictures, calibration: StereoCalibration
 ) -> None:
     told: list[tuple[int, int, str]] = []
@@ -183,7 +183,7 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
         check_stereo(calibration, [blank], [blank], board=BOARD)
 
 
-def test_pictures_that_will_not_do_are_named(
+def test_unusable_pictures_are_named(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
     text, small = tmp_path / "text.png", tmp_path / "small.png"
@@ -218,7 +218,7 @@ def test_corners_numbered_from_another_end_are_brought_into_order(columns: int, 
 
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), move=st.tuples(*[st.floats(-5, 5)] * 3))
 @settings(max_examples=50, deadline=None)
-def test_a_moved_board_fits_itself(
+def test_rigid_fit_recovers_a_moved_board(
     turn: tuple[float, float, float], move: tuple[float, float, float]
 ) -> None:
     model = board_points(BOARD)
@@ -229,7 +229,7 @@ def test_a_moved_board_fits_itself(
     assert 5e-4 < rigid_fit_residuals(bumped, model).max() < 2e-3
 
 
-def test_a_file_gives_back_every_digit(tmp_path: Path, calibration: StereoCalibration) -> None:
+def test_file_round_trip_keeps_every_digit(tmp_path: Path, calibration: StereoCalibration) -> None:
     save_calibration(calibration, tmp_path / "rig.yaml")
     loaded = load_calibration(tmp_path / "rig.yaml")
     assert loaded.model_dump(mode="json") == calibration.model_dump(mode="json")
@@ -307,7 +307,7 @@ def test_the_joint_fit_is_the_least_squares_that_opencv_finds(rendered: Pictures
     assert fit.rig[19:22] == pytest.approx(position.ravel(), abs=1e-5)
 
 
-def test_single_corners_that_stray_are_left_out(
+def test_outlying_corners_are_left_out(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
     """Three corners are painted over, so that they are found a pixel or more away."""
@@ -333,7 +333,7 @@ def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
         calibrate([rendered.left[0]] * 6, [rendered.right[0]] * 6)
 
 
-def test_boards_that_are_never_tilted_do_not_determine_a_rig(tmp_path: Path) -> None:
+def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
     """Straight on, focal length and distance cannot be told from each other."""
     pictures = Pictures([], [])
     middle = board_points(BOARD).mean(axis=0)
@@ -350,7 +350,7 @@ def test_boards_that_are_never_tilted_do_not_determine_a_rig(tmp_path: Path) -> 
         calibrate(pictures.left, pictures.right)
 
 
-def test_pictures_that_made_the_calibration_are_named_when_checked(
+def test_check_names_pictures_used_for_the_calibration(
     rendered: Pictures, calibration: StereoCalibration
 ) -> None:
     result = check_stereo(calibration, rendered.left[7:11], rendered.right[7:11], board=BOARD)

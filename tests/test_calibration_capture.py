@@ -119,7 +119,7 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
         ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 holds 50"),
     ],
 )
-def test_charuco_boards_that_cannot_be_are_refused(change: dict[str, Any], said: str) -> None:
+def test_impossible_charuco_boards_are_refused(change: dict[str, Any], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         CornerFinder(CHARUCO.model_copy(update=change))
 
@@ -192,7 +192,7 @@ def posed(turn: list[float]) -> Floats:
         ([-0.5, 0.0, 0.0], "top back"),
     ],
 )
-def test_tilts_have_the_names_that_people_would_give_them(turn: list[float], tilt: str) -> None:
+def test_names_of_tilts(turn: list[float], tilt: str) -> None:
     pose = posed(turn)
     middle = board_points(CHESSBOARD).mean(axis=0)
     assert classify_tilt(pose, middle) == tilt
@@ -221,7 +221,7 @@ def watching(camera: StereoCamera, *, pairs: int, still_pictures: int) -> Captur
     )
 
 
-def test_a_pair_is_taken_when_the_board_holds_still_somewhere_new(camera: StereoCamera) -> None:
+def test_pair_is_taken_when_the_board_rests_at_a_new_place(camera: StereoCamera) -> None:
     first, second = shown(CHESSBOARD, camera, 2, seed=6)
     blank = (np.full_like(first[0], 60), np.full_like(first[1], 60))
     capture = watching(camera, pairs=8, still_pictures=3)
@@ -239,7 +239,7 @@ def test_a_pair_is_taken_when_the_board_holds_still_somewhere_new(camera: Stereo
     assert not capture.complete
 
 
-def test_what_is_missing_is_asked_for(camera: StereoCamera) -> None:
+def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
     capture = watching(camera, pairs=8, still_pictures=1)
     wanted = needed(8)
     assert {one.name for one in wanted if one.group == "tilt"} == set(TILTS)
@@ -262,7 +262,7 @@ def test_what_is_missing_is_asked_for(camera: StereoCamera) -> None:
     assert place(Bin("right cell", "0,0")) == "at the top left of"
 
 
-def test_coverage_is_drawn_with_what_is_missing(camera: StereoCamera) -> None:
+def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:
     capture = watching(camera, pairs=20, still_pictures=1)
     (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
     assert capture.see(*picture).taken
@@ -276,7 +276,7 @@ def test_coverage_is_drawn_with_what_is_missing(camera: StereoCamera) -> None:
     console.file.close()
 
 
-def test_ctrl_c_keeps_what_was_taken(camera: StereoCamera, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_pictures_taken(camera: StereoCamera, tmp_path: Path) -> None:
     pictures = shown(CHESSBOARD, camera, 3, seed=6)
 
     def until_interrupted() -> Iterator[tuple[Image, Image]]:
@@ -370,7 +370,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert "rigid_fit_rms_mm" in out
 
 
-def test_pictures_are_taken_from_what_a_camera_source_describes(
+def test_pictures_are_taken_from_the_camera_source(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
     """Image files stand in for cameras; each picture comes four times, as of a board held still."""
@@ -406,7 +406,7 @@ def test_pictures_are_taken_from_what_a_camera_source_describes(
         (("--twin", "nowhere.yaml"), "cannot be read"),
     ],
 )
-def test_what_cannot_be_done_is_said_with_a_remedy(
+def test_errors_name_a_remedy(
     flexsheet: Flexsheet, scene_file: Path, tmp_path: Path, given: tuple[str, ...], said: str
 ) -> None:
     words = [str(scene_file) if word == "SCENE" else word for word in given]

@@ -122,7 +122,7 @@ def noisy(*, seed: int, sigma_px: float, count: int = 12) -> list[BoardPair]:
     ]
 
 
-def test_slopes_of_corners_are_those_of_differences() -> None:
+def test_derivatives_of_corners_equal_differences() -> None:
     rig = numbers_of(make_true_camera(scene_camera()))
     pose = np.array([0.3, -0.4, 0.1, -0.05, -0.04, 0.45])
     (pair,) = noisy(seed=1, sigma_px=0.1, count=1)
@@ -159,7 +159,7 @@ def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floa
     )
 
 
-def test_slopes_of_positions_are_those_of_differences() -> None:
+def test_derivatives_of_positions_equal_differences() -> None:
     rig = numbers_of(make_true_camera(scene_camera()))
     grid = view_of_work(rig, (640, 480), 0.5)
     assert grid[:, 2] == pytest.approx(0.5)
@@ -219,7 +219,7 @@ def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
     assert 0.6 < ratio < 1.6
 
 
-def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
+def test_only_the_jackknife_detects_bent_boards() -> None:
     """Corners that err together: the fit believes in many small errors, refits tell better."""
     camera = make_true_camera(scene_camera())
     true = numbers_of(camera)
@@ -245,7 +245,7 @@ def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
     assert np.divide(stated, alone) == pytest.approx(uncertainty.jackknife_ratio, rel=1e-6)
 
 
-def test_fingertips_err_as_the_calibrations_state() -> None:
+def test_fingertip_errors_agree_with_the_stated_uncertainty() -> None:
     """Six calibrations from pictures, each of other poses and noise, judged by the true rig."""
     camera = small_camera()
     true = numbers_of(camera)
@@ -262,7 +262,7 @@ def test_fingertips_err_as_the_calibrations_state() -> None:
     assert 1 / 1.5 < np.sqrt(variances[0] + variances[1]) / lateral_m < 1.5
 
 
-def test_the_shipped_calibration_is_true_within_what_it_states() -> None:
+def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
     true, measured = numbers_of(make_true_camera(scene_camera())), numbers_of(shipped)

@@ -186,7 +186,6 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
 
 async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
-        await asyncio.sleep(0.3)
         launchers.say(STOP)
         await until(lambda: len(files(folder)) == 2, launchers.said)
         launchers.say(RESET, before_ns=-(10**10))

@@ -32,7 +32,7 @@ from flexsheet.messages.topics import TOPICS, Delivery, topic_named
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
 from tests.waiting import DEADLINE_S, until
 
-pytestmark = [pytest.mark.alone, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
 STROKE_S = 4.0
 KILLED = "triangulator"
@@ -91,7 +91,8 @@ async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
     scene = plan.scene_message()
     assert scene is not None
     async with RunningGraph(plan) as graph:
-        await graph.wait_ready(DEADLINE_S)
+        # Ten processes start at once, those that draw at the lowest priority.
+        await graph.wait_ready(2 * DEADLINE_S)
         numbers: list[int] = []
         frames = subscriber_to(
             "frame", plan, graph.run, lambda frame, _: numbers.append(frame.number),

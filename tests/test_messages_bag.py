@@ -202,7 +202,7 @@ def test_frames_joined_and_split(frames: list[bytes]) -> None:
 
 
 @given(st.binary(max_size=100))
-def test_foreign_data_are_no_frames(data: bytes) -> None:
+def test_foreign_data_is_rejected_as_frames(data: bytes) -> None:
     try:
         frames = split_frames(data)
     except WireError:
@@ -258,7 +258,7 @@ def check_cut(data: bytes, boundaries: list[tuple[int, int]], cut: int, folder: 
     assert sum(topic.count for topic in reader.info().topics) == wanted
 
 
-def test_cut_at_every_boundary_and_beside_it(sample: tuple[bytes, list[Any], Path]) -> None:
+def test_bag_truncated_at_and_beside_every_boundary(sample: tuple[bytes, list[Any], Path]) -> None:
     data, boundaries, folder = sample
     assert len(boundaries) == 10
     for end, _ in boundaries:
@@ -270,14 +270,18 @@ def test_cut_at_every_boundary_and_beside_it(sample: tuple[bytes, list[Any], Pat
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_cut_anywhere(sample: tuple[bytes, list[Any], Path], draw: st.DataObject) -> None:
+def test_bag_truncated_at_any_byte(
+    sample: tuple[bytes, list[Any], Path], draw: st.DataObject
+) -> None:
     data, boundaries, folder = sample
     check_cut(data, boundaries, draw.draw(st.integers(0, len(data))), folder)
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_damaged_anywhere(sample: tuple[bytes, list[Any], Path], draw: st.DataObject) -> None:
+def test_bag_damaged_at_any_byte(
+    sample: tuple[bytes, list[Any], Path], draw: st.DataObject
+) -> None:
     """Bytes overwritten: every message that comes is one that was recorded, or BagError."""
     data, _, folder = sample
     damaged = bytearray(data)
@@ -311,7 +315,7 @@ def test_foreign_files(tmp_path_factory: pytest.TempPathFactory, data: bytes) ->
             BagReader(path)
 
 
-def test_foreign_files_that_people_try(tmp_path: Path) -> None:
+def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("no bag at all\n")
     with pytest.raises(BagError, match="no MCAP file"):
@@ -332,7 +336,7 @@ def test_foreign_files_that_people_try(tmp_path: Path) -> None:
         info(other)
 
 
-def test_nothing_is_written_over(whole: Path, tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(whole: Path, tmp_path: Path) -> None:
     before = whole.read_bytes()
     with pytest.raises(BagError, match="never written over"):
         BagWriter(whole)
@@ -355,7 +359,7 @@ def test_empty_bag(tmp_path: Path) -> None:
     assert info(tmp_path / "e.mcap").complete
 
 
-def test_full_disk_is_said(tmp_path: Path) -> None:
+def test_full_disk_is_reported(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     writer = BagWriter(tmp_path / "full.mcap")
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
@@ -387,7 +391,7 @@ def test_changed_type_is_refused_by_name_but_its_bytes_stay_readable(
     assert readable == {"twin/finger": False, "stereo": True, "estop": True}
 
 
-def test_topic_that_is_no_more(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_removed_topic(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         bag_module, "TOPICS", {n: t for n, t in TOPICS.items() if n != "twin/finger"}
     )
@@ -442,7 +446,7 @@ sys.stdin.read()
 """
 
 
-def test_killed_writer_loses_nothing_that_is_a_second_old(tmp_path: Path) -> None:
+def test_killed_writer_loses_at_most_the_last_second(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
     with subprocess.Popen(
         [sys.executable, "-c", WRITE_FOREVER, str(path), str(ROOT)],

@@ -70,7 +70,7 @@ def pushes_of(
 
 @settings(max_examples=12, deadline=None)
 @given(st.floats(200.0, 4000.0), st.floats(0.237, 0.243), st.floats(0.5, 2.0))
-def test_a_sheets_numbers_are_found_again(modulus: float, width: float, cubic: float) -> None:
+def test_sheet_parameters_are_recovered(modulus: float, width: float, cubic: float) -> None:
     law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=modulus,
@@ -84,7 +84,7 @@ def test_a_sheets_numbers_are_found_again(modulus: float, width: float, cubic: f
     assert fit.used.all()
 
 
-def test_noise_is_within_the_stated_deviations_and_strays_are_left_out() -> None:
+def test_errors_are_within_stated_deviations_without_outliers() -> None:
     law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=1500.0,
@@ -122,7 +122,7 @@ def test_mooneys_share_is_found_where_the_sheet_is_stretched_far() -> None:
     assert 0.0 < fit.standard_deviations[3] < 0.2
 
 
-def test_edge_forces_tell_more() -> None:
+def test_edge_forces_reduce_the_uncertainty() -> None:
     law = ScaledSheetModel(NOMINAL)
     without = fit_sheet_model(pushes_of(law), NOMINAL)
     along = fit_sheet_model(pushes_of(law, edges=True), NOMINAL)
@@ -139,12 +139,14 @@ def test_edge_forces_tell_more() -> None:
         ),
     ],
 )
-def test_rows_that_leave_it_open_are_refused(rows: list[MeasuredPush], words: str) -> None:
+def test_rows_that_do_not_determine_the_fit_are_refused(
+    rows: list[MeasuredPush], words: str
+) -> None:
     with pytest.raises(SheetModelFitError, match=words):
         fit_sheet_model(rows, NOMINAL)
 
 
-def test_a_table_keeps_what_the_law_leaves() -> None:
+def test_table_keeps_the_residual_of_the_law() -> None:
     rows = [
         MeasuredPush(
             push.edge_distance_m,
@@ -217,7 +219,7 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
         ("stretch_ratio,depth_mm,force_n\n" + "x,5,1\n" * 25, "and 5 more"),
     ],
 )
-def test_mistakes_in_rows_are_pointed_at(tmp_path: Path, text: str, said: str) -> None:
+def test_errors_in_rows_name_the_line(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "rows.csv"
     file.write_text(text)
     with pytest.raises(BadInputError) as caught:
@@ -244,7 +246,7 @@ def twin_calibration() -> SheetCalibration:
     )
 
 
-def test_the_twin_is_known_by_its_pushes(twin_calibration: SheetCalibration) -> None:
+def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibration) -> None:
     found = twin_calibration
     assert found.modulus_thickness_n_per_m.value == pytest.approx(1000.0, rel=0.06)
     assert found.slack_width_m.value == pytest.approx(0.24, abs=0.0006)
@@ -260,7 +262,7 @@ def test_the_twin_is_known_by_its_pushes(twin_calibration: SheetCalibration) -> 
         assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
 
 
-def test_the_file_gives_back_the_law(twin_calibration: SheetCalibration, tmp_path: Path) -> None:
+def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_path: Path) -> None:
     file = tmp_path / "sheet.yaml"
     save_sheet_calibration(twin_calibration, file, comment="made so")
     assert file.read_text().splitlines()[1] == "# made so"
@@ -335,7 +337,7 @@ def test_the_command_fits_rows_and_tells(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["--rows", "a.csv", "--twin", "b.yaml"]])
-def test_the_command_wants_one_source(tmp_path: Path, arguments: list[str]) -> None:
+def test_the_command_requires_one_source(tmp_path: Path, arguments: list[str]) -> None:
     result = CliRunner().invoke(
         app, ["calibrate", "sheet", "-o", str(tmp_path / "o.yaml"), *arguments]
     )
