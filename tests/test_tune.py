@@ -364,7 +364,7 @@ def test_where_nothing_can_be_written_nothing_is_measured(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: pytest.fail("measured"))
     outcome = run(SCENES / "sphere.yaml", "--output", tmp_path / where)
     assert isinstance(outcome.exception, BadInputError)
-    assert "give --output FILE in in an existing, writable folder" in str(outcome.exception)
+    assert "give --output FILE in an existing, writable folder" in str(outcome.exception)
 
 
 def run(*arguments: object) -> Any:

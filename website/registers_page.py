@@ -1,4 +1,4 @@
-"""Writes the register map into docs/modbus.md, between its marks, from the code that speaks it."""
+"""Write the register map of the Modbus driver into docs/modbus.md, between its marks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 
 
 def page(text: str) -> str:
-    """The page with its register map as the code has it; ValueError where it lacks the marks."""
+    """Return the page with a new register map; ValueError if it lacks the marks."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
@@ -42,7 +42,7 @@ def registers() -> str:
 
 
 def _block(title: str, address: int, block: Sequence[Field]) -> str:
-    """A block's heading and table; address: of its first register."""
+    """Return a block's heading and table; address: of its first register."""
     lines = [f"## {title}: {register_count(block)} registers from {address}", ""]
     lines += ["| register | field | type | meaning |", "|---|---|---|---|"]
     for field in block:
