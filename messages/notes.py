@@ -33,7 +33,7 @@ class NodeNote(Enum):
         BUSY_FIRST + "Then read the log of the arm's bridge, which sent no command for 100 ms.",
     )
     NO_PATH = (
-        "no way:",
+        "no path:",
         "Move the arms nearer to the sheet by hand, or the sheet to another position "
         "(docs/arms.md).",
     )

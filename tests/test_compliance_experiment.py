@@ -116,7 +116,7 @@ def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
     bag = tmp_path / "bare.mcap"
     with BagWriter(bag):
         pass
-    with pytest.raises(ExperimentError, match="no scene, or no soft body"):
+    with pytest.raises(ExperimentError, match="no scene or no force curve"):
         read_bag(bag)
 
 

@@ -261,7 +261,7 @@ def test_joints_that_are_none_are_named(joints: Floats) -> None:
     detections = Workplace(9).detections(6)
     one = detections[2]
     detections[2] = BoardDetection(one.name, joints, one.left, one.right)
-    with pytest.raises(HandEyeError, match="place 2: its joints"):
+    with pytest.raises(HandEyeError, match="place 2: needs six finite joints"):
         calibrate_base(detections, RIG)
 
 
@@ -484,7 +484,7 @@ def test_bad_input_to_the_command_is_named(
 def test_pictures_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     live = Live(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
-    with pytest.raises(ArmPosesError, match="pictures of 640x480 px"):
+    with pytest.raises(ArmPosesError, match="images of 640x480 px"):
         read_detections(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)
     add_row(tmp_path, ["left01.png", "left01.png"], READY)
     other = Board(columns=9, rows=6, square_m=0.015)

@@ -84,7 +84,7 @@ def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
 def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
     pictures = stroke.DrawnFrames([], [], [])
     for light_s in np.arange(0.1, 12.0, 1 / 15):
-        pictures.take(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
+        pictures.add(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
     told = stroke.visible_lag_ms(recording(pictures), SECONDS)
     assert told["fingertip"] == pytest.approx(1e3 * lag_s, abs=0.5)
     assert told["sheet"] == pytest.approx(2e3 * lag_s, abs=0.5)
@@ -93,8 +93,8 @@ def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
 
 def test_too_few_pictures_tell_no_lag() -> None:
     pictures = stroke.DrawnFrames([], [], [])
-    pictures.take(frame(3.0, 0.0, 0.0, 0.0))
-    pictures.take(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))
+    pictures.add(frame(3.0, 0.0, 0.0, 0.0))
+    pictures.add(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))
     told = stroke.visible_lag_ms(recording(pictures), SECONDS)
     assert told == {"fingertip": None, "sheet": None, "object": 0.0}
     empty = stroke.visible_lag_ms(recording(stroke.DrawnFrames([], [], [])), SECONDS)

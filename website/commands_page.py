@@ -16,11 +16,11 @@ INTRODUCTION = """\
 
 <!-- Written by `make pages`; a test compares. -->
 
-Data goes to stdout, words to stderr; `--json` makes the data JSON.  Exit codes: 0 done, 1 failed,
-2 the input is wrong, 3 a replay differs from what was live, or `tune` found no method good enough.
-Colours and progress bars are for terminals; NO_COLOR takes the colours away.  `flexsheet
---install-completion` teaches your shell to complete commands, options, topics, nodes, families and
-files.  What a message means: [errors.md](errors.md).
+Data goes to stdout, all else to stderr; `--json` prints the data as JSON.  Exit codes: 0 success,
+1 failure, 2 invalid input, 3 a replay that differs from the recording, or `tune` without a
+sufficient method.  Terminals get colours and progress bars; NO_COLOR disables the colours.
+`flexsheet --install-completion` installs completion of commands, options, topics, nodes, families
+and files in your shell.  Meanings of errors: [errors.md](errors.md).
 """
 
 
@@ -40,7 +40,7 @@ def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[s
 
 
 def reference() -> str:
-    """The whole page."""
+    """Return the whole page."""
     known = dict(commands())
     links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in known)
     sections = [INTRODUCTION, links + "\n"]

@@ -47,7 +47,7 @@ Arrays never hold NaN or infinity.
 
 
 def reference() -> str:
-    """The whole page."""
+    """Return the whole page."""
     types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
     parts = list(dict.fromkeys(part for kind in types for part in parts_of(kind)))
     sections = [INTRODUCTION + "\n" + _topic_table(), HEADER_INTRODUCTION + "\n" + _header_table()]
@@ -83,7 +83,7 @@ def _rate(topic: Topic) -> str:
 
 
 def _header_table() -> str:
-    """The fields of the header with the words of its docstring."""
+    """Return the table of the header's fields, described by its docstring."""
     described: dict[str, str] = {}
     for line in inspect.cleandoc(Header.__doc__ or "").splitlines():
         name, colon, words = line.partition(": ")
@@ -99,7 +99,7 @@ def _header_table() -> str:
 
 
 def type_section(kind: type[BaseModel]) -> str:
-    """A type's name, docstring and fields."""
+    """Return a section with a type's name, docstring and fields."""
     rows = [
         (f"`{name}`", field_type(field), _field_notes(field))
         for name, field in kind.model_fields.items()
@@ -143,7 +143,7 @@ def _constraint(extra: Any) -> str:
 
 
 def parts_of(annotation: Any) -> Iterator[type[BaseModel]]:
-    """All models within a type, outer ones first, without the type itself."""
+    """Yield all models within a type, outer ones first, without the type itself."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for field in annotation.model_fields.values():
             for inner in _models_in(field.annotation):

@@ -1,4 +1,4 @@
-"""Writes docs/parameters.md: what can be set of each node in a launch file."""
+"""Write docs/parameters.md: the parameters of each node."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ prints the same with ports and timers.
 
 
 def reference() -> str:
-    """The whole page."""
+    """Return the whole page."""
     kinds = [parameters_of(node_class(name)) for name in NODES]
     parts = dict.fromkeys(part for kind in kinds for part in parts_of(kind))
     sections = [INTRODUCTION, *(_section(name) for name in NODES)]
@@ -41,7 +41,7 @@ def reference() -> str:
 
 
 def unit(name: str) -> str:
-    """The unit that a parameter's name ends in; empty where it has none."""
+    """Return the unit at the end of a parameter's name; empty without one."""
     return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
 
 

@@ -1,4 +1,4 @@
-"""Writes the register map into docs/modbus.md, between its marks, from the code that speaks it."""
+"""Write the register map of the Modbus driver into docs/modbus.md, between its marks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def registers() -> str:
 
 
 def _block(title: str, address: int, block: Sequence[RegisterField]) -> str:
-    """A block's heading and table; address: of its first register."""
+    """Return the heading and table of a block; address: its first register."""
     lines = [f"## {title}: {register_count(block)} registers from {address}", ""]
     lines += ["| register | field | type | meaning |", "|---|---|---|---|"]
     for field in block:

@@ -37,7 +37,7 @@ MAX_FIT_RMS_PX = 0.6
 
 
 class DecodeError(FlexsheetError, ValueError):
-    """The images do not show the patterns; the message gives the reason."""
+    """Raised for images that do not show the patterns; the text gives the reason."""
 
     code = "gray-code"
     remedy = "Take all images in order, exposed neither too dark nor too bright."
@@ -56,8 +56,7 @@ def patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The lit pixels of one camera: pixels (n, 2), and the projector's pixels (n, 2) that light
-    them.
+    """Hold the lit pixels (n, 2) of one camera and the projector pixels (n, 2) that light them.
 
     The latter are the middles of their cells.
     """

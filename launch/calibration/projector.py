@@ -67,7 +67,7 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """A calibrated projector and its residuals, in projector pixels and, on the sheet, metres.
+    """Hold a calibrated projector and its residuals, in projector pixels and metres on the sheet.
 
     held_out_rms_px: of poses that it was fitted without. before_rms_px: of the initial projector.
     coverage_ratio: fraction of the image's cells with points.
@@ -171,7 +171,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
             f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not determined elsewhere"
         )
     for _ in range(3):
-        projector = _fitted(points, inliers, guess)
+        projector = _fit_projector(points, inliers, guess)
         residual_px = np.linalg.norm(
             project_points(projector, points.world) - points.pixels, axis=1
         )
@@ -189,7 +189,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     held_out = [
         np.linalg.norm(
             project_points(
-                _fitted(points, inliers & (points.pose != pose), guess), points.world[here]
+                _fit_projector(points, inliers & (points.pose != pose), guess), points.world[here]
             )
             - points.pixels[here],
             axis=1,
@@ -219,7 +219,7 @@ def _rms(values: Floats) -> float:
 
 
 def _depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """How far (m) the points reach along the projector's axis, the middle nine tenths of them."""
+    """Return the range (m) of the central 90 % of the points along the projector's axis."""
     pose = guess.world_from_projector
     along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
@@ -231,11 +231,12 @@ def _coverage(pixels: Floats, projector: Projector) -> float:
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
 
-def _fitted(points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector) -> Projector:
-    """The projector of least squared pixels: square pixels, k1, k2, p1, p2; k3 as guessed.
+def _fit_projector(
+    points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector
+) -> Projector:
+    """Fit a projector by least squares: square pixels, k1, k2, p1, p2; k3 as in the guess.
 
-    OpenCV's own fit refuses a principal point outside the picture, where lens shift puts it; its
-    projection and that one's derivatives serve here.
+    OpenCV's own fit rejects a principal point outside the image, where lens shift puts it.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -256,7 +257,7 @@ def _fitted(points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projecto
         return np.asarray((seen.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """By turn (3), shift (3), focal length, principal point (2) and k1, k2, p1, p2."""
+        """Return derivatives by rotation, translation, focal length, principal point, k1 to p2."""
         _, by = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
         focal = by[:, 6:7] + aspect * by[:, 7:8]
         return np.hstack([by[:, :6], focal, by[:, 8:14]])

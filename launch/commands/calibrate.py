@@ -389,7 +389,7 @@ def _board(text: str, square_mm: float, marker_mm: float | None, dictionary: str
 
 
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
-    """As asked for, else from the scene's left camera to the screen's centre, else None."""
+    """Return the given distance, else that of the scene's camera to the screen, else None."""
     if distance_mm is not None:
         return 1e-3 * distance_mm
     if scene is None:
@@ -399,7 +399,7 @@ def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float
 
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """A progress bar on stderr, as the function that the calibration calls."""
+    """Show a progress bar on stderr; yield the function that updates it."""
     from rich.progress import Progress
 
     with Progress(console=words.console, transient=True) as bar:

@@ -283,7 +283,7 @@ def _optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
 def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
-    """A folder with the twin's places."""
+    """Make a folder with simulated poses."""
     from flexsheet.launch.calibration.arm_poses import simulate_poses
     from flexsheet.nodes.twin.board import BoardError
 
@@ -399,12 +399,12 @@ def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
 
 
 def _rounded(value: float) -> float:
-    """To a nanometre or nanoradian: what is beyond is noise, and hard to read."""
+    """Round to a nanometre or nanoradian; further digits are noise."""
     return round(float(value), 9) + 0.0
 
 
 def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str, float]:
-    """How far the found base of the twin is off, at the world's origin."""
+    """Return the error of the simulated arm's base, at the world's origin."""
     import numpy as np
 
     from flexsheet.launch.calibration.arm_poses import true_base
@@ -515,7 +515,7 @@ def _scene_line(base: ArmBase) -> str:
 
 
 def _shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """How far the base was found from where the scene has it: m and rad."""
+    """Return the distance (m) and rotation (rad) of the base from that of the scene."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation

@@ -169,7 +169,7 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
 
 
 def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
-    """What the twin's true rig sees of the patterns on the sheet, in one pose after the other."""
+    """Render the patterns on the sheet as the simulated cameras see them, pose by pose."""
     from rich.progress import track
 
     from flexsheet.launch.calibration.gray_code import patterns
@@ -184,7 +184,7 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
 
 
 def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """The scene's camera with the optics of a calibration file."""
+    """Return the scene's camera with the optics of a calibration file."""
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
@@ -257,7 +257,7 @@ def _in_a_row(values: list[float]) -> Any:
 
 
 def _rounded(value: float) -> float:
-    """To a nanometre, nanoradian or billionth of a pixel: what is beyond is noise."""
+    """Round to a nanometre, nanoradian or 1e-9 pixel; further digits are noise."""
     return round(float(value), 9) + 0.0
 
 

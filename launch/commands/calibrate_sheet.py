@@ -112,7 +112,7 @@ def fitted(
     with_mooney: bool,
     with_table: bool,
 ) -> SheetCalibration:
-    """The calibration that pushes give; SheetModelFitError where they do not determine one."""
+    """Return the calibration from pushes; SheetModelFitError if they do not determine one."""
     from importlib.metadata import version
 
     from flexsheet.launch.calibration.sheet_fit import fit_sheet_model, tabulate_pushes

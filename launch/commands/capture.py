@@ -71,7 +71,7 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
 
 
 def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """What the twin's true rig sees of a board, in one pose after the other."""
+    """Render a board as the simulated cameras see it, pose by pose."""
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
 

@@ -177,11 +177,11 @@ def read_gestures(bag: Path) -> GestureRecording:
 
 
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
-    """How far the estimate jumps beyond the finger's own motion, in its sigmas (n-1,).
+    """Return the jumps of the estimate without the finger's own motion, in sigmas (n-1,).
 
-    errors: (n, 3) m, of consecutive estimates against the truth.  covariances: (n, 3, 3) m^2, as
-    stated with them.  What the finger did itself drops out of the errors' difference; the sigma is
-    that of the difference along its own direction, both estimates taken as independent.
+    errors: (n, 3) m, of consecutive estimates.  covariances: (n, 3, 3) m^2, as stated by them.  The
+    difference of the errors excludes the finger's motion.  Sigma is that of the difference along
+    its direction, for independent estimates.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -204,7 +204,7 @@ def error_mm(errors: Floats) -> dict[str, float | None]:
 
 
 def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
-    """Where fingertips (n,) say that the finger is `lead_s` after their exposures (n, 3)."""
+    """Return the predicted positions (n, 3) of fingertips `lead_s` after their exposures."""
     if lead_s == 0.0:
         return _rows([tip.position_world_m for tip in tips])
     return _rows(
@@ -216,15 +216,15 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _rows(points: Sequence[Floats]) -> Floats:
-    """Points as rows (n, 3), also if there are none."""
+    """Stack points as rows (n, 3), n may be 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
-    """The figures of one gesture; lengths in mm, times in ms, None where there is nothing to tell.
+    """Return the figures of one gesture in mm and ms; None for unknown ones.
 
-    missing: exposures of which no fingertip came.  reasons: why fingertips that came were not
-    valid.  jump: between consecutive valid fingertips.
+    missing: number of exposures without a fingertip.  reasons: counts of the reasons of invalid
+    fingertips.  jump: between consecutive valid fingertips.
     """
     if name not in recorded.windows_ns:
         have = ", ".join(recorded.windows_ns) or "none"

@@ -429,12 +429,13 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """The stroke's errors over time: seconds since the stroke began, metres, radians.
+    """Hold the errors over time of a stroke, m and rad.
 
-    seconds: (n,) of the exposures with a valid fingertip, at which the measured errors stand.
-    true_seconds: (m,) of all exposures, at which the true ones stand: a sheet that holds while the
-        finger is not seen is off all the same.
-    arcs_m: (m, 2), how far around the object the true sheet and the true finger are.
+    seconds: (n,) times of the measured errors since the stroke began: exposures with a valid
+        fingertip.
+    true_seconds: (m,) times of the true errors: all exposures, since a sheet that holds without a
+        fingertip has an error too.
+    arcs_m: (m, 2) arc lengths around the object of the true sheet and the true finger.
     """
 
     seconds: Floats
@@ -449,7 +450,7 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """When that stroke began and ended; ExperimentError when the bag does not have it."""
+    """Return begin and end of a stroke, ns; ExperimentError if the bag does not have it."""
     label = stroke_label(seconds)
     if label not in recording.windows_ns:
         have = ", ".join(recording.windows_ns) or "none"
@@ -460,7 +461,7 @@ def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int
 
 
 def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
-    """Errors at every exposure of that stroke; ExperimentError when the bag does not have it."""
+    """Return the errors at each exposure of a stroke; ExperimentError if the bag lacks it."""
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
     def in_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -470,7 +471,7 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
         return times[keep]
 
     times, exposures = (
-        in_stroke(make_motion.times_ns) for make_motion in (recording.fingertip, recording.finger)
+        in_stroke(motion.times_ns) for motion in (recording.fingertip, recording.finger)
     )
     if len(times) < 10:
         label = stroke_label(seconds)
@@ -500,7 +501,7 @@ def arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Ways (n, 2) m around the cylinder: of the line that the sheet presents, of the points."""
+    """Return arc lengths (n, 2) m around the cylinder of the presented line and of the points."""
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
     _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])
@@ -511,7 +512,7 @@ def arcs(
 def tangential_distance(
     scene: Scene, world_from_object: Floats, points: Floats, others: Floats
 ) -> Floats:
-    """Distance (n,) between the cylinder points nearest to `points` and to `others` (n, 3)."""
+    """Return the distances (n,) of the cylinder points nearest to `points` and `others` (n, 3)."""
     object_from_world = inverse(world_from_object)
     on_surface = []
     for array in (points, others):
@@ -523,7 +524,7 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """How late what was drawn is when its light leaves, after all prediction; None: not to tell.
+    """Return the lags of drawn contents at display, after prediction; None if unknown.
 
     fingertip, sheet: the mark and the sheet's turn about the object, as drawn, against the true
     ones, by the shift in time that makes them most alike.  object: the median age of the finger

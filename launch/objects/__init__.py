@@ -1,1 +1,1 @@
-"""What a scene's object is made from: meshes and textures in files, and an organ of our own."""
+"""Read the meshes and textures of a scene's object."""

@@ -206,5 +206,5 @@ def cut(pictures: ImagePair, wanted: Regions) -> ImagePair:
 
 
 def encode_png(picture: Image) -> bytes:
-    """The PNG file of a picture."""
+    """Return an image as the bytes of a PNG file."""
     return bytes(cv2.imencode(".png", picture)[1])

@@ -103,7 +103,7 @@ class Stream(threading.Thread):
 
     @property
     def believed(self) -> bool:
-        """Whether the driver's stamps are trusted."""
+        """Return whether the driver's stamps are trusted."""
         return self._judge is not None and self._judge.believed
 
     def stop(self) -> None:
@@ -216,8 +216,7 @@ class CameraReader:
         return self._pictures(frames)
 
     def _by_stamp(self) -> bool:
-        """Whether the drivers' stamps are used: both cameras are compared by one kind of stamp
-        only."""
+        """Return whether the drivers' stamps are used; both cameras need the same kind of stamp."""
         return all(stream.believed for stream in self._streams)
 
     def _moment_ns(self, frame: CapturedFrame) -> int:

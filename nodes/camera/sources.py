@@ -12,19 +12,19 @@ from flexsheet.messages.scene import Finite, NonNegative, Positive
 from flexsheet.nodes.parameter_marks import DeviceFile
 
 
-class Source(LimitedModel):
+class CameraSource(LimitedModel):
     """A kind of device, as the parameter `source` names it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class TwinSource(Source):
+class TwinSource(CameraSource):
     """The simulator's pixels, from the topic twin/stereo."""
 
     kind: Literal["twin"] = "twin"
 
 
-class OpenCvSource(Source):
+class OpenCvSource(CameraSource):
     """Cameras that OpenCV opens: by number, by path, or by a stream's address.
 
     Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`); one
@@ -60,7 +60,7 @@ class OpenCvSource(Source):
     )
 
 
-class VideoSource(Source):
+class VideoSource(CameraSource):
     """One video file with both views side by side, or two."""
 
     kind: Literal["video"]
@@ -70,7 +70,7 @@ class VideoSource(Source):
     loop: bool = False
 
 
-class ImagesSource(Source):
+class ImagesSource(CameraSource):
     """Image files, in the order of their sorted names."""
 
     kind: Literal["images"]

@@ -23,7 +23,7 @@ class DeadlineFallback:
 
     @property
     def is_fallback(self) -> bool:
-        """Whether another method replaces the best one, because that was late."""
+        """Return whether another method replaces the best one, because that was late."""
         return self.name != self._names[0]
 
     def record(self, seconds: float) -> bool:

@@ -158,7 +158,7 @@ class ClutterTrack(Track):
 
     @property
     def is_stationary(self) -> bool:
-        """Whether the marker was stationary when it was last seen."""
+        """Return whether the marker was stationary when it was last seen."""
         return (self.at_ns - self.stationary_since_ns) * 1e-9 >= STATIONARY_TIME_S
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
@@ -180,8 +180,7 @@ class ClutterTrack(Track):
             self.sole_since_ns = at_ns
 
     def is_alive(self, at_ns: int) -> bool:
-        """Whether the track has not timed out, and its last time is not in the future after a clock
-        step."""
+        """Return whether the track has neither timed out nor a time in the future."""
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
             timeout_s = STATIONARY_TRACK_TIMEOUT_S
@@ -241,7 +240,7 @@ class DataAssociation:
         return result, marker.measured
 
     def is_clutter_search_due(self, at_ns: int) -> bool:
-        """Whether the last search is too long ago, or lies in the future after a clock step."""
+        """Return whether the last search is too long ago or in the future after a clock step."""
         return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
 
     def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:

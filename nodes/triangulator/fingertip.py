@@ -252,7 +252,7 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 
 
 def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
-    """Whether an image, or its part inside the gate, is overexposed."""
+    """Return whether an image, or its part inside the gate, is overexposed."""
     return any(
         is_overexposed(image) or is_overexposed(image, window)
         for image, window in zip(inputs.images, windows, strict=True)

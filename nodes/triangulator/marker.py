@@ -141,7 +141,7 @@ def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window
 
 
 def is_overexposed(image: Image, window: Window | None = None) -> bool:
-    """Whether too large a fraction of an image, or of a window of it, is white."""
+    """Return whether too large a fraction of an image, or of a window of it, is white."""
     part = image if window is None else image[window]
     white = cv2.threshold(part, WHITE_LEVEL - 1, 1, cv2.THRESH_BINARY)[1]
     return bool(cv2.countNonZero(white) > WHITE_FRACTION * part.size)

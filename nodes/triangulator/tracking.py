@@ -50,7 +50,7 @@ class PositionMeasurement:
     covariance: Floats
 
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
-        """Whether a finger can move from this point to a later one, allowing for noise."""
+        """Return whether a finger can move from this point to a later one, allowing for noise."""
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
         return distance <= max_speed * (later.at_ns - self.at_ns) * 1e-9 + GATE_SIGMAS * noise
@@ -64,7 +64,7 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Whether a measured point can be the finger's, allowing for its noise."""
+        """Return whether a measured point can be the finger's, allowing for its noise."""
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
@@ -101,7 +101,7 @@ class Tracker:
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Whether a point of that time is older than the newest one."""
+        """Return whether a point of that time is older than the newest one."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
@@ -248,8 +248,7 @@ class Tracker:
         return "unconfirmed"
 
     def _is_missing_between(self, previous: int, after: int) -> bool:
-        """Whether two points of the track are so far apart in time that one between them is
-        missing."""
+        """Return whether a point is missing between two points of the track, by their times."""
         times_ns = np.array([entry[0].at_ns for entry in self._history])
         usual_ns = float(np.median(np.diff(times_ns)))
         return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns
