@@ -206,7 +206,7 @@ async def test_an_answer_to_another_command_closes_the_connection(
 ) -> None:
     async with linked() as (link, controller):
         await exchange(link)
-        monkeypatch.setattr(controller, "take", lambda registers: True)
+        monkeypatch.setattr(controller, "receive_command", lambda registers: True)
         with pytest.raises(ArmAnswerError, match="answer to command 1, awaited 2"):
             await exchange(link)
         assert not link.connected
