@@ -1,4 +1,4 @@
-"""`flexsheet chart`: speed against accuracy of a method family."""
+"""`flexsheet chart`: measure speed against accuracy of a method family."""
 
 from __future__ import annotations
 
@@ -40,29 +40,32 @@ def chart(
     *,
     family: Annotated[
         str | None,
-        typer.Argument(help="Method family; without it, all.", autocompletion=complete.families),
+        typer.Argument(help="Method family; default: all.", autocompletion=complete.families),
     ] = None,
     scene_file: Annotated[
         Path,
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene to measure on.",
+            help="Scene for the measurements.",
             autocompletion=complete.yaml_files,
         ),
     ] = SCENE_FILE,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder for charts and numbers.")
     ] = Path("runs/charts"),
     redraw: Annotated[
-        bool, typer.Option("--redraw", help="Measure nothing: draw the numbers in --output anew.")
+        bool,
+        typer.Option(
+            "--redraw", help="Draw the stored numbers in --output again without measuring."
+        ),
     ] = False,
     cases: Annotated[
-        bool, typer.Option("--cases", help="Print every case, and not each method alone.")
+        bool, typer.Option("--cases", help="Print every case instead of one line per method.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Chart speed against accuracy of a family's methods, on this machine and one scene.
+    """Measure and draw speed against accuracy of a family's methods on this computer.
 
     Printed is for each method its slowest median and its largest error over the cases that it says
     it is good for; the front has those that no other method beats in both.

@@ -1,4 +1,4 @@
-"""`flexsheet tune`: the cheapest methods that are good enough for a scene."""
+"""`flexsheet tune`: choose the cheapest methods that meet a scene's tolerances."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code: for some family no method is good enough, and the nearest miss was taken."""
+"""Exit code if no method of some family meets the tolerance, so the best one was chosen."""
 
 
 app = typer.Typer(add_completion=False)
@@ -49,24 +49,26 @@ def tune(
         typer.Option(
             "--family",
             metavar="NAME",
-            help="Only this one; may be given repeatedly.",
+            help="Tune only this family; may be repeated.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", metavar="FILE", help="Write a copy there, and leave SCENE alone."),
+        typer.Option(
+            "--output", metavar="FILE", help="Write a copy to this file instead of changing SCENE."
+        ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not write any file.")] = False,
     margin: Annotated[
         float,
         typer.Option(
-            min=0.0, max=0.9, help="Share of each tolerance that a method must leave over."
+            min=0.0, max=0.9, help="Fraction of each tolerance that must remain as a margin."
         ),
     ] = 0.2,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the cheapest methods that keep a scene's tolerances, and write them into the scene.
+    """Choose the cheapest methods that meet a scene's tolerances, and write them into the scene.
 
     Measures each family on this machine over the scene's working range: seconds to minutes each,
     the first time.  Says why in a sentence per family.  Nodes whose parameters say `auto` take the
