@@ -240,7 +240,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a calibration by measuring a board of known size on other images."""
+    """Measure a board of known size with a calibration, on pictures that did not make it."""
     from flexsheet.messages.calibration import load_calibration
     from flexsheet.messages.calibration_file import CalibrationFileError
     from flexsheet.nodes.camera.check import check_stereo
@@ -287,7 +287,7 @@ def cross_check(
     leave_out: Annotated[int, typer.Option(help="Number of pairs left out at a time.", min=1)] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration by leaving pairs out, and compare it with plain OpenCV."""
+    """Leave pairs out in turn, measure them with what the rest gives, beside plain OpenCV."""
     from flexsheet.nodes.camera import check
     from flexsheet.nodes.camera.corners import CalibrationError
 
@@ -336,7 +336,7 @@ def print_board(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a board for printing at true size: a chessboard, or with --marker-mm ChArUco."""
+    """Write a board to print at true size: a chessboard, or with --marker-mm a ChArUco board."""
     from flexsheet.nodes.camera.corners import CalibrationError
     from flexsheet.nodes.camera.printing import caption, write_board
 

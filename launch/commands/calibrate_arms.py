@@ -289,7 +289,7 @@ def _optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
 def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
-    """Write a folder with simulated poses, and return it."""
+    """A folder with the twin's places."""
     from flexsheet.launch.bench.arm_places import twin_places
     from flexsheet.nodes.twin.board import BoardError
 
