@@ -234,7 +234,7 @@ async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
 ) -> None:
     """Suspended, but with the readings of a process that waits for a processor."""
     starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
-    monkeypatch.setattr(ProcessorTime, "of", lambda process: starved)
+    monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
     said: list[str] = []
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
