@@ -70,5 +70,5 @@ def test_quotes_are_found() -> None:
     found = {page: list(quoted((DOCS / f"{page}.md").read_text())) for page in QUOTING}
     assert "clock ... is known to ... only" in found["troubleshooting"]
     assert any(message.startswith("no way: left arm") for message in found["troubleshooting"])
-    assert "takes connections and says nothing" in found["deploy"]
+    assert "accepts connections, but does not answer" in found["deploy"]
     assert any("is known to 7.1 ms only" in message for message in found["clocks"])

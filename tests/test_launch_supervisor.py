@@ -353,7 +353,7 @@ async def test_a_port_in_use_is_named_before_anything_starts(
     endpoint = plan.writers["twin/finger"][0].tcp
     assert endpoint is not None
     with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
-        with pytest.raises(BadInputError, match="is a graph running already"):
+        with pytest.raises(BadInputError, match="end the other graph or program"):
             await RunningGraph(plan).__aenter__()
         # The other host's launcher does not bind it.
         async with RunningGraph(plan, host="main") as graph:
