@@ -254,7 +254,7 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("echo", "display", "--once", "--timeout", "0.2"), 1, 'nothing came on "display"'),
         (("hz", "display", "--duration", "0.2"), 1, 'nothing came on "display"'),
         (("pub", "estop", "{engaged: maybe}"), 2, "MESSAGE (EStop): engaged"),
-        (("pub", "estop", "{engaged: ["), 2, "neither YAML nor JSON"),
+        (("pub", "estop", "{engaged: ["), 2, "not valid YAML or JSON"),
         (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
         (("echo", "estop", "--run", "/nowhere"), 2, "no plan.json"),
     ],

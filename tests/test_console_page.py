@@ -323,7 +323,7 @@ def test_a_page_of_another_site_gets_no_socket(session: Session) -> None:
 
 
 def test_a_scene_that_is_no_scene_is_left_out_with_the_reason(session: Session) -> None:
-    assert "scene broken.yaml is left out" in session.notes["log"]
+    assert "scene broken.yaml is skipped" in session.notes["log"]
 
 
 def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:

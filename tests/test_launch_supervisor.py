@@ -234,7 +234,7 @@ async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
 ) -> None:
     """Suspended, but with the readings of a process that waits for a processor."""
     starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
-    monkeypatch.setattr(ProcessorTime, "of", lambda process: starved)
+    monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
     said: list[str] = []
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
@@ -353,7 +353,7 @@ async def test_a_port_in_use_is_named_before_anything_starts(
     endpoint = plan.writers["twin/finger"][0].tcp
     assert endpoint is not None
     with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
-        with pytest.raises(BadInputError, match="is a graph running already"):
+        with pytest.raises(BadInputError, match="end the other graph or program"):
             await RunningGraph(plan).__aenter__()
         # The other host's launcher does not bind it.
         async with RunningGraph(plan, host="main") as graph:

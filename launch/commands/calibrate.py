@@ -1,4 +1,4 @@
-"""`flexsheet calibrate`: a stereo rig measured by pictures of a board, and checked."""
+"""`flexsheet calibrate`: calibrate a stereo rig with images of a board, and check it."""
 
 from __future__ import annotations
 
@@ -27,21 +27,25 @@ if TYPE_CHECKING:
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Scene
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="Calibration from pictures.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Calibrate cameras, arms, projector and sheet."
+)
 
-LeftOption = Annotated[str, typer.Option(metavar="GLOB", help="Left pictures, in name order.")]
-RightOption = Annotated[str, typer.Option(metavar="GLOB", help="Right pictures, in name order.")]
-BoardOption = Annotated[
-    str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the board, as 9x6.")
+LeftOption = Annotated[
+    str, typer.Option(metavar="GLOB", help="Left images, in the order of names.")
 ]
-SquareOption = Annotated[float, typer.Option(help="Side of a square, mm.", min=1e-3)]
+RightOption = Annotated[
+    str, typer.Option(metavar="GLOB", help="Right images, in the order of names.")
+]
+BoardOption = Annotated[
+    str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the board, such as 9x6.")
+]
+SquareOption = Annotated[float, typer.Option(help="Side length of a square, mm.", min=1e-3)]
 MarkerOption = Annotated[
     float | None,
-    typer.Option(help="Side of a marker, mm; with it the board is a ChArUco board.", min=1e-3),
+    typer.Option(help="Side length of a marker, mm; makes the board a ChArUco board.", min=1e-3),
 ]
-DictionaryOption = Annotated[
-    str, typer.Option(help="OpenCV's dictionary of a ChArUco board's markers.")
-]
+DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
 FOUR_BITS = "DICT_4X4_50"
 
 
@@ -59,30 +63,35 @@ def stereo(
     square_mm: SquareOption,
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
     left: Annotated[
-        str | None, typer.Option(metavar="GLOB", help="Left pictures, in name order.")
+        str | None, typer.Option(metavar="GLOB", help="Left images, in the order of names.")
     ] = None,
     right: Annotated[
-        str | None, typer.Option(metavar="GLOB", help="Right pictures, in name order.")
+        str | None, typer.Option(metavar="GLOB", help="Right images, in the order of names.")
     ] = None,
     device_source: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Take pictures live, from what a camera node's source describes: "
+            help="Capture images live from the source of a camera node: "
             "'{kind: opencv, left: 0, right: 1}'.",
         ),
     ] = None,
     scene_file: Annotated[
         Path | None,
-        typer.Option("--scene", metavar="FILE", help="Scene of the live camera: size, exposure."),
+        typer.Option(
+            "--scene",
+            metavar="FILE",
+            help="Scene with the image size and exposure of the live camera.",
+        ),
     ] = None,
     twin: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="Take pictures from a scene's twin.")
+        Path | None,
+        typer.Option(metavar="SCENE", help="Capture images from the simulator of this scene."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the twin's poses and noise.")] = 1,
-    pairs: Annotated[int, typer.Option(help="Pairs to take live.", min=5)] = 20,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated poses and noise.")] = 1,
+    pairs: Annotated[int, typer.Option(help="Image pairs to capture live.", min=5)] = 20,
     pictures: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="New folder for pictures taken live.")
+        Path | None, typer.Option(metavar="FOLDER", help="New folder for captured images.")
     ] = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
@@ -92,16 +101,16 @@ def stereo(
     distance_mm: Annotated[
         float | None,
         typer.Option(
-            help="Distance to state the uncertainty at; default: the scene's, or the boards'.",
+            help="Distance of the reported uncertainty; default: the scene's or the boards'.",
             min=1.0,
         ),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write a report with plots there.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder for a report with plots.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate both cameras and how they stand to each other.
+    """Calibrate both cameras and their relative pose.
 
     From pictures (--left, --right), from a device (--device-source, --scene) or from the twin.
     """
@@ -275,7 +284,7 @@ def cross_check(
     square_mm: SquareOption,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    leave_out: Annotated[int, typer.Option(help="Pairs left out at a time.", min=1)] = 1,
+    leave_out: Annotated[int, typer.Option(help="Number of pairs left out at a time.", min=1)] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Leave pairs out in turn, measure them with what the rest gives, beside plain OpenCV."""
@@ -351,7 +360,7 @@ def _figure(value: object) -> str:
 def _one_source(
     left: str | None, right: str | None, device_source: str | None, twin: Path | None
 ) -> None:
-    """Raises CommandError unless exactly one way to get pictures is chosen."""
+    """Raise CommandError unless exactly one source of images is chosen."""
     files = left is not None or right is not None
     chosen = [files, device_source is not None, twin is not None]
     if sum(chosen) != 1 or (files and (left is None or right is None)):
@@ -389,7 +398,7 @@ def _board(text: str, square_mm: float, marker_mm: float | None, dictionary: str
 
 
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
-    """Return the given distance, else that of the scene's camera to the screen, else None."""
+    """Return the requested distance, else that of the scene's screen centre, else None."""
     if distance_mm is not None:
         return 1e-3 * distance_mm
     if scene is None:
@@ -399,7 +408,7 @@ def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float
 
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr; yield the function that updates it."""
+    """Show a progress bar on stderr, and yield the function that updates it."""
     from rich.progress import Progress
 
     with Progress(console=words.console, transient=True) as bar:

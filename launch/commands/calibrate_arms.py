@@ -1,4 +1,4 @@
-"""`flexsheet calibrate arms`: where the arms' bases stand, by a board on the flange."""
+"""`flexsheet calibrate arms`: measure the arms' base poses with a board on the flange."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
     from flexsheet.messages.types import Side
 
 SceneOption = Annotated[
-    Path, typer.Option("--scene", metavar="SCENE", help="Scene with the camera's place.")
+    Path, typer.Option("--scene", metavar="SCENE", help="Scene with the camera's pose.")
 ]
 CalibrationOption = Annotated[
     Path | None,
     typer.Option(
         "--calibration",
         metavar="FILE",
-        help="What `calibrate stereo` wrote; without it the scene's own optics.",
+        help="Stereo calibration file; default: the optics of the scene.",
     ),
 ]
 SIDES: tuple[Side, Side] = ("left", "right")
@@ -89,26 +89,30 @@ def arms(
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
     left_arm: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Places of the left arm: joints.csv and pictures."),
+        typer.Option(
+            metavar="FOLDER", help="Folder of the left arm's poses: joints.csv and images."
+        ),
     ] = None,
     right_arm: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Places of the right arm.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder of the right arm's poses.")
     ] = None,
-    twin: Annotated[
-        bool, typer.Option("--twin", help="Take the places from the scene's twin, both arms.")
-    ] = False,
-    places: Annotated[int, typer.Option(help="Places of each of the twin's arms.", min=6)] = 16,
-    seed: Annotated[int, typer.Option(help="Of the twin's bases, places and noise.")] = 1,
+    twin: Annotated[bool, typer.Option("--twin", help="Simulate the poses of both arms.")] = False,
+    places: Annotated[int, typer.Option(help="Simulated poses per arm.", min=6)] = 16,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated bases, poses and noise.")] = 1,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     copy: Annotated[
         Path | None,
-        typer.Option("--write-scene", metavar="FILE", help="Write a copy of the scene with it."),
+        typer.Option(
+            "--write-scene",
+            metavar="FILE",
+            help="Write a copy of the scene with the measured bases.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure where the arms' bases stand in the world of the stereo camera.
+    """Measure the poses of the arms' bases in the world frame of the stereo camera.
 
     The board is fast on the flange; the arm stands still at 15 to 20 places, its flange turned to
     all sides.  Give a folder for each arm (see docs/arms.md), or --twin.
@@ -150,12 +154,14 @@ def arms(
 
 
 def write_scene(
-    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="Of the arms.")],
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION", help="Calibration file of the arms.")
+    ],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene to copy.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
+    """Copy a scene and insert the bases of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import load_arms_calibration
     from flexsheet.messages.calibration_file import CalibrationFileError
@@ -174,21 +180,21 @@ def write_scene(
 
 def capture(
     *,
-    side: Annotated[str, typer.Option("--arm", metavar="left|right", help="The arm to watch.")],
+    side: Annotated[str, typer.Option("--arm", metavar="left|right", help="Side of the arm.")],
     board: BoardOption,
     square_mm: SquareOption,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FOLDER", help="New folder for the places.")
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="New folder for the poses.")
     ],
     scene_file: SceneOption,
-    places: Annotated[int, typer.Option(help="End after so many.", min=1)] = 20,
+    places: Annotated[int, typer.Option(help="Stop after this number of poses.", min=1)] = 20,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Take places from the graph that runs, from the topics of the arm and `stereo`.
+    """Capture poses from the running graph, from the topics of the arm and `stereo`.
 
     Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
     somewhere new; Ctrl-C ends.
@@ -374,7 +380,7 @@ def _arm_base(fit: BaseFit) -> ArmBase:
 
 
 def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
-    """Write the scene with the measured bases; comments and layout stay."""
+    """Write the scene with the measured bases; keep comments and layout."""
     from ruamel.yaml import YAML
 
     from flexsheet.launch.plans.plan import load_scene
@@ -404,7 +410,7 @@ def _rounded(value: float) -> float:
 
 
 def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str, float]:
-    """Return the error of the simulated arm's base, at the world's origin."""
+    """Return the error of the simulated base at the world's origin."""
     import numpy as np
 
     from flexsheet.launch.calibration.arm_poses import true_base
@@ -515,7 +521,7 @@ def _scene_line(base: ArmBase) -> str:
 
 
 def _shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return the distance (m) and rotation (rad) of the base from that of the scene."""
+    """Return the distance of the measured base from that of the scene: m and rad."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation

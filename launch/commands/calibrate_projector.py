@@ -1,4 +1,4 @@
-"""`flexsheet calibrate projector`: where the projector stands and how its lens bends, measured."""
+"""`flexsheet calibrate projector`: measure the projector's pose and lens distortion."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VOLUME_HALF_M = 0.1
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to `flexsheet calibrate`."""
+    """Add the command to `flexsheet calibrate`."""
     app.command(
         "projector",
         epilog=examples(
@@ -46,38 +46,49 @@ def register(app: typer.Typer) -> None:
 def projector(
     *,
     scene_file: Annotated[
-        Path, typer.Option("--scene", metavar="FILE", help="Scene with the projector by its data.")
+        Path,
+        typer.Option("--scene", metavar="FILE", help="Scene with the projector's nominal data."),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Scene file to write; may be the same one."),
+        typer.Option("-o", "--output", help="Scene file to write; may be the same file."),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The stereo camera's; default: the scene's.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Stereo calibration file; default: the optics of the scene."
+        ),
     ] = None,
     write_patterns: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write the patterns to show, and end.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Write the patterns to this folder and exit."),
     ] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="A folder per pose with left00.png, right00.png, ..."),
+        typer.Option(
+            metavar="FOLDER", help="Folder with one folder per pose: left00.png, right00.png, ..."
+        ),
     ] = None,
     corners: Annotated[
         str | None,
         typer.Option(
             metavar="'X,Y X,Y X,Y X,Y'",
-            help="By hand: pixels that light the corners of --rectangle-mm on the imaginary "
+            help="Manual calibration: pixels at the corners of --rectangle-mm on the imaginary "
             "screen; left bottom, right bottom, right top, left top, as the user sees them.",
         ),
     ] = None,
     rectangle_mm: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="About the screen's centre, for --corners.")
+        str,
+        typer.Option(
+            metavar="WIDTHxHEIGHT", help="Rectangle around the screen's centre, for --corners."
+        ),
     ] = "200x200",
     twin: Annotated[
-        bool, typer.Option("--twin", help="A projector that deviates from the scene's, unknown.")
+        bool,
+        typer.Option("--twin", help="Simulate a projector with unknown deviations from the scene."),
     ] = False,
-    poses: Annotated[int, typer.Option(min=3, help="Of the twin's sheet.")] = 6,
-    seed: Annotated[int, typer.Option(help="Of the twin's deviations and noise.")] = 1,
+    poses: Annotated[int, typer.Option(min=3, help="Poses of the simulated sheet.")] = 6,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated deviations and noise.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate the projector and write it into a scene.
@@ -169,7 +180,7 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
 
 
 def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
-    """Render the patterns on the sheet as the simulated cameras see them, pose by pose."""
+    """Yield the simulated images of the patterns on the sheet, pose by pose."""
     from rich.progress import track
 
     from flexsheet.launch.calibration.gray_code import patterns
@@ -224,7 +235,7 @@ def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
-    """Write the scene with this projector; comments and layout stay."""
+    """Write the scene with this projector; keep comments and layout."""
     from ruamel.yaml import YAML
 
     from flexsheet.launch.plans.plan import load_scene
@@ -257,7 +268,7 @@ def _in_a_row(values: list[float]) -> Any:
 
 
 def _rounded(value: float) -> float:
-    """Round to a nanometre, nanoradian or 1e-9 pixel; further digits are noise."""
+    """Round to a nanometre, nanoradian or billionth of a pixel; further digits are noise."""
     return round(float(value), 9) + 0.0
 
 
@@ -314,7 +325,7 @@ def _tell(
 
 
 def _eye_errors_mm(scene: Scene, found: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """True errors at the eye, on sheets held about, before and after the calibration."""
+    """Return the true image errors at the eye before and after the calibration."""
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate sheet`: the sheet's law, fitted to measured pushes or to the twin's."""
+"""`flexsheet calibrate sheet`: fit the sheet's force model to measured or simulated pushes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to `flexsheet calibrate`."""
+    """Add the command to `flexsheet calibrate`."""
     app.command(
         "sheet",
         epilog=examples(
@@ -49,10 +49,14 @@ def sheet(
         Path, typer.Option("--scene", metavar="FILE", help="Scene of the measured sheet.")
     ] = SCENE_FILE,
     twin: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="Push the twin's sheet of a scene.")
+        Path | None,
+        typer.Option(metavar="SCENE", help="Simulate the pushes on the sheet of this scene."),
     ] = None,
     places: Annotated[
-        bool, typer.Option("--places", help="Push the twin's sheet all over, not in the middle.")
+        bool,
+        typer.Option(
+            "--places", help="Simulate pushes over the whole sheet instead of its centre."
+        ),
     ] = False,
     table: Annotated[
         bool, typer.Option("--table", help="Keep a table of what the fitted law leaves, too.")
@@ -60,8 +64,10 @@ def sheet(
     mooney: Annotated[
         bool, typer.Option("--mooney", help="Fit Mooney's share too; wants stretches past 1.15.")
     ] = False,
-    noise_n: Annotated[float, typer.Option(help="Of the twin's gauge, N.", min=0.0)] = 0.005,
-    seed: Annotated[int, typer.Option(help="Of that noise.")] = 1,
+    noise_n: Annotated[
+        float, typer.Option(help="Noise of the simulated force gauge, N.", min=0.0)
+    ] = 0.005,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Fit modulus x thickness, slack width and cubic term of a sheet to pushes.

@@ -1,4 +1,4 @@
-"""Live capture for `flexsheet calibrate stereo`, from devices or the twin, with coverage shown."""
+"""Capture board images for `flexsheet calibrate stereo`, from devices or the simulator."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""The twin shows so many poses for each pair wanted, in case not all add coverage."""
+"""Simulated poses per requested pair, as not all of them add coverage."""
 
 
 def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
-    """Grey pairs from what a camera node's parameter `source` describes, in YAML."""
+    """Yield grey image pairs from a camera node's `source`, given in YAML."""
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
 
@@ -71,7 +71,7 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
 
 
 def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """Render a board as the simulated cameras see it, pose by pose."""
+    """Yield simulated image pairs of a board, pose by pose."""
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
 
@@ -84,9 +84,9 @@ def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Itera
 
 
 def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int:
-    """Keep the pairs that `capture` takes as left01.png, right01.png, ... in a new folder.
+    """Write the pairs that `capture` accepts as left01.png, right01.png, ... to a new folder.
 
-    Ends when all is covered, when the pictures end, or at Ctrl-C; what is still missing is said.
+    Stops at full coverage, at the end of the images, or at Ctrl-C, and prints missing coverage.
     Returns the number of pairs, at least one.
     """
 
@@ -119,7 +119,7 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
 
 @contextmanager
 def _shown(capture: Capture) -> Iterator[Any]:
-    """Calls with (hint, taken) update the view; a line per taken pair where it is no terminal."""
+    """Yield a function of (hint, taken) that updates the view, or prints lines if piped."""
     if not words.is_terminal:
 
         def tell(hint: str, taken: bool) -> None:
@@ -136,7 +136,7 @@ def _shown(capture: Capture) -> Iterator[Any]:
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Cells of both pictures, tilts, distances and pairs: how often seen of how often needed."""
+    """Draw how often each image cell, tilt and distance was seen and is needed."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""`flexsheet chart`: compare speed and accuracy of methods."""
+"""`flexsheet chart`: measure speed against accuracy of a method family."""
 
 from __future__ import annotations
 
@@ -40,30 +40,32 @@ def chart(
     *,
     family: Annotated[
         str | None,
-        typer.Argument(help="Method family; without it, all.", autocompletion=complete.families),
+        typer.Argument(help="Method family; default: all.", autocompletion=complete.families),
     ] = None,
     scene_file: Annotated[
         Path,
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene to measure on.",
+            help="Scene for the measurements.",
             autocompletion=complete.yaml_files,
         ),
     ] = SCENE_FILE,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="Folder for figures and numbers.")
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder for charts and numbers.")
     ] = Path("runs/charts"),
     redraw: Annotated[
         bool,
-        typer.Option("--redraw", help="Redraw the stored numbers in --output."),
+        typer.Option(
+            "--redraw", help="Draw the stored numbers in --output again without measuring."
+        ),
     ] = False,
     cases: Annotated[
-        bool, typer.Option("--cases", help="Print every case instead of one row per method.")
+        bool, typer.Option("--cases", help="Print every case instead of one line per method.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure and draw speed and accuracy of a family's methods, on this machine and one scene.
+    """Measure and draw speed against accuracy of a family's methods on this computer.
 
     Prints the maximum median time and the maximum error of each method over the cases in its range.
     The front has the methods that no other method dominates in both.

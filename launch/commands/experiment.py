@@ -1,4 +1,4 @@
-"""`flexsheet experiment`: the paper's experiments, run on the graph."""
+"""`flexsheet experiment`: run the paper's experiments on a graph."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="The paper's experiments, through the running graph.",
+    help="Run the paper's experiments on a graph.",
 )
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
@@ -34,24 +34,28 @@ LaunchOption = Annotated[
     typer.Option(
         "--launch",
         metavar="FILE",
-        help="The graph to experiment on.",
+        help="Launch file of the graph.",
         autocompletion=complete.yaml_files,
     ),
 ]
 OutputOption = Annotated[
     Path | None,
-    typer.Option("--output", metavar="FOLDER", help="For bag and results; default: runs/..."),
+    typer.Option(
+        "--output", metavar="FOLDER", help="Folder for the bag and results; default: runs/..."
+    ),
 ]
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+    typer.Option(
+        "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
+    ),
 ]
 MapOption = Annotated[
     Path | None,
     typer.Option(
         "--map",
         metavar="FILE.png",
-        help="Also measure the error at each visible point, and draw it; twice as long.",
+        help="Also measure and draw the error at each visible point; takes twice as long.",
     ),
 ]
 
@@ -87,7 +91,9 @@ def _record(
 )
 def stroke(
     *,
-    seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="Moving time.")] = 10.0,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=600.0, help="Duration of the motion, s.")
+    ] = 10.0,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     output: OutputOption = None,
@@ -120,7 +126,7 @@ def tilt(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
+    """Measure image errors on an inclined sheet (section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
 
     bag = result_folder(output, "tilt") / "tilt.mcap"
@@ -136,11 +142,17 @@ def push(
     *,
     at_mm: Annotated[
         float,
-        typer.Option("--at", metavar="MM", help="Along the cylinder's axis, from its middle."),
+        typer.Option(
+            "--at",
+            metavar="MM",
+            help="Contact position along the cylinder's axis, from its middle.",
+        ),
     ] = 0.0,
     tilt_deg: Annotated[
         float,
-        typer.Option("--tilt", metavar="DEG", help="Around it, which inclines the sheet so far."),
+        typer.Option(
+            "--tilt", metavar="DEG", help="Contact angle around the axis, which inclines the sheet."
+        ),
     ] = 0.0,
     map_file: MapOption = None,
     launch_file: LaunchOption = DEMO_FILE,
@@ -148,7 +160,7 @@ def push(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Errors of the picture on a pushed sheet (section VI-C, Fig. 13).
+    """Measure image errors on a pushed sheet (section VI-C, Fig. 13).
 
     As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
     all of the push.  `--set planner.compliance_mode=force_curve` has it comply.
@@ -172,7 +184,7 @@ def compliance(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """How the force that a finger meets compares with the object's, over the push."""
+    """Compare the force on the finger with that of the object over the push depth."""
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
 
@@ -250,14 +262,14 @@ def gestures(
     *,
     names: Annotated[
         str | None,
-        typer.Option("--names", metavar="NAME,...", help="Some of them only; default: all."),
+        typer.Option("--names", metavar="NAME,...", help="Gestures to run; default: all."),
     ] = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """How well a fingertip is tracked that strokes, taps, reaches, stops and turns."""
+    """Measure how well a fingertip is tracked in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
 
     wanted = experiment.select_gestures(names)
@@ -275,7 +287,7 @@ def gestures(
 
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """A line for each gesture: errors in mm, lags in ms."""
+    """Print a line per gesture: errors in mm, delays in ms."""
 
     def shown(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
@@ -296,7 +308,7 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """A line for each path: how well the true sheet followed the true finger in contact."""
+    """Print a line per path: error between true sheet and true finger in contact."""
 
     def shown(values: dict[str, float] | None) -> list[str]:
         if values is None:
@@ -316,7 +328,7 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
-    """Table I of the paper beside ours, mean and standard deviation."""
+    """Print Table I of the paper beside the measured values, mean and standard deviation."""
     from flexsheet.launch.experiments.stroke import PAPER_TABLE_1
 
     columns = ["moving time"]

@@ -1,4 +1,4 @@
-"""`flexsheet topic`: the table of topics, and a look at (or a word into) the graph that runs."""
+"""`flexsheet topic`: list topics, and read or publish them in the running graph."""
 
 from __future__ import annotations
 
@@ -34,17 +34,20 @@ if TYPE_CHECKING:
     from flexsheet.messages.topics import Topic
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Topics: the table, and what is on them now."
+    add_completion=False,
+    no_args_is_help=True,
+    help="List topics, and read or publish them in the running graph.",
 )
 
 TopicArgument = Annotated[
-    str, typer.Argument(help="Name of the topic, as twin/finger.", autocompletion=complete.topics)
+    str,
+    typer.Argument(help="Name of the topic, such as twin/finger.", autocompletion=complete.topics),
 ]
 PATIENCE_S = 3.0
-"""After which it is said that nothing came yet."""
+"""Time after which a missing message is reported."""
 
 SHORT_ARRAY = 36
-"""Arrays of more elements than a 6x6 matrix are abbreviated."""
+"""Longer arrays than a 6x6 matrix are abbreviated."""
 
 
 @app.command(
@@ -52,7 +55,7 @@ SHORT_ARRAY = 36
     epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
 )
 def list_topics(as_json: JsonOption = False) -> None:
-    """The one table of topics."""
+    """List all topics."""
     from flexsheet.messages.topics import TOPICS
 
     rows = [_describe(topic) for topic in TOPICS.values()]
@@ -77,7 +80,7 @@ def list_topics(as_json: JsonOption = False) -> None:
 
 @app.command(epilog=examples("flexsheet topic info fingertip"))
 def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Type and fields of a topic, and who writes and reads it in the graph that runs."""
+    """Print the type and fields of a topic, and its writers and readers in the running graph."""
     found = _topic(topic)
     description = _describe(found)
     schema = found.message.model_json_schema()
@@ -119,16 +122,20 @@ def echo(
     *,
     topic: TopicArgument,
     once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
-    count: Annotated[int | None, typer.Option(help="Stop after so many messages.", min=1)] = None,
-    timeout: Annotated[
-        float | None, typer.Option(help="Fail when nothing came for so many seconds.")
+    count: Annotated[
+        int | None, typer.Option(help="Stop after this number of messages.", min=1)
     ] = None,
-    field: Annotated[str | None, typer.Option(help="Only this field, as left.fx_px.")] = None,
+    timeout: Annotated[
+        float | None, typer.Option(help="Fail if no message arrives for this time, s.")
+    ] = None,
+    field: Annotated[
+        str | None, typer.Option(help="Print only this field, such as left.fx_px.")
+    ] = None,
     full: Annotated[bool, typer.Option("--full", help="Do not abbreviate arrays.")] = False,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the messages of a topic as they come; --json prints one document a line."""
+    """Print the messages of a topic as they arrive; --json prints one document per line."""
     found = _topic(topic)
     wanted = 1 if once else count
 
@@ -147,11 +154,11 @@ def echo(
 @app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
 def hz(
     topic: TopicArgument,
-    duration: Annotated[float, typer.Option(help="Measure for so many seconds.", min=0.1)] = 5.0,
+    duration: Annotated[float, typer.Option(help="Measurement time, s.", min=0.1)] = 5.0,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Rate of each writer of a topic, by the writers' own stamps and sequence numbers."""
+    """Measure the rate of each writer of a topic, by its stamps and sequence numbers."""
     found = _topic(topic)
     headers: list[Header] = []
     run_interruptible(_collect_headers(found, run, headers, duration))
@@ -186,9 +193,9 @@ def hz(
 def pub(
     *,
     topic: TopicArgument,
-    message: Annotated[str, typer.Argument(help="In YAML, JSON (of any size), or @FILE.")],
-    rate: Annotated[float | None, typer.Option(help="Send again at this rate, Hz.")] = None,
-    count: Annotated[int | None, typer.Option(help="Send so many times.", min=1)] = None,
+    message: Annotated[str, typer.Argument(help="Message in YAML or JSON, or @FILE.")],
+    rate: Annotated[float | None, typer.Option(help="Repeat the message at this rate, Hz.")] = None,
+    count: Annotated[int | None, typer.Option(help="Number of messages to send.", min=1)] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -225,7 +232,7 @@ def silence(topic: str, duration_s: float) -> CommandError:
 
 
 def rates(headers: list[Header]) -> list[dict[str, Any]]:
-    """Per writer: rate by its stamps, received and lost messages, intervals between stamps."""
+    """Return per writer: rate, received and lost messages, intervals between stamps."""
     import numpy as np
 
     rows = []
@@ -256,7 +263,7 @@ def rates(headers: list[Header]) -> list[dict[str, Any]]:
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
-    """A message or field as JSON's types; long arrays as their type, shape and range."""
+    """Convert a message or field to JSON types; long arrays to type, shape and range."""
     import numpy as np
     from pydantic import BaseModel
 
@@ -385,7 +392,7 @@ async def _collect_headers(
 def listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
 ) -> Subscriber:
-    """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
+    """Make a subscriber to a topic of the running graph.  Raises CommandError without a writer."""
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
@@ -419,7 +426,7 @@ def _parse_message(topic: Topic, text: str) -> Message:
         except ValueError:  # YAML's own errors say what is wrong with either
             value = parse_value(text)
     except YAMLError as error:
-        raise CommandError(f"{source}: neither YAML nor JSON: {error}", BAD_INPUT) from error
+        raise CommandError(f"{source}: not valid YAML or JSON: {error}", BAD_INPUT) from error
     if not isinstance(value, dict):
         raise CommandError(f"{source}: holds no fields of {topic.message.__name__}", BAD_INPUT)
     return validate(

@@ -1,4 +1,4 @@
-"""`flexsheet tune`: choose the fastest sufficient methods for a scene."""
+"""`flexsheet tune`: choose the cheapest methods that meet a scene's tolerances."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code: a family has no sufficient method, and the nearest miss was chosen."""
+"""Exit code if no method of some family meets the tolerance, so the best one was chosen."""
 
 
 app = typer.Typer(add_completion=False)
@@ -49,22 +49,26 @@ def tune(
         typer.Option(
             "--family",
             metavar="NAME",
-            help="Tune only this family; can be repeated.",
+            help="Tune only this family; may be repeated.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", metavar="FILE", help="Write a copy, and leave SCENE unchanged."),
+        typer.Option(
+            "--output", metavar="FILE", help="Write a copy to this file instead of changing SCENE."
+        ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not write the scene.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not write any file.")] = False,
     margin: Annotated[
         float,
-        typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance that must remain."),
+        typer.Option(
+            min=0.0, max=0.9, help="Fraction of each tolerance that must remain as a margin."
+        ),
     ] = 0.2,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the fastest methods within a scene's tolerances, and write them into the scene.
+    """Choose the cheapest methods that meet a scene's tolerances, and write them into the scene.
 
     Measures each family on this machine over the scene's working range, which takes seconds to
     minutes the first time.  Prints the reason for each choice.  Nodes with the parameter value

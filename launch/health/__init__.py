@@ -1,1 +1,1 @@
-"""Whether computers, devices, reach and sheet are fit for a scene, and what to do about it."""
+"""Check computers, devices, reach and sheet for a scene, with remedies."""
