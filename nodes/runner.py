@@ -206,7 +206,7 @@ class Links:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on an absolute grid; calls that came due late are skipped."""
+    """Call a node's periodic method on an absolute grid; skip calls that are already late."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -226,19 +226,19 @@ async def run_keys(links: Links) -> None:
         links.renew_keys()
 
 
-async def run_status(node: Node, process: psutil.Process, sign_of_life: Callable[[], None]) -> None:
-    """Publish the node's status once a second, and tell the launcher that the loop still turns."""
+async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
+    """Publish the node's status once a second, and report to the launcher that the loop runs."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
         node.status.publish(status_of(node, "running", process))
-        sign_of_life()
+        beat()
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
-    """The status message: rates, ages, drops and errors of every port come for free.
+    """Make the status message, with rates, ages, losses and errors of every port.
 
-    Degraded: something went wrong since the last one.  A gap on a `latest` topic is none of it.
+    Degraded: an error or a loss since the last status. A gap on a `latest` topic does not count.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -292,15 +292,15 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
             asyncio.create_task(run_timer(node, number, timer))
             for number, timer in enumerate(timers_of(class_))
         ]
-        life = Life(config.ready_fd)
-        tasks.append(asyncio.create_task(run_status(node, process, life.sign)))
+        heartbeat = Heartbeat(config.ready_fd)
+        tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
         if links.keys is not None:
             tasks.append(asyncio.create_task(run_keys(links)))
-        # What setup built lives on; without this the collector walks it in the middle of a cycle.
+        # Objects of setup live on; unfrozen, the garbage collector would traverse them in a cycle.
         gc.collect()
         gc.freeze()
-        life.sign()
+        heartbeat.beat()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
@@ -326,11 +326,11 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
         _, pending = await asyncio.wait(pending, timeout=CANCEL_AGAIN_S)
 
 
-class Life:
-    """The pipe to the launcher: the first byte says that the node is set up, others that it lives.
+class Heartbeat:
+    """Report to the launcher over a pipe that the node is set up (first byte) and alive (others).
 
-    fd: the pipe's end, None where nobody listens.  A launcher that does not read keeps no node
-    waiting.
+    fd: the writing end, None without a launcher. A launcher that does not read never blocks the
+    node.
     """
 
     def __init__(self, fd: int | None) -> None:
@@ -338,10 +338,10 @@ class Life:
         if fd is not None:
             os.set_blocking(fd, False)
 
-    def sign(self) -> None:
+    def beat(self) -> None:
         if self._fd is not None:
-            # Full, the pipe holds enough signs; broken, the launcher is gone, and its lifeline
-            # ends this process.
+            # A full pipe holds enough beats.  A broken one means that the launcher is gone, and its
+            # lifeline ends this process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
