@@ -1,4 +1,4 @@
-"""The report's charts: SVG that follows light and dark, each with a text of what it shows."""
+"""Draw the charts of the report as SVG for light and dark pages, each with a text."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """svg: the picture.  text: what it shows, for who cannot see it.  caption: how to read it."""
+    """Hold a chart. svg: image. text: its content in words. caption: how to read it."""
 
     svg: str
     text: str
     caption: str
 
 
-def charts_of(session: Session) -> dict[str, Chart]:
-    """The charts that the bag has data for, by name."""
+def draw_charts(session: Session) -> dict[str, Chart]:
+    """Draw the charts for which the bag has data, by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -76,14 +76,14 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Set the axes to the bag's time, once their lines are there."""
+    """Set the axes to the time of the bag, after the lines are drawn."""
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Mark each value of a line that no line leads to or from: else it would not be seen."""
+    """Mark each value without neighbours: no line would show it."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         beside = np.zeros_like(known)
@@ -96,7 +96,7 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Strips of states over time, and above them what happened."""
+    """Draw strips of states over time, and events above them."""
     strips = [
         (name, states)
         for name, states in (
@@ -120,7 +120,7 @@ def timeline(session: Session) -> Chart | None:
     looks: dict[tuple[str, str | None], list[str]] = {}
     for row, (name, states) in enumerate(strips):
         lasting = name == "e-stop"
-        for state, begin_s, end_s in stretches_of(states, session.fine, lasting=lasting):
+        for state, begin_s, end_s in find_intervals(states, session.fine, lasting=lasting):
             colour, hatch = look = STATE_COLOURS.get(state, MIDDLE), HATCHES.get(state)
             axes.barh(
                 row, end_s - begin_s, left=begin_s, height=0.7, color=colour, hatch=hatch,
@@ -158,15 +158,17 @@ def timeline(session: Session) -> Chart | None:
 
 
 def spent_in(states: States) -> list[tuple[str, float]]:
-    """The states that lasted, the longest first."""
+    """Describe the states, the longest first."""
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
 
-def stretches_of(
+def find_intervals(
     states: States, grid: Grid, *, lasting: bool = False
 ) -> Iterator[tuple[str, float, float]]:
-    """Runs of one state: (state, from s, to s).  lasting: until another one, not until silence."""
+    """Find intervals of one state: (state, from s, to s). lasting: up to the next state, not up to
+    silence.
+    """
     width_s = grid.duration_s / grid.count
     # A message every second leaves holes in a fine grid, which are none in what it says.
     holes = max(int(0.5 / width_s), 1)
@@ -187,7 +189,7 @@ def stretches_of(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Median and 99 % of each step after the exposure, over time."""
+    """Draw median and 99 % of each step after the exposure, over time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -226,7 +228,7 @@ def latencies(session: Session) -> Chart | None:
 
 
 def paths(session: Session) -> Chart | None:
-    """Where the finger and the sheet's middle were, from the front and from the side."""
+    """Draw the paths of finger and sheet centre, from the front and from the side."""
     finger, true = 1e3 * session.finger_place.points, 1e3 * session.true_place.points
     sheet = 1e3 * session.sheet_place.points
     known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
@@ -265,7 +267,7 @@ def paths(session: Session) -> Chart | None:
 
 
 def sheet_errors(session: Session) -> Chart | None:
-    """Greatest position and angle error of each stretch, while the sheet touches."""
+    """Draw the maximum position and angle errors of each interval in contact."""
     errors = session.errors
     shown = [
         (name, label)
@@ -309,7 +311,7 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def joint_speeds(session: Session) -> Chart | None:
-    """Each joint's greatest speed as a share of what it can do."""
+    """Draw each joint's maximum speed over its limit."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
@@ -343,7 +345,7 @@ def joint_speeds(session: Session) -> Chart | None:
 
 
 def forces(session: Session) -> Chart | None:
-    """The pull at the sheet's edges, the object's force, and how deep the finger pushes."""
+    """Draw the edge forces, the force of the object and the push depth."""
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None
