@@ -32,7 +32,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""So that states which call for attention are told apart without colours."""
+"""Hatches that distinguish grave states without colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -126,9 +126,9 @@ def timeline(session: Session) -> Chart | None:
                 row, end_s - begin_s, left=begin_s, height=0.7, color=colour, hatch=hatch,
                 edgecolor="#ffffff" if hatch else colour, linewidth=0.0,
             )  # fmt: skip
-            told = looks.setdefault(look, [])
-            if state not in told:
-                told.append(state)
+            texts = looks.setdefault(look, [])
+            if state not in texts:
+                texts.append(state)
     for kind in kinds:
         marker, colour = MARKS[kind]
         at = [seconds for seconds, _ in session.events.of(kind)]
@@ -139,8 +139,8 @@ def timeline(session: Session) -> Chart | None:
     _over_time(axes, session)
     axes.set_xlabel("time in the bag, s")
     patches = [
-        Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(told))
-        for (colour, hatch), told in looks.items()
+        Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(texts))
+        for (colour, hatch), texts in looks.items()
     ]
     handles, _ = axes.get_legend_handles_labels()
     figure.legend(handles=[*patches, *handles], ncols=5, fontsize=8, loc="outside lower center")
@@ -196,7 +196,7 @@ def latencies(session: Session) -> Chart | None:
     rows = (len(events) + 1) // 2
     figure, grid = _figure(rows, 2, 1.9 * rows + 0.4)
     seconds = session.grid.seconds()
-    told = []
+    texts = []
     for i, event in enumerate(events):
         axes: Axes = grid[i // 2][i % 2]
         spread: Spread = session.latencies[event]
@@ -211,7 +211,7 @@ def latencies(session: Session) -> Chart | None:
         _over_time(axes, session)
         axes.set_ylabel("ms")
         whole = [spread.quantile_s(share) or 0.0 for share in (0.5, 0.99)]
-        told.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
+        texts.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
     grid[0][0].legend(fontsize=8)
     for axes in grid[-1]:
         axes.set_xlabel("time in the bag, s")
@@ -220,7 +220,7 @@ def latencies(session: Session) -> Chart | None:
     return Chart(
         svg_of(figure),
         "From the exposure to each step, over the whole bag, median and 99 %: "
-        + "; ".join(told)
+        + "; ".join(texts)
         + ".",
         "From the middle of the exposure until the message was sent, the command written, the "
         "frame drawn.",
@@ -282,10 +282,10 @@ def sheet_errors(session: Session) -> Chart | None:
         (grid[0][0], errors.distance, 1e3, "Δd, mm"),
         (grid[1][0], errors.angle, float(np.degrees(1.0)), "Δθ, degrees"),
     ):
-        for i, (name, told) in enumerate(shown):
+        for i, (name, texts) in enumerate(shown):
             axes.plot(
                 seconds, scale * values[name].most, color=COLOURS[4 * i], linewidth=1.0,
-                linestyle=("-", "--")[i], label=f"against the {told}",
+                linestyle=("-", "--")[i], label=f"against the {texts}",
             )  # fmt: skip
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0.0)
@@ -317,7 +317,7 @@ def joint_speeds(session: Session) -> Chart | None:
         return None
     figure, grid = _figure(len(arms), 1, 2.3 * len(arms) + 0.3)
     seconds = session.grid.seconds()
-    told = []
+    texts = []
     for axes, (side, arm) in zip(grid[:, 0], arms.items(), strict=True):
         for i, (range_, limit) in enumerate(
             zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
@@ -334,12 +334,12 @@ def joint_speeds(session: Session) -> Chart | None:
             for range_, limit in zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
             if (overall := range_.overall())
         ]
-        told.append(f"{side} arm at most {max(shares):.0f} %")
+        texts.append(f"{side} arm at most {max(shares):.0f} %")
     grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
     grid[-1][0].set_xlabel("time in the bag, s")
     return Chart(
         svg_of(figure),
-        f"Joint speeds as shares of their limits: {', '.join(told)}.",
+        f"Joint speeds over their limits: {', '.join(texts)}.",
         "The greatest of each stretch of time, from the measured joints over 25 ms.",
     )
 
@@ -352,12 +352,12 @@ def forces(session: Session) -> Chart | None:
     figure, grid = _figure(2, 1, 4.4)
     seconds = session.grid.seconds()
     upper, lower = grid[0][0], grid[1][0]
-    told = []
+    texts = []
     for i, (side, arm) in enumerate(arms.items()):
         upper.plot(seconds, arm.edge_force.most, color=COLOURS[4 * i], linewidth=1.2,
                    linestyle=("-", "--")[i], label=f"{side} edge")  # fmt: skip
         overall = arm.edge_force.overall()
-        told.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
+        texts.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
     if session.scene is not None:
         most_n = session.scene.sheet.max_edge_force_n
         upper.axhline(most_n, linestyle="--", color=INK, linewidth=1.0, label="limit")
@@ -373,7 +373,7 @@ def forces(session: Session) -> Chart | None:
     lower.set_xlabel("time in the bag, s")
     return Chart(
         svg_of(figure),
-        f"Forces: {', '.join(told)}.",
+        f"Forces: {', '.join(texts)}.",
         "Above, the pull of the sheet at its edges, by the bridges; below, how deep the finger is "
         "in the object, and the object's force on it by the solver.",
     )

@@ -228,8 +228,8 @@ def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterat
     if not events:
         yield "<p>No scene, bookmark, gap, fault, restart or e-stop was recorded.</p>"
         return
-    told = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
-    title = f"What happened ({told})"
+    texts = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
+    title = f"What happened ({texts})"
     if len(events) > EVENTS_SHOWN:
         title += f"; the first {EVENTS_SHOWN}, all are in --json"
     told_of = [(one["seconds"], one["kind"], one["text"]) for one in events[:EVENTS_SHOWN]]
@@ -270,7 +270,7 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _latency(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
-    yield figure(charts.get("latency"), "No topic was recorded that tells a latency.")
+    yield figure(charts.get("latency"), "No recorded topic has a latency.")
     rows = [
         (event, one["p50"], one["p99"], one["max"], one["count"])
         for event, one in numbers["latency_ms"].items()
@@ -340,8 +340,8 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
         )  # fmt: skip
     reasons = numbers["finger"]["reasons"]
     if reasons:
-        told = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
-        yield f"<p>What the pictures gave: {escape(told)}.</p>"
+        texts = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
+        yield f"<p>Results of the images: {escape(texts)}.</p>"
 
 
 def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
