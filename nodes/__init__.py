@@ -1,7 +1,7 @@
-"""One folder per node: `node.py` wires, the files beside it compute.
+"""Contain one folder per node: `node.py` wires, the modules beside it compute.
 
-`NODES` is the table of nodes that a launch file can name.  Classes are imported when asked for, so
-that a process loads no other node's libraries.
+`NODES` lists the nodes that a launch file can name. A class is imported when it is used, so that a
+process does not load the libraries of other nodes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """What a node is to the launcher, the doctor and the replay, whatever its class is named.
+    """Name what a node is to the launcher, the doctor and the replay, whatever its class name.
 
-    A node class declares it as `role`; one that publishes the state of an arm is an arm bridge
-    without saying so.
+    A node class declares it as `role`. A class that publishes the state of an arm is an arm bridge
+    without a declaration.
     """
 
     ARM_BRIDGE = "arm_bridge"
@@ -50,7 +50,7 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """A node name that is not in the table; the message suggests one that is."""
+    """Report a node name that is not in the table; the message suggests one that is."""
 
     code = "unknown-node"
     remedy = "`flexsheet node list` prints all names."
@@ -60,8 +60,8 @@ def node_class(name: str) -> type[Node]:
     """Import the class of a node type: a name of the table, or "module:Class".
 
     Launch files and bags written before the package was named `flexsheet` name modules as
-    "nodes.planner.node"; these are found too.  Raises UnknownNodeError for a name that is neither,
-    ImportError or AttributeError for a module or class that does not exist.
+    "nodes.planner.node"; these are found too. UnknownNodeError for any other name; ImportError or
+    AttributeError for a module or class that does not exist.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")

@@ -1,4 +1,4 @@
-"""Priority of processes that compute something for later while a graph runs."""
+"""Lower the priority of processes that compute results for later use."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ MAX_NICE = 19
 
 
 def enter_background() -> None:
-    """Leave the processors to all others: take the highest niceness and batch scheduling.
+    """Take the highest niceness and batch scheduling, so that other processes run first.
 
     A process of the batch class never interrupts another one when it wakes up.
     """

@@ -1,4 +1,4 @@
-"""Limits how often a node's log repeats a warning or an error."""
+"""Limit how often a node's log repeats a warning or an error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import structlog
 LIMITED_LEVELS = {"warning", "error", "critical"}
 REPORT_PERIOD_S = 60.0
 MAX_DISTINCT = 1000
-"""Number of distinct records whose counts are kept; the one that is unseen for longest goes."""
+"""Number of distinct records that are counted; the least recent one is dropped first."""
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _WITHOUT_MEANING = {"exc_info", "count"}
@@ -25,18 +25,17 @@ Key = tuple[tuple[str, str], ...]
 
 @dataclass(slots=True)
 class Repeats:
-    """How often a record came, and when it was last logged (s)."""
+    """Count a record, and store when it was last logged (s)."""
 
     count: int = 0
     logged_s: float = float("-inf")
 
 
 class RepeatLimiter:
-    """Structlog processor that passes the 1st, 10th, 100th, ... of records that say the same.
+    """Pass the 1st, 10th, 100th, ... of equal records; a structlog processor.
 
-    A record that continues is passed once in REPORT_PERIOD_S too.  Records say the same if they
-    differ in numbers alone.  From the second on, a record that is passed carries its `count` since
-    the node's start.
+    A record that continues also passes once in REPORT_PERIOD_S. Records are equal if they differ in
+    numbers only. From the second on, a passed record has its `count` since the start of the node.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -46,7 +45,7 @@ class RepeatLimiter:
     def __call__(self, logger: Any, method: str, record: Record) -> Record:
         if method not in LIMITED_LEVELS:
             return record
-        repeats = self._repeats_of(record)
+        repeats = self._count_repeats(record)
         repeats.count += 1
         now_s = self._now_s()
         if not _is_power_of_ten(repeats.count) and now_s < repeats.logged_s + REPORT_PERIOD_S:
@@ -56,7 +55,7 @@ class RepeatLimiter:
             record["count"] = repeats.count
         return record
 
-    def _repeats_of(self, record: Record) -> Repeats:
+    def _count_repeats(self, record: Record) -> Repeats:
         key = tuple(
             (name, _NUMBER.sub("#", str(value)))
             for name, value in sorted(record.items())

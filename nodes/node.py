@@ -1,7 +1,7 @@
-"""The form of a node: ports declared as annotations, handlers found by name, all else injected.
+"""Define the base class of nodes: ports are annotations, handlers are found by name.
 
     class Follower(Node):
-        "Publishes where the sheet shall be, a hand's breadth above the finger."
+        "Publish a sheet target one hand's breadth above the finger."
 
         parameters: FollowerParameters
         fingertip: Input[Fingertip]
@@ -10,10 +10,10 @@
         def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
             self.sheet_target.publish(..., source_ns=header.source_ns)
 
-A node knows no sockets: it is given parameters, a clock and a function that takes what it sends.
-The same class therefore runs live (`nodes.runner`), in replay and in a unit test.  Handlers may be
-plain functions or coroutines; a coroutine handler never runs twice at once, and on a `latest` topic
-it skips what was superseded while it ran.
+A node knows no sockets.  It gets parameters, a clock and a function that sends its messages.  The
+same class therefore runs live (`nodes.runner`), in replay and in a unit test.  Handlers are plain
+functions or coroutines.  A coroutine handler never runs twice at once.  On a `latest` topic it
+skips messages that were superseded while it ran.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ RESEND_NS = 5_000_000_000
 
 
 class NodeParameters(LimitedModel):
-    """A node's parameters; subclasses declare theirs with units in the names and sane defaults."""
+    """Hold a node's parameters; subclasses declare theirs, with units in the names and defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(slots=True)
 class PortCounts:
-    """What is counted per port, for the status message."""
+    """Count the messages of a port, for the status message."""
 
     messages: int = 0
     dropped: int = 0
@@ -126,9 +126,9 @@ class ExecutionLog:
 
 
 class Input(Generic[M]):
-    """A subscribed topic: the newest message with its header, and what was counted.
+    """Hold the latest message of a subscribed topic, with its header and counts.
 
-    All stamps are of our own clock; clock_trouble says why they cannot be trusted, empty: they can.
+    All stamps are of this host's clock. clock_trouble: why they cannot be trusted; empty: they can.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -142,9 +142,11 @@ class Input(Generic[M]):
         self._clock = clock
 
     def age_s(self) -> float:
-        """Seconds since the newest message's source stamp; infinite before the first.
+        """Return the seconds since the source stamp of the latest message; infinite before the
+        first.
 
-        Of another host's clock that is not measured, the time since it was received counts.
+        For a clock of another host that is not measured: the seconds since the message was
+        received.
         """
         if self.header is None:
             return float("inf")
@@ -159,7 +161,7 @@ class Input(Generic[M]):
 
 
 class Output(Generic[M]):
-    """A published topic: numbers and stamps each message."""
+    """Publish messages of a topic, and number and stamp them."""
 
     def __init__(
         self, topic: Topic, clock: Clock, send: Send, *, writer: str, epoch: int, plan: str
@@ -170,7 +172,7 @@ class Output(Generic[M]):
         self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
-        """Send `message`; `source_ns` is the stamp of what it derives from (default: now)."""
+        """Publish `message`; `source_ns` is the stamp of its source (default: now)."""
         now_ns = self._clock.now_ns()
         header = Header(
             sequence=self.counts.messages + 1,
@@ -188,7 +190,7 @@ class Output(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """A declared input or output, before any node is built."""
+    """Describe a declared input or output of a node class."""
 
     name: str
     direction: str
@@ -197,14 +199,14 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """A method to be called periodically; `rate_parameter` names the parameter with its Hz."""
+    """Name a periodic method; `rate_parameter` names the parameter with its rate in Hz."""
 
     method: str
     rate_parameter: str
 
 
 def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a method to be called at the rate (Hz) that the named parameter holds."""
+    """Mark a method to be called at the rate (Hz) of the named parameter."""
 
     def mark(method: Callable[..., Any]) -> Callable[..., Any]:
         method.__periodic__ = rate_parameter  # type: ignore[attr-defined]  # a function attribute
@@ -214,9 +216,9 @@ def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[...
 
 
 def ports_of(node_class: type[Node]) -> dict[str, Port]:
-    """The declared ports of a node class, in the order of declaration.
+    """Return the declared ports of a node class, in the order of declaration.
 
-    A port is named as its topic, with "/" written "__" ("twin__finger"); a launch file may connect
+    A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file may connect
     it to another topic of the same type.
     """
     ports = {}
@@ -234,12 +236,12 @@ def further_port(topic_name: str) -> str:
 
 
 def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
-    """The declared type of a node class's `parameters`."""
+    """Return the declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
 def role_of(node_class: type[Node]) -> NodeRole | None:
-    """The declared role of a node class; an arm bridge is known by what it publishes."""
+    """Return the role of a node class; a class that publishes ArmState is an arm bridge."""
     publishes = {
         port.message for port in ports_of(node_class).values() if port.direction == "output"
     }
@@ -249,7 +251,7 @@ def role_of(node_class: type[Node]) -> NodeRole | None:
 
 
 def timers_of(node_class: type[Node]) -> list[Timer]:
-    """The methods of a node class that are marked `@periodic`."""
+    """Return the methods of a node class that are marked `@periodic`."""
     return [
         Timer(name, member.__periodic__)
         for name, member in inspect.getmembers(node_class, inspect.isfunction)
@@ -258,25 +260,25 @@ def timers_of(node_class: type[Node]) -> list[Timer]:
 
 
 class Node:
-    """Base of all nodes; see the module's text."""
+    """Base class of all nodes; see the docstring of the module."""
 
     parameters: NodeParameters
     status: Output[Status]
 
     takes_frames: ClassVar[bool] = False
-    """Whether `deliver` is given each message as the wire's frames, unopened."""
+    """Whether `deliver` gets each message as the frames of the wire, undecoded."""
     measures_clocks: ClassVar[bool] = False
-    """Whether it wants the stamps of other hosts as they are, of their clocks."""
+    """Whether stamps of other hosts stay in the time of their clocks."""
     role: ClassVar[NodeRole | None] = None
     opens_devices: ClassVar[bool] = False
-    """Whether it reaches for devices, ports or files of its own: a replay must not start it."""
+    """Whether it opens devices, ports or files: a replay must not start it."""
 
     async def settle(self) -> None:
-        """Wait for work that handlers have left to others; a replay stands still until then."""
+        """Wait for work that handlers have started; a replay continues after it."""
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        """Say why `bag verify` must not step a node with these parameters; empty: it may."""
+        """Return why `bag verify` must not step a node with these parameters; empty: it may."""
         if cls.opens_devices:
             return "it uses devices of its own, whose data are not in the bag"
         return ""
@@ -301,9 +303,10 @@ class Node:
         plan_hash: str = "",
         epoch: int | None = None,
     ) -> None:
-        """`topics` connects ports to topics of other names: {"arm": "arm_left"}.
+        """Connect the ports to topics.
 
-        `epoch` tells one start of the node from another; when it starts, unless a replay gives it.
+        topics: names of topics by port, where they differ: {"arm": "arm_left"}. epoch: identifies
+        one start of the node; default: the time of the start. A replay gives its own.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
@@ -350,16 +353,16 @@ class Node:
         }
 
     async def setup(self) -> None:
-        """Called once before the first message; open devices here."""
+        """Open devices; called once before the first message."""
 
     async def close(self) -> None:
-        """Called once at the end, whatever happened; release devices here."""
+        """Release devices; called once at the end, also after an error."""
 
     def _handler(self, port: str) -> Handler | None:
         return getattr(self, f"on_{port}", None)
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
-        """Hand a message to the input; a plain handler runs now, a coroutine in its own task."""
+        """Pass a message to the input; a plain handler runs now, a coroutine in its own task."""
         message, header, clock_trouble = self._localised(message, header)
         mailbox = self._mailboxes.get(port)
         if mailbox is not None:
@@ -374,7 +377,7 @@ class Node:
                 self.report_error(f"on_{port}", error)
 
     async def step(self, port: str, message: Message, header: Header) -> None:
-        """Hand a message to the input and wait until its handler is through: replay, tests."""
+        """Pass a message to the input, and wait until its handler has ended: replay, tests."""
         await self.take(port, *self._localised(message, header))
 
     def _localised(self, message: Message, header: Header) -> tuple[Message, Header, str]:
@@ -383,14 +386,14 @@ class Node:
         return self.clock_table.localised(message, header, self.clock.now_ns())
 
     async def take(self, port: str, message: Message, header: Header, clock_trouble: str) -> None:
-        """`step` with a message whose stamps are of our own clock already."""
+        """Do as `step`, with a message whose stamps are of this clock already."""
         self.inputs[port].accept(message, header, clock_trouble)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or timer; an exception is counted, logged and shown in the status."""
+        """Call a handler or timer; count, log and report an exception in the status."""
         try:
             result = function(*arguments)
             if inspect.isawaitable(result):
@@ -409,7 +412,7 @@ class Node:
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error, keep it for the status, and log it with its trace."""
+        """Count an error, store it for the status, and log it with its traceback."""
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
         self.log.error("handler failed", what=what, error=str(error), exc_info=error)
@@ -419,7 +422,7 @@ class Node:
         return self._mailboxes[port].has_waiting
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
-        """Tasks in which coroutine handlers run now; for the runner to end."""
+        """Return the tasks in which coroutine handlers run, for the runner to end."""
         return [box.task for box in self._mailboxes.values() if box.task is not None]
 
     def stop_mailboxes(self) -> None:
@@ -428,7 +431,7 @@ class Node:
 
 
 class Mailbox:
-    """What waits for a coroutine handler: the newest message, or a bounded queue of every one."""
+    """Queue messages for a coroutine handler: the latest one, or a bounded number of all."""
 
     def __init__(self, node: Node, port: str) -> None:
         self._node, self._port = node, port
@@ -453,7 +456,7 @@ class Mailbox:
 
     @property
     def has_waiting(self) -> bool:
-        """Whether a message waits that no handler has begun with."""
+        """Return whether a message waits whose handler has not begun."""
         return bool(self._waiting)
 
     async def _drain(self) -> None:

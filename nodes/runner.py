@@ -206,7 +206,7 @@ class Links:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on an absolute grid; calls that came due late are skipped."""
+    """Call a node's periodic method on an absolute grid; skip calls that are already late."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -227,7 +227,7 @@ async def run_keys(links: Links) -> None:
 
 
 async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
-    """Publish the node's status once a second, and tell the launcher that the loop still turns."""
+    """Publish the node's status once a second, and report to the launcher that the loop runs."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
@@ -236,9 +236,9 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
-    """The status message: rates, ages, drops and errors of every port come for free.
+    """Make the status message, with rates, ages, losses and errors of every port.
 
-    Degraded: something went wrong since the last one.  A gap on a `latest` topic is none of it.
+    Degraded: an error or a loss since the last status. A gap on a `latest` topic does not count.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -297,7 +297,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         tasks.append(asyncio.create_task(stop.wait()))
         if links.keys is not None:
             tasks.append(asyncio.create_task(run_keys(links)))
-        # What setup built lives on; without this the collector walks it in the middle of a cycle.
+        # Objects of setup live on; unfrozen, the garbage collector would traverse them in a cycle.
         gc.collect()
         gc.freeze()
         heartbeat.beat()
@@ -327,9 +327,10 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """Write a byte to the launcher's pipe when the node is set up, and one in each status period.
+    """Report to the launcher over a pipe that the node is set up (first byte) and alive (others).
 
-    fd: the pipe's end; None without a launcher.  A full pipe does not block the node.
+    fd: the writing end, None without a launcher. A launcher that does not read never blocks the
+    node.
     """
 
     def __init__(self, fd: int | None) -> None:
@@ -339,7 +340,7 @@ class Heartbeat:
 
     def beat(self) -> None:
         if self._fd is not None:
-            # A full pipe holds enough beats.  A broken one means that the launcher is gone; its
+            # A full pipe holds enough beats.  A broken one means that the launcher is gone, and its
             # lifeline ends this process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")

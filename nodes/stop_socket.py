@@ -1,8 +1,8 @@
-"""A unix socket of a launcher or a node that takes an e-stop, and nothing else.
+"""Take e-stops on a unix socket of a launcher or a node.
 
-Command-line tools share one endpoint of the topic `estop`, which one of them may hold.  Any number
-of them can connect to this socket at once; each sends one packet and gets one back.  Nothing that
-is heavy to import is needed for that.
+Command-line tools share one endpoint of the topic `estop`, which one of them may occupy. Any number
+of them can connect to this socket at once. Each sends one packet and receives one. The module
+imports nothing that is slow to load.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Kind = Literal["launcher", "node"]
 REQUEST, ANSWER = b"stop ", b"stopped"
 MAX_REQUEST_BYTES = 4096
 MAX_CONNECTIONS = 32
-"""Of several that say nothing the oldest makes room for a new one."""
+"""At more silent connections, the oldest is closed for a new one."""
 
 _PEER = struct.Struct("3i")
 
 
 class StopSocket:
-    """Calls `on_stop(reason)` for each e-stop; use between `open` and `close`.
+    """Call `on_stop(reason)` for each e-stop, between `open` and `close`.
 
-    The directory of the run is closed to other users, and so is the socket; who connects must be
-    this user or root besides.
+    The directory of the run and the socket are closed to other users. A peer must be this user or
+    root as well.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class StopSocket:
         self._connections: list[socket.socket] = []
 
     def open(self) -> None:
-        """Listen; needs a running loop.  OSError where the path is too long."""
+        """Listen; needs a running loop. OSError for a path that is too long."""
         self._path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
@@ -99,7 +99,7 @@ class StopSocket:
 
 
 def peer_of(connection: socket.socket) -> tuple[int, int]:
-    """Process and user at the other end of a connected unix socket."""
+    """Return process and user at the other end of a connected unix socket."""
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
     process, user, _ = _PEER.unpack(packed)
     return process, user

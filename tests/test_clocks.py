@@ -54,7 +54,7 @@ def measured(
         stamps = ours.at(now), theirs.at(now + there), theirs.at(answered), ours.at(answered + back)
         sample = make_sample(*stamps, max_drift_ratio=max_drift)
         if sample is not None:
-            clock.take(sample)
+            clock.add(sample)
         now = answered + back
     return clock, now
 
@@ -111,9 +111,9 @@ def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
 def test_a_clock_that_was_stepped_is_measured_anew() -> None:
     clock = OtherClock(5e-4)
     for number in range(20):
-        clock.take(Sample(number * S, 7 * S, MS))
+        clock.add(Sample(number * S, 7 * S, MS))
     for number in range(20, 40):
-        clock.take(Sample(number * S, 9 * S, MS))
+        clock.add(Sample(number * S, 9 * S, MS))
     found = clock.estimate(40 * S)
     assert clock.resets == 1
     assert found is not None
@@ -133,7 +133,7 @@ def test_impossible_stamps_are_no_sample(t1: int, t2: int, t3: int, t4: int) -> 
 def test_what_is_kept_of_a_clock_is_bounded() -> None:
     clock = OtherClock(5e-4)
     for number in range(5000):
-        clock.take(Sample(number * S // 16, 0, MS + number % 7))
+        clock.add(Sample(number * S // 16, 0, MS + number % 7))
     assert len(clock.samples) <= 121
     low, high = bounds(clock.samples, 5000 * S // 16, max_drift_ratio=5e-4)
     assert low < 0 < high

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import (
     Display,
     EStop,
@@ -16,6 +15,7 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.recorder.node import Recorder, RecorderParameters
 from tests.console_parts import frames_of
+from tests.node_harness import build_node
 
 Floats = NDArray[np.float64]
 
@@ -26,13 +26,11 @@ def names_in(folder: Path) -> list[Path]:
 
 async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path) -> None:
     names = ("estop", "recording", "display")
-    node = Recorder(
+    node = build_node(
+        Recorder,
         RecorderParameters(bag=tmp_path / "a.mcap", attach=(), start_paused=True),
-        name="recorder",
-        clock=VirtualClock(1000, clock_id="clock"),
-        send=lambda topic, message, header: None,
         topics={f"in/{name}": name for name in names},
-    )
+    ).node
     await node.setup()
     shown = Display(correction="none", stereo="mono")
     node.deliver("in/display", *frames_of(shown))
@@ -60,13 +58,11 @@ async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path)
 
 async def test_a_recorder_that_cannot_begin_says_so_and_goes_on(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    node = Recorder(
+    node = build_node(
+        Recorder,
         RecorderParameters(bag=tmp_path / "file" / "a.mcap", attach=(), start_paused=True),
-        name="recorder",
-        clock=VirtualClock(),
-        send=lambda topic, message, header: None,
         topics={"in/recording": "recording"},
-    )
+    ).node
     await node.setup()
     node.deliver("in/recording", *frames_of(Recording(running=True)))
     assert node.errors == 1

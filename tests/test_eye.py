@@ -13,7 +13,6 @@ from benchmarks.image_correction import Bench
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Correction, Display, Frame, TwinArms, TwinEye
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
@@ -34,6 +33,7 @@ from flexsheet.nodes.twin.eye import (
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.membrane import DeformedSheet
 from flexsheet.nodes.twin.true_object import TrueBody
+from tests.node_harness import NodeHarness
 
 ROOT = Path(__file__).parents[1]
 EYE = np.array([0.0, 0.0, 0.4])
@@ -228,23 +228,20 @@ def test_row_of_figure_13(bench: Bench) -> None:
     assert errors["two_pass"] < 0.2
 
 
-class EyeBench:
+class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
     def __init__(self, scene: Scene, **parameters: object) -> None:
-        self.clock = VirtualClock(10**10)
-        self.sent: list[tuple[TwinEye, Header]] = []
+        given = TwinEyeParameters(metres_per_px=0.002, **parameters)
+        super().__init__(TwinEyeNode, given, VirtualClock(10**10), name="twin_eye")
         self.scene = scene
-        self.node = TwinEyeNode(
-            TwinEyeParameters(metres_per_px=0.002, **parameters),
-            name="twin_eye",
-            clock=self.clock,
-            send=self._send,
-        )
 
-    def _send(self, topic: Topic, message: Message, header: Header) -> None:
-        assert isinstance(message, TwinEye)
-        self.sent.append((message, header))
+    @property
+    def sent(self) -> list[tuple[TwinEye, Header]]:
+        return self.messages(TwinEye)
 
-    async def step(self, port: str, message: Message) -> None:
+    async def step(
+        self, port: str, message: Message, *, age_ms: float = 0.0, sequence: int = 1
+    ) -> None:
+        """Pass a message with a fixed stamp; errors of the node are for the tests to judge."""
         header = Header(1, 123, 124, "virtual", "test", 1)
         await self.node.step(port, message, header)
 

@@ -19,7 +19,6 @@ from ruamel.yaml import YAML
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.fem_solver import precompute, precompute_table, snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody
@@ -27,6 +26,7 @@ from flexsheet.nodes.fem_solver.mesh import cylinder
 from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
+from tests.node_harness import NodeHarness
 from tests.soft_bodies import Here
 from tests.waiting import DEADLINE_S
 
@@ -67,20 +67,16 @@ class Named:
         return getattr(self._method, name)
 
 
-class Bench:
-    """A node and what it sent."""
+class Bench(NodeHarness[FemSolver, VirtualClock]):
+    """A solver that gets fingertips by hand."""
 
     def __init__(self, **parameters: Any) -> None:
-        self.sent: list[tuple[str, Message, Header]] = []
-        self.node = FemSolver(
-            FemSolverParameters(skin_spacing_m=0.007, **parameters),
-            name="fem_solver",
-            clock=VirtualClock(),
-            send=self._keep,
-        )
+        given = FemSolverParameters(skin_spacing_m=0.007, **parameters)
+        super().__init__(FemSolver, given, VirtualClock(), name="fem_solver")
 
-    def _keep(self, topic: Topic, message: Message, header: Header) -> None:
-        self.sent.append((topic.name, message, header))
+    @property
+    def sent(self) -> list[tuple[str, Message, Header]]:
+        return [(topic.name, message, header) for topic, message, header in self.published]
 
     async def push(self, tip: Fingertip, source_ns: int = 0) -> SoftBody:
         await self.node.step("fingertip", tip, header(source_ns))

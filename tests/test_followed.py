@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.bags.report.findings import findings_of
+from flexsheet.launch.bags.report.findings import find_problems
 from flexsheet.launch.bags.report.followed import FollowedFinger
-from flexsheet.launch.bags.report.page import page_of
+from flexsheet.launch.bags.report.page import render_page
 from flexsheet.launch.bags.report.session import read_session
 from flexsheet.launch.bags.report.strokes import read_followed
-from flexsheet.launch.bags.report.write import result_of
+from flexsheet.launch.bags.report.write import make_result
 from flexsheet.launch.commands.experiment import print_followed
 from flexsheet.launch.experiments import ExperimentError, stroke
 from flexsheet.launch.experiments.demo import read_followed_path
@@ -137,15 +137,15 @@ def test_drop_outs_are_counted_in_contact(tmp_path: Path, by: str) -> None:
 def test_the_report_says_the_same(tmp_path: Path) -> None:
     bag = write_hand(tmp_path / "a.mcap", mode=lambda s: "hold" if 1.0 <= s < 1.2 else "follow")
     session = read_session(bag)
-    numbers = result_of(session)
+    numbers = make_result(session)
     (row,) = numbers["sheet"]["followed"]
     assert row.pop("begins_s") == pytest.approx(0.2, abs=0.01)
     assert [row] == read_followed(bag)
-    page = page_of(session)
+    page = render_page(session)
     assert "The true finger along each path" in page
     assert "drop-outs" in page
     assert any(
-        'path "hand" was not followed in contact once' in one.text for one in findings_of(numbers)
+        'path "hand" was not followed in contact once' in one.text for one in find_problems(numbers)
     )
 
 

@@ -26,7 +26,7 @@ from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.launch.running.tools import subscriber_to
+from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.topics import TOPICS, Delivery, topic_named
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
@@ -94,7 +94,7 @@ async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
         # Ten processes start at once, those that draw at the lowest priority.
         await graph.wait_ready(2 * DEADLINE_S)
         numbers: list[int] = []
-        frames = subscriber_to(
+        frames = make_subscriber(
             "frame", plan, graph.run, lambda frame, _: numbers.append(frame.number),
             on_problem=print,
         )  # fmt: skip

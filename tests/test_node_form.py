@@ -26,6 +26,7 @@ from flexsheet.nodes.node import (
 )
 from flexsheet.nodes.runner import end_tasks, status_of
 from tests.fingertips import fingertip as even_fingertip
+from tests.node_harness import NodeHarness
 from tests.waiting import DEADLINE_S
 
 
@@ -79,16 +80,8 @@ Sent = list[tuple[Topic, Message, Header]]
 
 
 def build(topics: dict[str, str] | None = None) -> tuple[Echo, VirtualClock, Sent]:
-    clock = VirtualClock(1_000)
-    sent: Sent = []
-    node = Echo(
-        EchoParameters(),
-        name="echo",
-        clock=clock,
-        send=lambda *args: sent.append(args),
-        topics=topics,
-    )
-    return node, clock, sent
+    harness = NodeHarness(Echo, EchoParameters(), VirtualClock(1_000), name="echo", topics=topics)
+    return harness.node, harness.clock, harness.published
 
 
 def test_ports_parameters_and_timers_are_read_from_the_class() -> None:

@@ -29,9 +29,10 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import EStop
 from flexsheet.messages.wire import encode, read_envelope
-from flexsheet.nodes.recorder.files import free_path
-from flexsheet.nodes.recorder.node import TRY_AGAIN_NS, Recorder
+from flexsheet.nodes.recorder.bag_recording import RETRY_NS, free_path
+from flexsheet.nodes.recorder.node import Recorder
 from flexsheet.nodes.recorder.parameters import RecorderParameters
+from tests.node_harness import NodeHarness
 from tests.waiting import DEADLINE_S
 
 pytestmark = pytest.mark.alone
@@ -48,13 +49,13 @@ def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def recorder(clock: VirtualClock, **parameters: Any) -> Recorder:
-    return Recorder(
+    return NodeHarness(
+        Recorder,
         RecorderParameters(**{"attach": (), **parameters}),
+        clock,
         name="recorder",
-        clock=clock,
-        send=lambda topic, message, header: None,
         topics={"in/estop": "estop", "in/status": "status", "status": "status"},
-    )
+    ).node
 
 
 def names_in(folder: Path) -> list[str]:
@@ -155,11 +156,11 @@ async def test_a_disk_that_refuses_is_said_and_what_is_lost_is_counted(
     assert node.note.startswith("NOT RECORDING")
     assert "Input/output error" in node.note
     # It is asked again after a while, in vain, and then it has come back.
-    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    clock.move_to(clock.now_ns() + RETRY_NS)
     node.watch_disk()
     assert node.errors == 2
     monkeypatch.undo()
-    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    clock.move_to(clock.now_ns() + RETRY_NS)
     node.watch_disk()
     node.deliver("in/estop", *estop_message(5))
     await node.close()
@@ -229,7 +230,7 @@ async def test_on_a_full_disk_the_bag_ends_readable_and_another_goes_on(
     filler.unlink()
     node.watch_disk()
     assert node.note.startswith("NOT RECORDING"), "it is not asked again at once"
-    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    clock.move_to(clock.now_ns() + RETRY_NS)
     node.watch_disk()
     send(20)
     await node.close()

@@ -12,7 +12,7 @@ from pydantic import create_model
 from ruamel.yaml import YAML
 from typer.main import get_command
 
-from flexsheet.launch.bags.replay import lives_in
+from flexsheet.launch.bags.replay import read_runs
 from flexsheet.launch.commands import arms
 from flexsheet.launch.plans import renamed_keys
 from flexsheet.launch.plans.documents import BadInputError
@@ -210,8 +210,8 @@ def test_a_bag_with_old_topic_type_and_field_names_is_read_and_replayed(
         assert found["bookmark"] == Bookmark(label="touch")
         by_old_name = [message for _, message, *_ in BagReader(path, ["moment"])]
         assert by_old_name == [Bookmark(label="touch")]
-        (life,) = lives_in(path, "planner")
-        assert life.steps.tolist() == [[0, 1, 5, 20], [-1, 0, 0, 30]]
+        (run,) = read_runs(path, "planner")
+        assert run.steps.tolist() == [[0, 1, 5, 20], [-1, 0, 0, 30]]
 
 
 def test_a_recorded_value_within_a_list_of_parts_is_read() -> None:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from flexsheet.messages.base import Header, Message
+from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Display, Frame, SheetTarget, Skin, SoftBody
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
@@ -32,6 +31,7 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
+from tests.node_harness import NodeHarness
 
 ROOT = Path(__file__).parents[1]
 MS = 1_000_000
@@ -298,29 +298,17 @@ def test_finger_pushes_only_below_and_over_the_sheet(
     assert (sheet.pushed_point is not None) is pushed
 
 
-class Bench:
-    """A renderer with a clock that is moved by hand and a list of what it sent."""
+class Bench(NodeHarness[Renderer, VirtualClock]):
+    """A renderer and the paper's scene."""
 
     def __init__(self, **parameters: object) -> None:
-        self.clock = VirtualClock(10_000 * MS)
-        self.sent: list[tuple[Frame, Header]] = []
-        self.node = Renderer(
-            RendererParameters(spacing_m=0.006, **parameters),
-            name="renderer",
-            clock=self.clock,
-            send=self._send,
-        )
+        given = RendererParameters(spacing_m=0.006, **parameters)
+        super().__init__(Renderer, given, VirtualClock(10_000 * MS), name="renderer")
         self.scene = load_scene()
 
-    def _send(self, topic: Topic, message: Message, header: Header) -> None:
-        assert isinstance(message, Frame)
-        self.sent.append((message, header))
-
-    async def step(self, port: str, message: Message, *, age_ms: float = 0.0) -> None:
-        now_ns = self.clock.now_ns()
-        header = Header(1, now_ns - int(age_ms * MS), now_ns, "virtual", "test", 1)
-        await self.node.step(port, message, header)
-        assert self.node.errors == 0, self.node.last_error
+    @property
+    def sent(self) -> list[tuple[Frame, Header]]:
+        return self.messages(Frame)
 
     def forward(self, milliseconds: float) -> None:
         self.clock.move_to(self.clock.now_ns() + int(milliseconds * MS))

@@ -18,15 +18,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from flexsheet.launch.bags.report.album import MARKED_MOST, Album
-from flexsheet.launch.bags.report.charts import mark_isolated, stretches_of
-from flexsheet.launch.bags.report.findings import findings_of
-from flexsheet.launch.bags.report.numbers import methods_of, numbers_of
-from flexsheet.launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
-from flexsheet.launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
-from flexsheet.launch.bags.report.session import Port, read_session
+from flexsheet.launch.bags.report.album import MAX_BOOKMARK_SHOTS, Album
+from flexsheet.launch.bags.report.charts import find_intervals, mark_isolated
+from flexsheet.launch.bags.report.findings import find_problems
+from flexsheet.launch.bags.report.numbers import compute_numbers, describe_methods
+from flexsheet.launch.bags.report.page import COLOURS, MARK, SECTIONS, render_page
+from flexsheet.launch.bags.report.series import Events, Grid, Range, RunningMoments, Spread, States
+from flexsheet.launch.bags.report.session import PortTotals, read_session
 from flexsheet.launch.bags.report.strokes import SheetErrors
-from flexsheet.launch.bags.report.write import report, result_of
+from flexsheet.launch.bags.report.write import make_result, report
 from flexsheet.launch.cli import main
 from flexsheet.launch.experiments.stroke import read_recording, stroke_errors, summary
 from flexsheet.messages.bag import BagError, BagWriter
@@ -47,12 +47,12 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def numbers(bag: Path) -> dict[str, Any]:
-    return result_of(read_session(bag))
+    return make_result(read_session(bag))
 
 
 @pytest.fixture(scope="module")
 def page(bag: Path) -> str:
-    return page_of(read_session(bag))
+    return render_page(read_session(bag))
 
 
 # What is kept.
@@ -74,12 +74,12 @@ def test_nothing_has_no_quantile_and_no_summary() -> None:
     grid = Grid(0, 1.0, 3)
     assert Spread(grid).quantile_s(0.5) is None
     assert Range(grid).overall() is None
-    assert Moments().summary(1.0) is None
+    assert RunningMoments().summary(1.0) is None
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=50))
 def test_moments_are_numpys(values: list[float]) -> None:
-    moments = Moments()
+    moments = RunningMoments()
     for one in values:
         moments.take(np.abs([one]))
     found, wanted = moments.summary(2.0), summary(np.abs(values), 2.0)
@@ -110,8 +110,8 @@ def test_of_many_moments_the_first_are_shown_and_the_rest_counted() -> None:
     album = Album(4, [(float(i), str(i)) for i in range(500)])
     for i in range(500):
         album.take(float(i), "", (("left", np.zeros((2, 2), np.uint8)),))
-    assert len(album.shots()) == MARKED_MOST
-    assert album.left_out == 500 - MARKED_MOST
+    assert len(album.shots()) == MAX_BOOKMARK_SHOTS
+    assert album.left_out == 500 - MAX_BOOKMARK_SHOTS
     assert album.seen == 500
 
 
@@ -121,12 +121,12 @@ def test_states_last_until_another_and_gaps_stay_white() -> None:
     for second, state in ((0, "wait"), (1, "wait"), (2, "contact"), (7, "contact")):
         states.take(second, second * 10**9, state)
     assert states.changes == 1
-    assert list(stretches_of(states, grid)) == [
+    assert list(find_intervals(states, grid)) == [
         ("wait", 0.0, 2.0),
         ("contact", 2.0, 3.0),
         ("contact", 7.0, 8.0),
     ]
-    assert list(stretches_of(states, grid, lasting=True)) == [
+    assert list(find_intervals(states, grid, lasting=True)) == [
         ("wait", 0.0, 2.0),
         ("contact", 2.0, 10.0),
     ]
@@ -177,7 +177,7 @@ def test_latencies_speeds_and_forces(numbers: dict[str, Any]) -> None:
     assert numbers["latency_ms"]["left arm command"]["p99"] == pytest.approx(5.0, rel=0.03)
     assert numbers["latency_ms"]["frame drawn"]["p50"] == pytest.approx(28.0, rel=0.03)
     right = numbers["arms"]["right"]
-    assert right["joint_speed_share"][1] == pytest.approx(3.3 / np.radians(90.0), rel=1e-6)
+    assert right["joint_speed_ratio"][1] == pytest.approx(3.3 / np.radians(90.0), rel=1e-6)
     assert numbers["arms"]["left"]["edge_force_n"] == 25.0
     assert numbers["arms"]["left"]["modes_s"]["fault"] == pytest.approx(0.98, abs=0.03)
 
@@ -188,10 +188,10 @@ def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None
     )
     tuned = sessions.SCENE.model_copy(update={"methods": chosen})
     eye = {"marker": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
-    assert methods_of(eye, tuned) == "marker moments, triangulation dlt, tracking default"
-    assert methods_of(eye, None) == "marker default, triangulation dlt, tracking default"
-    assert methods_of({"method": "auto"}, tuned) == "linear"
-    assert methods_of({"side": "left"}, tuned) is None
+    assert describe_methods(eye, tuned) == "marker moments, triangulation dlt, tracking default"
+    assert describe_methods(eye, None) == "marker default, triangulation dlt, tracking default"
+    assert describe_methods({"method": "auto"}, tuned) == "linear"
+    assert describe_methods({"side": "left"}, tuned) is None
 
 
 def test_topics_know_what_is_missing(numbers: dict[str, Any]) -> None:
@@ -223,9 +223,9 @@ def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
         desk.write("arm_left", lost, 1.0)
         desk.write("host", quiet.model_copy(update={"cpu": pressure}), 1.5, writer="launch")
         desk.write("arm_left", arm, 2.0)
-    numbers = numbers_of(read_session(bag))
+    numbers = compute_numbers(read_session(bag))
     assert numbers["hosts"]["main"]["busy_fraction"] == 0.5
-    first = findings_of(numbers)[0]
+    first = find_problems(numbers)[0]
     assert first.gravity == "bad"
     assert first.text.startswith(
         "In 50% of the time the computer main is busy: twin_arms waits for a processor 61% of the "
@@ -240,12 +240,12 @@ def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
         desk = sessions.Desk(writer, ())
         for number, mode in enumerate(("starting", "idle", "follow")):
             desk.write("arm_left", arm_state("left", mode=mode), 0.1 * number)
-    numbers = numbers_of(read_session(bag))
+    numbers = compute_numbers(read_session(bag))
     assert numbers["events"]["counts"] == {}
 
 
 def test_what_was_wrong_is_said_and_the_worst_first(numbers: dict[str, Any]) -> None:
-    found = findings_of(numbers)
+    found = find_problems(numbers)
     said = " ".join(one.text for one in found)
     for part in (
         "had been changed",
@@ -361,16 +361,16 @@ def test_a_bag_may_lack_any_topic(
     # The charts are drawn once, elsewhere: here only from what they are drawn.
     path = sessions.write_session(tmp_path / "a.mcap", leave_out=leave_out)
     session = read_session(path)
-    monkeypatch.setattr("flexsheet.launch.bags.report.page.charts_of", lambda session: {})
-    text = page_of(session)
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.draw_charts", lambda session: {})
+    text = render_page(session)
     assert all(f'id="{key}"' in text for key in SECTIONS)
-    json.dumps(result_of(session), allow_nan=False)
+    json.dumps(make_result(session), allow_nan=False)
 
 
 def test_an_empty_bag_is_reported_as_that(tmp_path: Path) -> None:
     path = tmp_path / "empty.mcap"
     BagWriter(path).close()
-    text = page_of(read_session(path))
+    text = render_page(read_session(path))
     assert "No arm was recorded." in text
     assert "Nothing was found" in text
 
@@ -379,14 +379,14 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
     data = bag.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) - 400])
-    found = result_of(read_session(cut))
+    found = make_result(read_session(cut))
     assert found["findings"][0]["text"].startswith("The bag is not whole (cut after")
     assert found["bag"]["messages"] > 100
 
 
 def test_a_bag_from_before_any_migration_can_be_reported_on() -> None:
     old = Path(__file__).parent / "recorded" / "before-migrations.mcap"
-    assert result_of(read_session(old))["bag"]["messages"] > 0
+    assert make_result(read_session(old))["bag"]["messages"] > 0
 
 
 # The command.
@@ -412,7 +412,7 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
 ) -> None:
     copy = tmp_path / "b.mcap"
     copy.write_bytes(bag.read_bytes())
-    monkeypatch.setattr("flexsheet.launch.bags.report.page.charts_of", lambda session: {})
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.draw_charts", lambda session: {})
     for _ in range(2):
         report(copy, copy.with_suffix(".html"), lambda done, whole: None)
     assert MARK in copy.with_suffix(".html").read_text()
@@ -435,7 +435,7 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
         )  # fmt: skip
 
     for lived_before, lost in ((True, 3), (False, 8)):
-        port = Port(Spread(Grid(0, 1.0, 1)))
+        port = PortTotals(Spread(Grid(0, 1.0, 1)))
         for gaps in (5, 8):
             port.take("planner", 1, counted(gaps), lived_before=lived_before)
         assert port.totals() == (0, lost, 0)

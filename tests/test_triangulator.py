@@ -24,6 +24,7 @@ from flexsheet.nodes.twin.clutter import touching_highlight
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from tests.node_harness import NodeHarness
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -42,21 +43,24 @@ def camera(scene: Scene) -> TwinCamera:
     return TwinCamera(scene.camera, finger_radius_m=scene.finger.radius_m, seed=4)
 
 
-class Bench:
-    """A triangulator on a bench: pictures in by hand, fingertips out."""
+class Bench(NodeHarness[Triangulator, VirtualClock]):
+    """A triangulator that gets images by hand."""
 
     def __init__(self, camera: TwinCamera, **parameters: Any) -> None:
-        self.camera, self.clock, self.sent = camera, VirtualClock(), list[Fingertip]()
-        self.node = Triangulator(
-            TriangulatorParameters(**parameters), name="eye", clock=self.clock, send=self.keep
+        super().__init__(
+            Triangulator, TriangulatorParameters(**parameters), VirtualClock(), name="eye"
         )
+        self.camera = camera
         self.frame = 0
 
-    def keep(self, topic: Topic, message: Message, header: Header) -> None:
+    def _collect(self, topic: Topic, message: Message, header: Header) -> None:
         assert topic.name == "fingertip"
-        assert isinstance(message, Fingertip)
         assert header.source_ns == self.stamp_ns()
-        self.sent.append(message)
+        super()._collect(topic, message, header)
+
+    @property
+    def sent(self) -> list[Fingertip]:
+        return [message for message, _ in self.messages(Fingertip)]
 
     def stamp_ns(self) -> int:
         return self.frame * FRAME_NS

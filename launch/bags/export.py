@@ -65,7 +65,7 @@ MIN_FREE_BYTES = 4 << 20
 
 
 class ExportError(FlexsheetError, RuntimeError):
-    """An export that cannot be made; the sentence says what to do."""
+    """Report why an export cannot be made, and what to do."""
 
     code = "export"
     remedy = "Install the package that the text names, or choose another output file."
@@ -73,7 +73,7 @@ class ExportError(FlexsheetError, RuntimeError):
 
 @dataclass(slots=True)
 class Exported:
-    """What was written: messages per channel, and what could not be read."""
+    """Hold the number of messages per channel, and the unreadable topics."""
 
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -118,7 +118,7 @@ def export(
                 _check_room(output)
                 at_ns = log_time_ns + (offset_ns or 0)
                 views = seen.views(topic, message, at_ns)
-                for name, value in (*numbers_of(topic, message), *views):
+                for name, value in (*list_numbers(topic, message), *views):
                     channel = channels.get(name) or _channel(foxglove, name, value, context)
                     channels[name] = channel
                     channel.log(value, log_time=at_ns)
@@ -138,19 +138,19 @@ def export(
 
 
 def _check_room(output: Path) -> None:
-    """Raise OSError where the disk is nearly full."""
+    """Raise OSError if the disk is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def numbers_of(topic: str, message: Message) -> Iterator[Output]:
-    """The message as JSON, without its large arrays."""
+def list_numbers(topic: str, message: Message) -> Iterator[Output]:
+    """Return the message as JSON, without its large arrays."""
     yield topic, _plain(message)
 
 
 @dataclass(slots=True)
 class Seen:
-    """What later messages are drawn with: the newest scene, skin and flanges."""
+    """Hold the latest scene, skin and flanges, which later messages are drawn with."""
 
     scene: Scene | None = None
     skin: Skin | None = None
@@ -186,7 +186,7 @@ class Seen:
                 said = "engaged" if message.engaged else "cleared"
                 text = f"e-stop {said}: {message.reason}"
                 yield "log", fg.Log(timestamp=stamp, level=level, message=text, name=topic)
-        for name, picture in pictures_of(topic, message):
+        for name, picture in list_images(topic, message):
             yield name, _raw_image(name, picture, stamp)
 
     def _finger(self, message: Fingertip, stamp: Any) -> Any:
@@ -225,8 +225,8 @@ class Seen:
         return _mesh("sheet", np.array(corners), triangles, stamp, SHEET_COLOUR)
 
 
-def pictures_of(topic: str, message: Message) -> Iterator[Picture]:
-    """The pictures in a message, each with the name of its channel."""
+def list_images(topic: str, message: Message) -> Iterator[Picture]:
+    """Return the images in a message, each with the name of its channel."""
     match message:
         case StereoPair():
             yield f"{topic}/left", message.left
@@ -250,7 +250,9 @@ def _foxglove() -> Any:
 
 
 def _wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """From the recorder's clock to nanoseconds since 1970; None where the bag does not know."""
+    """Return the offset from the recorder's clock to 1970 in ns; None if the bag does not contain
+    it.
+    """
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])
@@ -261,21 +263,21 @@ def _wall_clock_offset_ns(reader: BagReader) -> int | None:
 
 def _channel(foxglove: Any, name: str, value: Any, context: Any) -> Any:
     if isinstance(value, dict):
-        shape = json.dumps(_schema_of(value)).encode()
+        shape = json.dumps(_make_schema(value)).encode()
         schema = foxglove.Schema(name=f"flexsheet.{name}", encoding="jsonschema", data=shape)
         return foxglove.Channel(name, schema=schema, message_encoding="json", context=context)
     channel_type = getattr(foxglove.channels, f"{type(value).__name__}Channel")
     return channel_type(name, context=context)
 
 
-def _schema_of(value: Any) -> dict[str, Any]:
-    """The JSON Schema of a plain value: which fields there are, so that they can be chosen from."""
+def _make_schema(value: Any) -> dict[str, Any]:
+    """Make the JSON Schema of a value: its fields, for selection in other tools."""
     match value:
         case dict():
-            fields = {name: _schema_of(item) for name, item in value.items()}
+            fields = {name: _make_schema(item) for name, item in value.items()}
             return {"type": "object", "properties": fields}
         case list():
-            return {"type": "array", "items": _schema_of(value[0]) if value else {}}
+            return {"type": "array", "items": _make_schema(value[0]) if value else {}}
         case bool():
             return {"type": "boolean"}
         case int() | float():
@@ -287,7 +289,7 @@ def _schema_of(value: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A message as JSON's own types; arrays of more than PLOTTED values are left out."""
+    """Convert a message to types of JSON; arrays of more than PLOTTED values are left out."""
     if isinstance(value, BaseModel):
         plain = {name: _plain(getattr(value, name)) for name in type(value).model_fields}
         return {name: item for name, item in plain.items() if item is not _TOO_LARGE}

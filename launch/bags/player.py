@@ -1,4 +1,4 @@
-"""Plays a bag into a running graph, as the writer "tools"."""
+"""Play a bag into a running graph, as the writer "tools"."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ Progress = Callable[[float, float], None]
 """Called with (seconds of the bag played, seconds in all)."""
 
 
-NOT_AGAIN = {
-    "status": "it tells of nodes that were",
-    "arming": "a person's word that arms may move is not said again",
-    "estop": "a person's word on an e-stop is not said again",
-    "recording": "what was recorded then is not recorded again",
+NEVER_PLAYED = {
+    "status": "it describes the nodes of the recording",
+    "arming": "permission to move the arms is not repeated",
+    "estop": "an e-stop or its reset is not repeated",
+    "recording": "requests to record are not repeated",
 }
 """Topics that are never played, and why."""
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
-    """What of a bag can be played into a graph: the topics, and those left out with the reason."""
+class TopicSelection:
+    """Hold the topics of a bag that can be played, and the others with the reason."""
 
     topics: tuple[str, ...]
     left_out: dict[str, str]
@@ -39,16 +39,16 @@ class Selection:
 
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
-) -> Selection:
-    """Topics of the bag that tools may write in the plan; BagError for wanted ones not so."""
+) -> TopicSelection:
+    """Select the topics of the bag that tools may write; BagError if a wanted one is not."""
     writable = topics_for_tools(plan)
     left_out = {}
     chosen = []
     for name in recorded:
         if wanted and name not in wanted:
             continue
-        if name in NOT_AGAIN:
-            left_out[name] = NOT_AGAIN[name]
+        if name in NEVER_PLAYED:
+            left_out[name] = NEVER_PLAYED[name]
         elif name in writable:
             chosen.append(name)
         else:
@@ -58,7 +58,7 @@ def select_topics(
         if name not in chosen:
             why = left_out.get(name, "not in the bag")
             raise BagError(f'topic "{name}" cannot be played: {why}')
-    return Selection(tuple(chosen), left_out)
+    return TopicSelection(tuple(chosen), left_out)
 
 
 async def play(
@@ -71,10 +71,11 @@ async def play(
     start_s: float = 0.0,
     progress: Progress = lambda played, total: None,
 ) -> int:
-    """Play once, from `start_s` into the bag, `rate` times as fast; returns the messages sent.
+    """Play once, from `start_s` into the bag, with the speed factor `rate`; return the messages
+    sent.
 
-    The last value of every latched topic before the start comes first.  Stamps are moved so that a
-    message is as old when it is played as it was when it was recorded.
+    The last value of every latched topic before the start comes first. Stamps are shifted, so that
+    a message has the same age as when it was recorded.
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)
@@ -115,7 +116,7 @@ async def play(
 def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
-    """The last message of every latched topic before `begin_ns`."""
+    """Return the last message of every latched topic before `begin_ns`."""
     latched = [name for name in topics if topic_named(name).delivery is Delivery.LATCHED]
     last = {}
     for entry in BagReader(bag, latched, end_ns=begin_ns):

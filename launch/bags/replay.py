@@ -37,17 +37,18 @@ from flexsheet.nodes.node import Node, parameters_of, timers_of
 
 CLOCKS = "clocks"
 EPOCH = 0
-"""Of the replayed writers; a live one is random, a replay must not be."""
+"""Epoch of the replayed writers: that of a live writer is its start time, which a replay must not
+use."""
 
-TOLD_EVERY = 100
-"""Steps after which it is said how far a pass is."""
+PROGRESS_STEPS = 100
+"""Number of steps between two reports of progress."""
 
 Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """What a replayed node published, as bytes."""
+    """Hold a message that a replayed node published, as bytes."""
 
     topic: str
     data: tuple[bytes, ...]
@@ -55,23 +56,23 @@ class Sent:
 
 @dataclass(slots=True)
 class Pass:
-    """One run through the bag.
+    """Hold the result of one replay of the bag.
 
-    as_taken: it took what the node said that it took; else all, in the recorder's order.
-    missing: messages that it took and the bag does not hold.
-    told_until_ns: of what it took later it could not say any more; its host's clock.
+    as_taken: the replay followed the execution log of the node; else the order of the recorder.
+    missing: logged messages that the bag does not contain. logged_until_ns: end of the execution
+    log, in time of the node's host.
     """
 
     messages_in: int = 0
     missing: int = 0
     as_taken: bool = False
-    told_until_ns: int | None = None
+    logged_until_ns: int | None = None
     sent: list[Sent] = field(default_factory=list)
     errors: int = 0
     last_error: str = ""
 
     def digest(self) -> str:
-        """Of all bytes that the node published, in order."""
+        """Return the SHA-256 of all bytes that the node published, in order."""
         digest = hashlib.sha256()
         for one in self.sent:
             digest.update(one.topic.encode())
@@ -83,9 +84,9 @@ class Pass:
 
 @dataclass(slots=True)
 class Comparison:
-    """Replayed against recorded messages of one topic, paired by their source stamps.
+    """Compare replayed with recorded messages of one topic, paired by their source stamps.
 
-    worst: largest difference per field that differs at all; anything but numbers counts 1.
+    worst: largest difference by field, for fields that differ; 1 for values other than numbers.
     """
 
     recorded: int = 0
@@ -97,7 +98,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What `bag verify` found; as_taken, missing: see `Pass`."""
+    """Hold the result of `bag verify`; as_taken, missing: see `Pass`."""
 
     node: str
     bag: str
@@ -114,12 +115,12 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Whether both passes gave the same bytes, without an error."""
+        """Return whether both passes gave the same bytes, without an error."""
         return self.same_bytes and self.errors == 0
 
     @property
     def as_live(self) -> bool:
-        """Whether the outputs are those that the node published live, within the tolerance."""
+        """Return whether the outputs equal the live ones, within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -130,16 +131,16 @@ class Verification:
         return self.repeatable and self.as_live
 
 
-def _untold(done: float, total: float) -> None:
-    """Nobody asks how far it is."""
+def _ignore_progress(done: float, total: float) -> None:
+    """Ignore the progress."""
 
 
 def verify(
-    bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _untold
+    bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _ignore_progress
 ) -> Verification:
     """Replay node `name` of the bag's plan twice; BagError for a bag that does not allow it."""
     reader = BagReader(bag)
-    plan = _plan_of(reader)
+    plan = _read_plan(reader)
     if name not in plan.nodes:
         raise BagError(
             f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
@@ -149,7 +150,7 @@ def verify(
         why = refusal(node)
     except (ValidationError, UnknownNodeError) as error:
         raise BagError(
-            f"{bag}: {name} is not of today's code; verify it with the code of the recording"
+            f"{bag}: {name} is unknown to this code; verify it with the code of the recording"
         ) from error
     if why:
         raise BagError(f"{name} is not replayed: {why}")
@@ -172,44 +173,44 @@ def verify(
     )
 
 
-def _plan_of(reader: BagReader) -> ResolvedGraph:
+def _read_plan(reader: BagReader) -> ResolvedGraph:
     try:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except ValidationError as error:
         raise BagError(
-            f"{reader.path}: its plan.json is no plan of today's code; verify it with the code of "
-            "the recording"
+            f"{reader.path}: its plan.json is not valid in this code; verify the bag with the "
+            "code of the recording"
         ) from error
 
 
 def refusal(node: ResolvedNode) -> str:
-    """Say why a node cannot be stepped through a bag; empty: it can."""
+    """Return why a node cannot be stepped through a bag; empty: it can."""
     class_ = node_class(node.type)
     return class_.replay_refusal(parameters_of(class_).model_validate(node.parameters))
 
 
-async def replay(bag: Path, planned: ResolvedNode, progress: Progress = _untold) -> Pass:
+async def replay(bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress) -> Pass:
     """Step a node through its inputs in the bag."""
     result = Pass()
-    lives = lives_in(bag, planned.name)
-    before, total = 0, sum(len(life.steps) for life in lives)
-    for life in lives:
-        result.as_taken, result.told_until_ns = True, int(life.steps[-1, 3])
-        told = partial(_told_with, progress, before, total)
-        await _replay_life(bag, planned, life, result, told)
-        before += len(life.steps)
-    if not lives:
+    runs = read_runs(bag, planned.name)
+    before, total = 0, sum(len(run.steps) for run in runs)
+    for run in runs:
+        result.as_taken, result.logged_until_ns = True, int(run.steps[-1, 3])
+        report = partial(_report_progress, progress, before, total)
+        await _replay_run(bag, planned, run, result, report)
+        before += len(run.steps)
+    if not runs:
         await _replay_in_order(bag, planned, result, progress)
     return result
 
 
-def _told_with(progress: Progress, before: int, total: int, step: int) -> None:
-    if step % TOLD_EVERY == 0:
+def _report_progress(progress: Progress, before: int, total: int, step: int) -> None:
+    if step % PROGRESS_STEPS == 0:
         progress(before + step, total)
 
 
-def _node_of(planned: ResolvedNode, clock: VirtualClock, result: Pass) -> Node:
-    """The node, built as a launcher would; what it sends is kept."""
+def _build_node(planned: ResolvedNode, clock: VirtualClock, result: Pass) -> Node:
+    """Build the node as a launcher would, and store what it publishes."""
 
     def keep(topic: Topic, message: Message, header: Header) -> None:
         result.sent.append(Sent(topic.name, tuple(bytes(one) for one in encode(message, header))))
@@ -241,7 +242,7 @@ async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
 async def _replay_in_order(
     bag: Path, planned: ResolvedNode, result: Pass, progress: Progress
 ) -> None:
-    """Hand it all its inputs, in the recorder's order."""
+    """Step the node through all its inputs, in the order of the recorder."""
     ports: dict[str, list[str]] = {}
     for port in planned.inputs:
         ports.setdefault(port.topic, []).append(port.port)
@@ -250,11 +251,11 @@ async def _replay_in_order(
     start_ns = info.start_ns
     clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
     clock = VirtualClock(start_ns, clock_id=clock_id)
-    node = _node_of(planned, clock, result)
+    node = _build_node(planned, clock, result)
     async with _set_up(node, result):
         timers = Timers(node, start_ns)
         for number, (topic, message, header, log_ns) in enumerate(reader):
-            if number % TOLD_EVERY == 0:
+            if number % PROGRESS_STEPS == 0:
                 progress(number, info.count)
             await timers.call_until(log_ns, clock)
             clock.move_to(log_ns)
@@ -266,21 +267,21 @@ async def _replay_in_order(
                 await node.settle()
 
 
-async def _replay_life(
-    bag: Path, planned: ResolvedNode, life: Life, result: Pass, told: Callable[[int], None]
+async def _replay_run(
+    bag: Path, planned: ResolvedNode, run: NodeRun, result: Pass, report: Callable[[int], None]
 ) -> None:
-    """Hand it what it took, from one start of it to its end."""
-    clock = VirtualClock(int(life.steps[0, 3]), clock_id=life.clock_id)
-    node = _node_of(planned, clock, result)
+    """Step the node through its execution log of one run."""
+    clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
+    node = _build_node(planned, clock, result)
     names, timers = list(node.inputs), timers_of(type(node))
     async with _set_up(node, result):
-        messages = Waiting(bag, node)
-        # What it was told before the bag began, it will not say that it took.
-        for port, message, header in messages.told_before(life):
+        messages = RecordedInputs(bag, node)
+        # Messages of before the recording are not in the execution log of the recorded statuses.
+        for port, message, header in messages.latched_before(run):
             result.messages_in += 1
             await node.step(port, message, header)
-        for step, (number, sequence, epoch, at_ns) in enumerate(life.steps.tolist()):
-            told(step)
+        for step, (number, sequence, epoch, at_ns) in enumerate(run.steps.tolist()):
+            report(step)
             if number < 0:
                 clock.move_to(at_ns)
                 await node.call_timer(-1 - number, timers[-1 - number])
@@ -296,35 +297,35 @@ async def _replay_life(
 
 
 @dataclass(frozen=True, slots=True)
-class Life:
+class NodeRun:
     """Hold what a node handled between two starts: rows of its `Status.execution_log`."""
 
     clock_id: str
     steps: NDArray[np.int64]
 
 
-def lives_in(bag: Path, name: str) -> list[Life]:
-    """What the node said that it took, per start of it; none in bags of earlier code."""
-    told: dict[int, list[NDArray[np.int64]]] = {}
+def read_runs(bag: Path, name: str) -> list[NodeRun]:
+    """Read the execution logs of a node, one per start; none in bags of earlier code."""
+    logs: dict[int, list[NDArray[np.int64]]] = {}
     clock_ids: dict[int, str] = {}
     if "status" not in BagReader(bag).topics:
         return []
     for _, message, header, _ in BagReader(bag, ["status"]):
         if isinstance(message, Status) and message.node == name and len(message.execution_log):
-            before = told.setdefault(header.epoch, [])
-            # A young node tells all from its start again.
+            before = logs.setdefault(header.epoch, [])
+            # In its first seconds a node repeats its whole log.
             if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
             before.append(message.execution_log)
             clock_ids[header.epoch] = header.clock_id
-    return [Life(clock_ids[epoch], np.concatenate(parts)) for epoch, parts in told.items()]
+    return [NodeRun(clock_ids[epoch], np.concatenate(parts)) for epoch, parts in logs.items()]
 
 
-class Waiting:
-    """The recorded inputs of a node, read on as far as what it took needs it."""
+class RecordedInputs:
+    """Read the recorded inputs of a node as far ahead as its execution log needs."""
 
     LOOK_AHEAD = 5000
-    """Messages after which one that should be in the bag is taken to be missing."""
+    """Number of messages that are read before a logged one counts as missing."""
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node
@@ -337,9 +338,9 @@ class Waiting:
             port: deque() for port in node.inputs
         }
 
-    def told_before(self, life: Life) -> list[tuple[str, Message, Header]]:
-        """Latched messages that came before the first step, in order."""
-        steps = {(names, *key) for names, *key in life.steps[:, :3].tolist()}
+    def latched_before(self, run: NodeRun) -> list[tuple[str, Message, Header]]:
+        """Return the latched messages before the first step, in order."""
+        steps = {(names, *key) for names, *key in run.steps[:, :3].tolist()}
         latched = {
             source.topic.name
             for source in self._node.inputs.values()
@@ -352,12 +353,12 @@ class Waiting:
                 if port not in self._ports[topic]:
                     continue
                 taken = (number, header.sequence, header.epoch) in steps
-                if not taken and header.publish_ns <= life.steps[0, 3]:
+                if not taken and header.publish_ns <= run.steps[0, 3]:
                     found[port] = (message, header)
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """That message; None where the bag does not have it."""
+        """Return this message; None if the bag does not contain it."""
         waiting = self._waiting[port]
         latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
         read = seen = 0
@@ -369,7 +370,7 @@ class Waiting:
                 if header.sequence > sequence:
                     return None
                 del waiting[i]
-                # What a reader of the newest has passed over, it never takes.
+                # A reader of the latest message never goes back to a skipped one.
                 for _ in range(i if latest else 0):
                     waiting.popleft()
                 return message, header
@@ -391,7 +392,7 @@ class Waiting:
 
 
 class Timers:
-    """A node's periodic methods on a virtual clock."""
+    """Call the periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
@@ -402,7 +403,7 @@ class Timers:
         self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
 
     async def call_until(self, now_ns: int, clock: VirtualClock) -> None:
-        """Call all that comes due up to `now_ns`, in the order of time."""
+        """Call the methods that are due up to `now_ns`, in the order of time."""
         while self._due_ns:
             next_one = min(self._due_ns, key=lambda one: (self._due_ns[one], one[1].method))
             due_ns = self._due_ns[next_one]
@@ -416,13 +417,15 @@ class Timers:
 def compare(
     bag: Path, node: ResolvedNode, replayed: Pass, tolerance: float
 ) -> dict[str, Comparison]:
-    """What the node published live against what it publishes now, for all its recorded outputs."""
+    """Compare the outputs that the node published live with the replayed ones."""
     outputs = {port.topic for port in node.outputs} - {"status"}
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
     comparisons = {topic: Comparison() for topic in sorted(outputs)}
     for topic, message, header, _ in BagReader(bag, outputs & set(BagReader(bag).topics)):
-        untold = replayed.told_until_ns is not None and header.source_ns > replayed.told_until_ns
-        if header.writer == node.name and not untold:
+        unlogged = (
+            replayed.logged_until_ns is not None and header.source_ns > replayed.logged_until_ns
+        )
+        if header.writer == node.name and not unlogged:
             recorded[topic][header.source_ns] = message
             comparisons[topic].recorded += 1
     for one in replayed.sent:
@@ -443,7 +446,7 @@ def compare(
 
 
 def field_differences(one: BaseModel, other: BaseModel, prefix: str = "") -> dict[str, float]:
-    """Fields that differ, and by how much; see `Comparison.worst`."""
+    """Return the differences by field; see `Comparison.worst`."""
     found: dict[str, float] = {}
     for name in type(one).model_fields:
         a, b = getattr(one, name), getattr(other, name)
@@ -467,7 +470,7 @@ def _difference(a: Any, b: Any) -> float:
 
 
 def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """The greatest difference; infinite where one is no number and the other is another thing."""
+    """Return the largest difference; infinite where only one value is NaN."""
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore"):
         apart = np.where(same, 0.0, np.abs(a - b))
@@ -475,17 +478,17 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
-    """Every input must have been recorded (an input on which nothing came is no lack)."""
+    """Raise BagError for an input that was not recorded; an input without messages is allowed."""
     recorded = set(reader.topics)
     for other in plan.nodes.values():
         if other.role is NodeRole.RECORDER:
             recorded |= {port.topic for port in other.inputs}
     lacking = [port.topic for port in node.inputs if port.topic not in recorded]
     if lacking:
-        also = " ".join(f"--include {topic}" for topic in lacking)
+        options = " ".join(f"--include {topic}" for topic in lacking)
         raise BagError(
             f"{bag}: {node.name} reads {', '.join(lacking)}, which was not recorded; "
-            f"record anew with: flexsheet bag record BAG {also}"
+            f"record it with: flexsheet bag record BAG {options}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):
-        raise BagError(f"{bag}: holds no input of {node.name}: nothing to replay")
+        raise BagError(f"{bag}: contains no input of {node.name}; there is nothing to replay")

@@ -59,7 +59,7 @@ class ClockNode(Node):
                     max_drift_ratio=self.parameters.max_drift_ratio,
                 )
                 if sample is not None:
-                    other.take(sample)
+                    other.add(sample)
 
     @periodic("rate_hz")
     def ping(self) -> None:

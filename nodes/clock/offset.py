@@ -107,8 +107,8 @@ class OtherClock:
     samples: list[Sample] = field(default_factory=list)
     resets: int = 0
 
-    def take(self, sample: Sample) -> None:
-        """Keep a sample if it is the best of its half second."""
+    def add(self, sample: Sample) -> None:
+        """Store a sample if it is the best of its half second."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return

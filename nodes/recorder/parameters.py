@@ -1,4 +1,4 @@
-"""What the recorder is told by the launch file."""
+"""Declare the parameters of the recorder."""
 
 from __future__ import annotations
 
@@ -14,30 +14,32 @@ RUN_FILES = tuple(
 
 
 class RecorderParameters(NodeParameters):
-    """Which topics go to which bag."""
+    """Select the topics to record and the bag to write."""
 
-    bag: Path = Field(description="file to write; %Y%m%d-%H%M%S and the like become its start")
+    bag: Path = Field(
+        description="file to write; %Y%m%d-%H%M%S and similar codes become the start time"
+    )
     topics: tuple[str, ...] = Field(
-        default=(), description="empty: all that the table of topics says are logged"
+        default=(), description="topics to record; empty: all that are logged by default"
     )
     include: tuple[str, ...] = Field(
         default=(), description="topics to record besides those, for example stereo"
     )
     compress: bool | None = Field(
         default=None,
-        description="null: unless pictures come, which take longer to compress than to write",
+        description="compress the bag; null: unless it holds images, which are slow to compress",
     )
     start_paused: bool = Field(
         default=False,
-        description="record only while a `recording` message says so, to a bag for each time",
+        description="record only while a `recording` message requests it, each time to a new bag",
     )
     keep_free_bytes: int = Field(
         default=256 << 20,
         ge=0,
-        description="with less than this left on the disk the bag is ended, with its index; with "
-        "twice as much again, recording goes on in another",
+        description="free space of the disk below which the bag is ended, with its index; with "
+        "twice as much free again, another bag begins",
     )
-    watch_hz: float = Field(default=2.0, gt=0.0, description="how often the disk is looked at")
+    watch_hz: float = Field(default=2.0, gt=0.0, description="rate of the check of the disk")
     attach: tuple[Path, ...] = Field(
-        default=RUN_FILES, description="files that go into the bag; @run is the run's directory"
+        default=RUN_FILES, description="files to store in the bag; @run is the directory of the run"
     )

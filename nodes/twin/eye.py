@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene
+from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
@@ -491,6 +493,33 @@ class EyeSituation:
     displacement: NDArray[np.float32] | None
     flat: bool
     metres_per_px: float
+
+    @classmethod
+    def from_messages(
+        cls,
+        scene: Scene,
+        arms: TwinArms,
+        *,
+        finger: TwinFinger | None,
+        body: SoftBody | None,
+        skin: Skin | None,
+        display: Display | None,
+        metres_per_px: float,
+    ) -> Self:
+        """Combine the latest messages; a skin and an answer of different meshes are not used."""
+        moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
+        shown = skin if moved is not None else None
+        return cls(
+            scene=scene,
+            world_from_flange_left=arms.world_from_flange_left,
+            world_from_flange_right=arms.world_from_flange_right,
+            finger_tip=None if finger is None else finger.position_world_m,
+            skin_vertices=None if shown is None else shown.vertices_world_m,
+            skin_triangles=None if shown is None else shown.triangles,
+            displacement=None if moved is None else moved.displacement_world_m,
+            flat=display is not None and display.shading == "flat",
+            metres_per_px=metres_per_px,
+        )
 
 
 def true_sheet(

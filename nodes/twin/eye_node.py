@@ -113,20 +113,15 @@ class TwinEyeNode(Node):
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
     def _situation(self, scene: Scene, arms: TwinArms) -> EyeSituation:
-        finger, body, skin = self.twin__finger.message, self.soft_body.message, self.skin.message
-        matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
-        display = self.display.message
         if self.parameters.projector is not None:
             scene = scene.model_copy(update={"projector": self.parameters.projector})
-        return EyeSituation(
-            scene=scene,
-            world_from_flange_left=arms.world_from_flange_left,
-            world_from_flange_right=arms.world_from_flange_right,
-            finger_tip=None if finger is None else finger.position_world_m,
-            skin_vertices=skin.vertices_world_m if matching and skin is not None else None,
-            skin_triangles=skin.triangles if matching and skin is not None else None,
-            displacement=body.displacement_world_m if matching and body is not None else None,
-            flat=display is not None and display.shading == "flat",
+        return EyeSituation.from_messages(
+            scene,
+            arms,
+            finger=self.twin__finger.message,
+            body=self.soft_body.message,
+            skin=self.skin.message,
+            display=self.display.message,
             metres_per_px=self.parameters.metres_per_px,
         )
 

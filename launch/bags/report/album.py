@@ -1,4 +1,4 @@
-"""The pictures of a session: a few, spread over it, and those at marked moments."""
+"""Select images of a session: some at regular intervals, and those at bookmarks."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MARKED_MOST = 40
-"""Shots of marked moments that are kept; the others are counted."""
+MAX_BOOKMARK_SHOTS = 40
+"""Number of shots at bookmarks that are stored; further ones are counted."""
 
-WIDEST_PX = 420
+MAX_WIDTH_PX = 420
 QUALITY = 82
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Some JPEG pictures of one moment, each with what it shows; marked: of a marked moment."""
+    """Hold JPEG images of one time, each with its title; marked: label of its bookmark."""
 
     seconds: float
     title: str
@@ -28,10 +28,10 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """At most `limit` shots, evenly out of all that came, and the first after each moment.
+    """Store at most `limit` shots at regular intervals, and the first shot after each bookmark.
 
-    moments: (seconds, label), in order.  seen: how many came.  left_out: shots of moments
-    beyond the first `MARKED_MOST`.
+    bookmarks: (seconds, label), in order. seen: number of shots. left_out: shots at bookmarks
+    beyond the first `MAX_BOOKMARK_SHOTS`.
     """
 
     limit: int
@@ -48,7 +48,7 @@ class Album:
         """Look at a shot; it is made small only if it is kept."""
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
-        if passed and len(self._marked) >= MARKED_MOST:
+        if passed and len(self._marked) >= MAX_BOOKMARK_SHOTS:
             self.left_out += 1
         elif passed:
             self._marked.append(_shot(seconds, title, pictures, "; ".join(passed)))
@@ -60,7 +60,7 @@ class Album:
         self.seen += 1
 
     def shots(self) -> list[Shot]:
-        """All that are kept, in the order of time."""
+        """Return the stored shots in the order of time."""
         return sorted((*self._held, *self._marked), key=lambda shot: shot.seconds)
 
 
@@ -74,10 +74,10 @@ def _shot(
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """A picture (h, w) grey or (h, w, 3) red, green, blue, at most `WIDEST_PX` wide, as JPEG."""
+    """Encode an image (h, w) grey or (h, w, 3) RGB as JPEG, at most `MAX_WIDTH_PX` wide."""
     height, width = image.shape[:2]
-    if width > WIDEST_PX:
-        size = (WIDEST_PX, max(round(height * WIDEST_PX / width), 1))
+    if width > MAX_WIDTH_PX:
+        size = (MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     if image.ndim == 3:
         image = image[:, :, ::-1]

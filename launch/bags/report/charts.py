@@ -1,4 +1,4 @@
-"""The report's charts: SVG that follows light and dark, each with a text of what it shows."""
+"""Draw the charts of the report as SVG for light and dark pages, each with a text."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""So that states which call for attention are told apart without colours."""
+"""Hatches that distinguish grave states without colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -42,15 +42,15 @@ EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """svg: the picture.  text: what it shows, for who cannot see it.  caption: how to read it."""
+    """Hold a chart. svg: image. text: its content in words. caption: how to read it."""
 
     svg: str
     text: str
     caption: str
 
 
-def charts_of(session: Session) -> dict[str, Chart]:
-    """The charts that the bag has data for, by name."""
+def draw_charts(session: Session) -> dict[str, Chart]:
+    """Draw the charts for which the bag has data, by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -76,14 +76,14 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Set the axes to the bag's time, once their lines are there."""
+    """Set the axes to the time of the bag, after the lines are drawn."""
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Mark each value of a line that no line leads to or from: else it would not be seen."""
+    """Mark each value without neighbours: no line would show it."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         beside = np.zeros_like(known)
@@ -96,7 +96,7 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Strips of states over time, and above them what happened."""
+    """Draw strips of states over time, and events above them."""
     strips = [
         (name, states)
         for name, states in (
@@ -120,15 +120,15 @@ def timeline(session: Session) -> Chart | None:
     looks: dict[tuple[str, str | None], list[str]] = {}
     for row, (name, states) in enumerate(strips):
         lasting = name == "e-stop"
-        for state, begin_s, end_s in stretches_of(states, session.fine, lasting=lasting):
+        for state, begin_s, end_s in find_intervals(states, session.fine, lasting=lasting):
             colour, hatch = look = STATE_COLOURS.get(state, MIDDLE), HATCHES.get(state)
             axes.barh(
                 row, end_s - begin_s, left=begin_s, height=0.7, color=colour, hatch=hatch,
                 edgecolor="#ffffff" if hatch else colour, linewidth=0.0,
             )  # fmt: skip
-            told = looks.setdefault(look, [])
-            if state not in told:
-                told.append(state)
+            texts = looks.setdefault(look, [])
+            if state not in texts:
+                texts.append(state)
     for kind in kinds:
         marker, colour = MARKS[kind]
         at = [seconds for seconds, _ in session.events.of(kind)]
@@ -139,8 +139,8 @@ def timeline(session: Session) -> Chart | None:
     _over_time(axes, session)
     axes.set_xlabel("time in the bag, s")
     patches = [
-        Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(told))
-        for (colour, hatch), told in looks.items()
+        Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(texts))
+        for (colour, hatch), texts in looks.items()
     ]
     handles, _ = axes.get_legend_handles_labels()
     figure.legend(handles=[*patches, *handles], ncols=5, fontsize=8, loc="outside lower center")
@@ -158,15 +158,17 @@ def timeline(session: Session) -> Chart | None:
 
 
 def spent_in(states: States) -> list[tuple[str, float]]:
-    """The states that lasted, the longest first."""
+    """Describe the states, the longest first."""
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
 
-def stretches_of(
+def find_intervals(
     states: States, grid: Grid, *, lasting: bool = False
 ) -> Iterator[tuple[str, float, float]]:
-    """Runs of one state: (state, from s, to s).  lasting: until another one, not until silence."""
+    """Find intervals of one state: (state, from s, to s). lasting: up to the next state, not up to
+    silence.
+    """
     width_s = grid.duration_s / grid.count
     # A message every second leaves holes in a fine grid, which are none in what it says.
     holes = max(int(0.5 / width_s), 1)
@@ -187,14 +189,14 @@ def stretches_of(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Median and 99 % of each step after the exposure, over time."""
+    """Draw median and 99 % of each step after the exposure, over time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
     rows = (len(events) + 1) // 2
     figure, grid = _figure(rows, 2, 1.9 * rows + 0.4)
     seconds = session.grid.seconds()
-    told = []
+    texts = []
     for i, event in enumerate(events):
         axes: Axes = grid[i // 2][i % 2]
         spread: Spread = session.latencies[event]
@@ -209,7 +211,7 @@ def latencies(session: Session) -> Chart | None:
         _over_time(axes, session)
         axes.set_ylabel("ms")
         whole = [spread.quantile_s(share) or 0.0 for share in (0.5, 0.99)]
-        told.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
+        texts.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
     grid[0][0].legend(fontsize=8)
     for axes in grid[-1]:
         axes.set_xlabel("time in the bag, s")
@@ -218,7 +220,7 @@ def latencies(session: Session) -> Chart | None:
     return Chart(
         render_svg(figure),
         "From the exposure to each step, over the whole bag, median and 99 %: "
-        + "; ".join(told)
+        + "; ".join(texts)
         + ".",
         "From the middle of the exposure until the message was sent, the command written, the "
         "frame drawn.",
@@ -226,7 +228,7 @@ def latencies(session: Session) -> Chart | None:
 
 
 def paths(session: Session) -> Chart | None:
-    """Where the finger and the sheet's middle were, from the front and from the side."""
+    """Draw the paths of finger and sheet centre, from the front and from the side."""
     finger, true = 1e3 * session.finger_place.points, 1e3 * session.true_place.points
     sheet = 1e3 * session.sheet_place.points
     known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
@@ -265,7 +267,7 @@ def paths(session: Session) -> Chart | None:
 
 
 def sheet_errors(session: Session) -> Chart | None:
-    """Greatest position and angle error of each stretch, while the sheet touches."""
+    """Draw the maximum position and angle errors of each interval in contact."""
     errors = session.errors
     shown = [
         (name, label)
@@ -280,10 +282,10 @@ def sheet_errors(session: Session) -> Chart | None:
         (grid[0][0], errors.distance, 1e3, "Δd, mm"),
         (grid[1][0], errors.angle, float(np.degrees(1.0)), "Δθ, degrees"),
     ):
-        for i, (name, told) in enumerate(shown):
+        for i, (name, texts) in enumerate(shown):
             axes.plot(
                 seconds, scale * values[name].most, color=COLOURS[4 * i], linewidth=1.0,
-                linestyle=("-", "--")[i], label=f"against the {told}",
+                linestyle=("-", "--")[i], label=f"against the {texts}",
             )  # fmt: skip
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0.0)
@@ -309,13 +311,13 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def joint_speeds(session: Session) -> Chart | None:
-    """Each joint's greatest speed as a share of what it can do."""
+    """Draw each joint's maximum speed over its limit."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
     figure, grid = _figure(len(arms), 1, 2.3 * len(arms) + 0.3)
     seconds = session.grid.seconds()
-    told = []
+    texts = []
     for axes, (side, arm) in zip(grid[:, 0], arms.items(), strict=True):
         for i, (range_, limit) in enumerate(
             zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
@@ -332,30 +334,30 @@ def joint_speeds(session: Session) -> Chart | None:
             for range_, limit in zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
             if (overall := range_.overall())
         ]
-        told.append(f"{side} arm at most {max(shares):.0f} %")
+        texts.append(f"{side} arm at most {max(shares):.0f} %")
     grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
     grid[-1][0].set_xlabel("time in the bag, s")
     return Chart(
         render_svg(figure),
-        f"Joint speeds as shares of their limits: {', '.join(told)}.",
+        f"Joint speeds over their limits: {', '.join(texts)}.",
         "The greatest of each stretch of time, from the measured joints over 25 ms.",
     )
 
 
 def forces(session: Session) -> Chart | None:
-    """The pull at the sheet's edges, the object's force, and how deep the finger pushes."""
+    """Draw the edge forces, the force of the object and the push depth."""
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None
     figure, grid = _figure(2, 1, 4.4)
     seconds = session.grid.seconds()
     upper, lower = grid[0][0], grid[1][0]
-    told = []
+    texts = []
     for i, (side, arm) in enumerate(arms.items()):
         upper.plot(seconds, arm.edge_force.most, color=COLOURS[4 * i], linewidth=1.2,
                    linestyle=("-", "--")[i], label=f"{side} edge")  # fmt: skip
         overall = arm.edge_force.overall()
-        told.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
+        texts.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
     if session.scene is not None:
         most_n = session.scene.sheet.max_edge_force_n
         upper.axhline(most_n, linestyle="--", color=INK, linewidth=1.0, label="limit")
@@ -371,7 +373,7 @@ def forces(session: Session) -> Chart | None:
     lower.set_xlabel("time in the bag, s")
     return Chart(
         render_svg(figure),
-        f"Forces: {', '.join(told)}.",
+        f"Forces: {', '.join(texts)}.",
         "Above, the pull of the sheet at its edges, by the bridges; below, how deep the finger is "
         "in the object, and the object's force on it by the solver.",
     )

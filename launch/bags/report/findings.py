@@ -1,4 +1,4 @@
-"""What was wrong in a session, in sentences; each says where on the page to read on."""
+"""Describe the problems of a session in sentences; each names its section of the page."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from flexsheet.messages.busy import BUSY_REMEDY
 
 Gravity = Literal["bad", "doubtful"]
 
-SLOW_SHARE = 0.5
+SLOW_RATIO = 0.5
 """Of the least rate that the table of topics expects, as on the console's page."""
 
-UNSEEN_SHARE = 0.05
+MAX_UNSEEN_RATIO = 0.05
 """Of the time: with the finger lost for longer, that is said."""
 
-FULL_SHARE = 1.0
+FULL_RATIO = 1.0
 """Of a limit."""
 
 ROUNDING = 1.02
@@ -24,8 +24,11 @@ ROUNDING = 1.02
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """gravity: bad, something failed; doubtful, to be looked at.  section: of the page, by id."""
+class SessionFinding:
+    """Hold a problem of a session.
+
+    gravity: bad, a failure; doubtful, to be checked. section: id on the page.
+    """
 
     gravity: Gravity
     text: str
@@ -45,8 +48,8 @@ CHECKED = (
 )
 
 
-def findings_of(numbers: dict[str, Any]) -> list[Finding]:
-    """All of them: a busy computer first, since it explains most others, then the bad ones."""
+def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
+    """Find all problems: a busy computer first, which explains most others, then the bad ones."""
     found = [
         *_of_the_bag(numbers),
         *_of_the_arms(numbers),
@@ -59,8 +62,8 @@ def findings_of(numbers: dict[str, Any]) -> list[Finding]:
     return [*_of_the_load(numbers, others), *others]
 
 
-def _of_the_load(numbers: dict[str, Any], others: list[Finding]) -> Iterator[Finding]:
-    """others: what else was found."""
+def _of_the_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
+    """Report a busy computer. others: the other findings."""
     stopped = numbers["events"]["counts"].get("arm", 0)
     for host in numbers["hosts"].values():
         if not host["busy_fraction"]:
@@ -73,20 +76,20 @@ def _of_the_load(numbers: dict[str, Any], others: list[Finding]) -> Iterator[Fin
             text += "This is the probable cause of what was late. "
         often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
         gravity: Gravity = "bad" if stopped or often else "doubtful"
-        yield Finding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
+        yield SessionFinding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
 
 
 MAX_TOPICS_LISTED = 10
 
 
-def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_the_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     bag = numbers["bag"]
     if not bag["complete"]:
-        yield Finding(
+        yield SessionFinding(
             "bad", f"The bag is not whole ({bag['problem']}); this is what can be read.", "bag"
         )
     if lost := int(bag["recording"].get("lost_messages", 0)):
-        yield Finding(
+        yield SessionFinding(
             "bad", f"The recorder lost {lost} messages before this bag (a full disk).", "bag"
         )
     unreadable = [
@@ -95,35 +98,35 @@ def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:
         if topic["readable"] is False
     ]
     for text in unreadable[:MAX_TOPICS_LISTED]:
-        yield Finding("doubtful", text, "topics")
+        yield SessionFinding("doubtful", text, "topics")
     if len(unreadable) > MAX_TOPICS_LISTED:
         text = f"{len(unreadable) - MAX_TOPICS_LISTED} more topics cannot be read."
-        yield Finding("doubtful", text, "topics")
+        yield SessionFinding("doubtful", text, "topics")
     if numbers["git"].get("changed"):
         text = "The code had been changed since its commit: this run cannot be repeated exactly."
-        yield Finding("doubtful", text, "bag")
+        yield SessionFinding("doubtful", text, "bag")
     for name, host in numbers["hosts"].items():
         if host["missing_devices"]:
             devices = ", ".join(host["missing_devices"])
-            yield Finding("bad", f"{name}: its nodes name devices that are not there: {devices}.",
-                          "bag")  # fmt: skip
+            text = f"{name}: its nodes name devices that do not exist: {devices}."
+            yield SessionFinding("bad", text, "bag")
 
 
-def _of_the_arms(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_the_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     counts, first = numbers["events"]["counts"], numbers["events"]["first"]
     for kind, what in (("estop", "E-stop"), ("fault", "Arm's fault"), ("arm", "Arm not at work")):
         if kind in counts:
             event = next(one for one in first if one["kind"] == kind)
             times = "once" if counts[kind] == 1 else f"{counts[kind]} times"
             text = f"{what}, {times}; first at {event['seconds']:.2f} s: {event['text']}."
-            yield Finding("bad", text, "timeline")
+            yield SessionFinding("bad", text, "timeline")
     scene = numbers["scene"] or {}
     for side, arm in numbers["arms"].items():
-        shares = [share for share in arm["joint_speed_share"] if share is not None]
-        if shares and max(shares) > ROUNDING * FULL_SHARE:
-            joint = arm["joint_speed_share"].index(max(shares)) + 1
+        shares = [share for share in arm["joint_speed_ratio"] if share is not None]
+        if shares and max(shares) > ROUNDING * FULL_RATIO:
+            joint = arm["joint_speed_ratio"].index(max(shares)) + 1
             text = f"{side} arm: joint {joint} went at {max(shares):.0%} of its greatest speed."
-            yield Finding("bad", text, "arms")
+            yield SessionFinding("bad", text, "arms")
         for key, limit, scale, unit, what in (
             ("tool_speed_mm_per_s", "max_tool_speed_m_per_s", 1e3, "mm/s", "its tool went at"),
             ("edge_force_n", "max_edge_force_n", 1.0, "N", "its edge was pulled with"),
@@ -132,43 +135,45 @@ def _of_the_arms(numbers: dict[str, Any]) -> Iterator[Finding]:
             if most is not None and limit in scene and most > ROUNDING * scale * scene[limit]:
                 allowed = scale * scene[limit]
                 text = f"{side} arm: {what} {most:.3g} {unit}; {allowed:.3g} {unit} are allowed."
-                yield Finding("bad", text, "arms")
+                yield SessionFinding("bad", text, "arms")
 
 
-def _of_the_nodes(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_the_nodes(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, node in numbers["nodes"].items():
         if node["errors"]:
             count = "an error" if node["errors"] == 1 else f"{node['errors']} errors"
-            yield Finding("bad", f"{name} had {count}; the last: {node['last_error']}.", "nodes")
+            yield SessionFinding(
+                "bad", f"{name} had {count}; the last: {node['last_error']}.", "nodes"
+            )
         if node["starts"] > 1:
-            yield Finding("bad", f"{name} was started {node['starts']} times.", "nodes")
+            yield SessionFinding("bad", f"{name} was started {node['starts']} times.", "nodes")
         if node["degraded"] and not node["errors"]:
             text = f"{name} called itself degraded {node['degraded']} times: {node['last_error']}"
-            yield Finding("doubtful", f"{text.rstrip(' :')}.", "nodes")
+            yield SessionFinding("doubtful", f"{text.rstrip(' :')}.", "nodes")
 
 
-def _of_the_topics(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_the_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, topic in numbers["topics"].items():
         expected, rate = topic["expected_hz"], topic["rate_hz"]
         if topic["refused"]:
             text = f"{name}: {topic['refused']} messages were refused by their readers."
-            yield Finding("bad", text, "topics")
+            yield SessionFinding("bad", text, "topics")
         if topic["lost"]:
             text = f"{name}: {topic['lost']} messages were lost on the way to readers."
-            yield Finding("doubtful", text, "topics")
+            yield SessionFinding("doubtful", text, "topics")
         if topic["missing"]:
             text = f"{name}: {topic['missing']} messages never reached the recorder."
-            yield Finding("doubtful", text, "topics")
-        if expected and rate and topic["messages"] > 10 and rate < SLOW_SHARE * expected[0]:
+            yield SessionFinding("doubtful", text, "topics")
+        if expected and rate and topic["messages"] > 10 and rate < SLOW_RATIO * expected[0]:
             text = f"{name} came at {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
-            yield Finding("doubtful", text, "topics")
+            yield SessionFinding("doubtful", text, "topics")
         if topic["silences"]:
             times = "once" if topic["silences"] == 1 else f"{topic['silences']} times"
             text = f"{name} fell silent {times}, for {topic['longest_silence_s']:.2f} s at most."
-            yield Finding("doubtful", text, "topics")
+            yield SessionFinding("doubtful", text, "topics")
 
 
-def _of_tolerances(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     if numbers["scene"] is None:
         return
     tolerances = numbers["scene"]["tolerances"]
@@ -180,7 +185,7 @@ def _of_tolerances(numbers: dict[str, Any]) -> Iterator[Finding]:
             text = (
                 f"Exposure to {event}: {p99:.1f} ms (99 %); the scene allows {allowed_ms:.3g} ms."
             )
-            yield Finding("doubtful", text, "latency")
+            yield SessionFinding("doubtful", text, "latency")
     contact = numbers["sheet"]["contact"]
     for key, what in (("true_delta_d_mm", "true"), ("delta_d_mm", "measured")):
         errors = contact[key]
@@ -191,24 +196,24 @@ def _of_tolerances(numbers: dict[str, Any]) -> Iterator[Finding]:
                     f"In contact the sheet was {errors['mean']:.3g} mm off the {what} finger "
                     f"in the mean; the scene allows {most_mm:.3g} mm."
                 )
-                yield Finding("doubtful", text, "sheet")
+                yield SessionFinding("doubtful", text, "sheet")
             break
     body = numbers["soft_body"]
     if body["out_of_range"]:
         share = body["out_of_range"] / sum(body["methods"].values())
         text = f"The soft body's method was out of its range in {share:.1%} of its answers."
-        yield Finding("doubtful", text, "nodes")
+        yield SessionFinding("doubtful", text, "nodes")
 
 
-def _of_the_finger(numbers: dict[str, Any]) -> Iterator[Finding]:
+def _of_the_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     reasons = numbers["finger"]["reasons"]
     total = sum(reasons.values())
     missed = {reason: count for reason, count in reasons.items() if reason != "ok"}
-    if total and sum(missed.values()) > UNSEEN_SHARE * total:
+    if total and sum(missed.values()) > MAX_UNSEEN_RATIO * total:
         worst = max(missed, key=lambda reason: missed[reason])
         share = sum(missed.values()) / total
         text = f"In {share:.1%} of the pictures there was no valid finger, mostly: {worst}."
-        yield Finding("doubtful", text, "sheet")
+        yield SessionFinding("doubtful", text, "sheet")
     for path in numbers["sheet"]["followed"]:
         if path["drop_outs"]:
             times = "once" if path["drop_outs"] == 1 else f"{path['drop_outs']} times"
@@ -216,8 +221,8 @@ def _of_the_finger(numbers: dict[str, Any]) -> Iterator[Finding]:
                 f'The finger on its path "{path["path"]}" was not followed in contact {times}; '
                 f"it was followed for {path['following_ratio']:.1%} of its contact."
             )
-            yield Finding("doubtful", text, "sheet")
+            yield SessionFinding("doubtful", text, "sheet")
     frames = numbers["frames"]
     if frames["late"]:
         text = f"{frames['late']} of {frames['count']} frames were late by more than half a frame."
-        yield Finding("doubtful", text, "latency")
+        yield SessionFinding("doubtful", text, "latency")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.bags.report.series import Grid, Moments, Spread
+from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ class Sizes:
     """Mean, 95 % quantile (to 2.3 %) and maximum of positive values that are not stored."""
 
     def __init__(self) -> None:
-        self._moments, self._spread = Moments(), Spread(Grid(0, 1.0, 1))
+        self._moments, self._spread = RunningMoments(), Spread(Grid(0, 1.0, 1))
 
     def add(self, values: Floats) -> None:
         """Add values (n,)."""

@@ -1,4 +1,4 @@
-"""A session as one JSON document: what `bag report --json` prints, and the page's tables show."""
+"""Compute the numbers of a session as one JSON document, for `bag report --json` and the page."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 DEGREES = float(np.degrees(1.0))
 
 METHODS = ("method", *Methods.model_fields)
-"""Parameters of nodes that name a method."""
+"""Names of parameters of nodes that select a method."""
 
 
-def numbers_of(session: Session) -> dict[str, Any]:
-    """All figures; None (null) where the bag does not hold what is needed."""
+def compute_numbers(session: Session) -> dict[str, Any]:
+    """Compute all figures; None where the bag lacks the data."""
     info, scene = session.info, session.scene
     return {
         "bag": {
@@ -160,7 +160,7 @@ def _arm(arm: Arm) -> dict[str, Any]:
     peaks = [one.overall() for one in arm.joint_speed]
     return {
         "modes_s": _states(arm.modes),
-        "joint_speed_share": [
+        "joint_speed_ratio": [
             None if peak is None else peak[1] / limit
             for peak, limit in zip(peaks, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
         ],
@@ -187,7 +187,7 @@ def _node(session: Session, name: str, said: NodeSaid) -> dict[str, Any]:
     planned = None if session.plan is None else session.plan.nodes.get(name)
     cpu = said.cpu.summary(1.0)
     return {
-        "method": None if planned is None else methods_of(planned.parameters, session.scene),
+        "method": None if planned is None else describe_methods(planned.parameters, session.scene),
         "cpu_mean": None if cpu is None else cpu["mean"],
         "cpu_max": None if cpu is None else cpu["max"],
         "resident_mb": 1e-6 * said.resident_bytes,
@@ -200,8 +200,8 @@ def _node(session: Session, name: str, said: NodeSaid) -> dict[str, Any]:
     }
 
 
-def methods_of(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
-    """What a node was told to take, family by family; of `auto`, what the scene chose."""
+def describe_methods(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
+    """Describe the methods of a node by family; for `auto` those of the scene."""
     by_scene = scene.methods.model_dump() if scene is not None else {}
     by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")
     found = []

@@ -1,4 +1,4 @@
-"""The report as one HTML file: nothing is fetched, it follows light and dark, and it prints."""
+"""Render the report as one HTML file that needs no network, for screen and print."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.bags.report.album import Album, Shot
-from flexsheet.launch.bags.report.charts import Chart, charts_of
-from flexsheet.launch.bags.report.findings import CHECKED, Finding, findings_of
-from flexsheet.launch.bags.report.numbers import numbers_of
+from flexsheet.launch.bags.report.charts import Chart, draw_charts
+from flexsheet.launch.bags.report.findings import CHECKED, SessionFinding, find_problems
+from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
@@ -87,9 +87,9 @@ pre { background: var(--panel); padding: .75rem; overflow-x: auto; }
 """
 
 
-def page_of(session: Session) -> str:
-    """The whole page."""
-    numbers, charts = numbers_of(session), charts_of(session)
+def render_page(session: Session) -> str:
+    """Render the whole page."""
+    numbers, charts = compute_numbers(session), draw_charts(session)
     name = Path(numbers["bag"]["path"]).name
     body = [
         '<a class="skip" href="#findings">To what was wrong</a>',
@@ -98,7 +98,7 @@ def page_of(session: Session) -> str:
         '<nav aria-label="Sections"><ul>',
         *(f'<li><a href="#{key}">{title}</a></li>' for key, title in SECTIONS.items()),
         "</ul></nav><main>",
-        *_section("findings", _findings(findings_of(numbers))),
+        *_section("findings", _findings(find_problems(numbers))),
         *_section("bag", _bag(numbers)),
         *_section("timeline", _timeline(numbers, charts)),
         *_section("topics", _topics(numbers)),
@@ -146,7 +146,7 @@ def _first_line(numbers: Mapping[str, Any]) -> str:
     return escape(" · ".join(parts))
 
 
-def _findings(findings: Sequence[Finding]) -> Iterator[str]:
+def _findings(findings: Sequence[SessionFinding]) -> Iterator[str]:
     if not findings:
         yield '<p class="good">✓ Nothing was found.</p>'
     else:
@@ -228,8 +228,8 @@ def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterat
     if not events:
         yield "<p>No scene, bookmark, gap, fault, restart or e-stop was recorded.</p>"
         return
-    told = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
-    title = f"What happened ({told})"
+    texts = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
+    title = f"What happened ({texts})"
     if len(events) > EVENTS_SHOWN:
         title += f"; the first {EVENTS_SHOWN}, all are in --json"
     told_of = [(one["seconds"], one["kind"], one["text"]) for one in events[:EVENTS_SHOWN]]
@@ -270,7 +270,7 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _latency(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
-    yield figure(charts.get("latency"), "No topic was recorded that tells a latency.")
+    yield figure(charts.get("latency"), "No recorded topic has a latency.")
     rows = [
         (event, one["p50"], one["p99"], one["max"], one["count"])
         for event, one in numbers["latency_ms"].items()
@@ -340,8 +340,8 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
         )  # fmt: skip
     reasons = numbers["finger"]["reasons"]
     if reasons:
-        told = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
-        yield f"<p>What the pictures gave: {escape(told)}.</p>"
+        texts = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
+        yield f"<p>Results of the images: {escape(texts)}.</p>"
 
 
 def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
@@ -358,7 +358,7 @@ def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[s
         [
             (
                 side,
-                max((100.0 * s for s in one["joint_speed_share"] if s is not None), default=None),
+                max((100.0 * s for s in one["joint_speed_ratio"] if s is not None), default=None),
                 one["tool_speed_mm_per_s"],
                 one["edge_force_n"],
                 _of(one["cycle_ms"], "p99"),
@@ -426,7 +426,7 @@ def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             yield _missing(missing)
             continue
         if numbers["pictures"][key] > len(shots):
-            rest = f", {album.left_out} of bookmarks left out" if album.left_out else ""
+            rest = f", {album.left_out} shots at bookmarks left out" if album.left_out else ""
             yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
         yield from _album(title, album)
 
@@ -451,7 +451,7 @@ def _image(title: str, shot: Shot, name: str, jpeg: bytes) -> str:
 
 
 def figure(chart: Chart | None, missing: str) -> str:
-    """A chart with its caption, or why there is none."""
+    """Render a chart with its caption, or the reason why there is none."""
     if chart is None:
         return _missing(missing)
     data = b64encode(chart.svg.encode()).decode()
@@ -463,7 +463,7 @@ def figure(chart: Chart | None, missing: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table whose first column heads its rows; numbers to three digits, on the right."""
+    """Render a table whose first column heads its rows; numbers to three digits, right-aligned."""
     body = []
     for first, *rest in rows:
         cells = "".join(_cell(value) for value in rest)
@@ -484,7 +484,7 @@ def _cell(value: Any) -> str:
 
 
 def _said(value: Any) -> str:
-    """A value for people."""
+    """Format a value for people."""
     match value:
         case None:
             return "–"
@@ -520,7 +520,7 @@ def _missing(text: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: 3.2 s, 4 min 10 s, 2 h 5 min."""
+    """Format a duration for people: 3.2 s, 4 min 10 s, 2 h 5 min."""
     if seconds < 60.0:
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)

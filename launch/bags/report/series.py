@@ -1,6 +1,6 @@
-"""What is kept of a measured quantity over time: per stretch of time, never per message.
+"""Summarize measured quantities per interval of time.
 
-A bag of an hour and one of a day so take the same memory.
+The memory does not depend on the duration of the bag.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-SHORTEST_S, LONGEST_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""Of durations that are told apart; a cell of a `Spread` is 2.3 % wide."""
+MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
+"""Range and resolution of `Spread`; a bin is 2.3 % wide."""
 
 CELLS = 7 * CELLS_PER_DECADE
-LONGEST_STEP_S = 0.5
-"""A state that nobody confirmed for longer is not taken to have lasted."""
+MAX_STATE_AGE_S = 0.5
+"""Maximum time for which a state without a further message counts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The bag's time in equal stretches."""
+    """Divide the time of a bag into equal intervals."""
 
     start_ns: int
     duration_s: float
     count: int
 
     def index(self, at_ns: int) -> int:
-        """The stretch of a moment; moments outside belong to the first or the last one."""
+        """Return the interval of a time; times outside belong to the first or the last one."""
         share = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
         return min(max(int(share * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
-        """The middles (count,) of the stretches, s since the bag began."""
+        """Return the centres (count,) of the intervals, s since the start of the bag."""
         middles = np.arange(self.count, dtype=np.float64) + 0.5
         return np.asarray(middles * (self.duration_s / self.count))
 
 
 class Range:
-    """Least and greatest value of each stretch; NaN where there was none."""
+    """Store minimum and maximum of each interval; NaN without a value."""
 
     def __init__(self, grid: Grid) -> None:
         self.least = np.full(grid.count, np.nan)
@@ -56,23 +56,23 @@ class Range:
             self.most[index] = value
 
     def overall(self) -> tuple[float, float] | None:
-        """Least and greatest of all; None where nothing came."""
+        """Return minimum and maximum of all; None without a value."""
         if np.isnan(self.most).all():
             return None
         return float(np.nanmin(self.least)), float(np.nanmax(self.most))
 
 
 class Spread:
-    """How durations are distributed in each stretch, as counts in cells of equal ratio."""
+    """Store a logarithmic histogram of durations for each interval."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
         self.longest_s = 0.0
 
     def take(self, index: int, duration_s: float) -> None:
-        """Add a duration; below `SHORTEST_S` (or negative) it counts as that."""
+        """Add a duration; below `MIN_DURATION_S` (or negative) it counts as that."""
         self.longest_s = max(self.longest_s, duration_s)
-        cell = CELLS_PER_DECADE * log10(max(duration_s, SHORTEST_S) / SHORTEST_S)
+        cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
 
     @property
@@ -80,29 +80,29 @@ class Spread:
         return int(self.counts.sum())
 
     def quantile_s(self, share: float) -> float | None:
-        """Of all durations together, to 2.3 %; None where there are none."""
+        """Return a quantile of all durations, to 2.3 %; None without a value."""
         found = _quantiles(self.counts.sum(axis=0, keepdims=True), share)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, share: float) -> Floats:
-        """Of each stretch, (count,); NaN where there was nothing."""
+        """Return the quantile of each interval, (count,); NaN without a value."""
         return _quantiles(self.counts, share)
 
 
 def _quantiles(counts: NDArray[np.int32], share: float) -> Floats:
-    """Quantiles (n,) of rows (n, CELLS) of counts."""
+    """Return quantiles (n,) of rows (n, CELLS) of counts."""
     sums = np.cumsum(counts, axis=1)
     wanted = share * sums[:, -1:]
     cell = np.argmax(sums >= np.maximum(wanted, 1), axis=1)
     before = np.take_along_axis(sums - counts, cell[:, None], axis=1)[:, 0]
     inside = np.take_along_axis(counts, cell[:, None], axis=1)[:, 0]
     part = np.clip((wanted[:, 0] - before) / np.maximum(inside, 1), 0.0, 1.0)
-    found = SHORTEST_S * 10.0 ** ((cell + part) / CELLS_PER_DECADE)
+    found = MIN_DURATION_S * 10.0 ** ((cell + part) / CELLS_PER_DECADE)
     return np.where(sums[:, -1] > 0, found, np.nan)
 
 
-class Places:
-    """The newest point of each stretch, (count, 3); NaN where there was none."""
+class PointSeries:
+    """Store the last point of each interval, (count, 3); NaN without a point."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -112,9 +112,9 @@ class Places:
 
 
 class States:
-    """A thing that is in one state at a time: the gravest of each stretch, and how long in each.
+    """Store the gravest state of each interval, and the total time in each state.
 
-    order: the states that are known, from the least to the most important to see.
+    order: the known states, from the least to the most important.
     """
 
     NOTHING = -1
@@ -134,7 +134,7 @@ class States:
             self.seconds[state] = 0.0
         if self.state is not None:
             passed_s = (at_ns - self._since_ns) * 1e-9
-            self.seconds[self.state] += min(max(passed_s, 0.0), LONGEST_STEP_S)
+            self.seconds[self.state] += min(max(passed_s, 0.0), MAX_STATE_AGE_S)
         changed = self.state is not None and self.state != state
         self.changes += changed
         self.state, self._since_ns = state, at_ns
@@ -143,8 +143,8 @@ class States:
 
 
 @dataclass(slots=True)
-class Moments:
-    """Mean, standard deviation and maximum of values that are not kept."""
+class RunningMoments:
+    """Accumulate mean, standard deviation and maximum of values that are not stored."""
 
     count: int = 0
     total: float = 0.0
@@ -159,7 +159,7 @@ class Moments:
             self.most = max(self.most, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """The three, times `scale`; None where there was no value."""
+        """Return the three figures times `scale`; None without a value."""
         if not self.count:
             return None
         mean = self.total / self.count
@@ -169,7 +169,7 @@ class Moments:
 
 @dataclass(slots=True)
 class Events:
-    """What happened, in order, at most `limit` of each kind; all are counted."""
+    """Store events in order, at most `limit` of each kind; count all."""
 
     limit: int = 100
     held: list[tuple[float, str, str]] = field(default_factory=list)

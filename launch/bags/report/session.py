@@ -1,4 +1,4 @@
-"""Reads a bag once, from its beginning to its end, and keeps what the report tells."""
+"""Read a bag once, from start to end, and summarize it for the report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexsheet.launch.bags.report.album import Album
-from flexsheet.launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
+from flexsheet.launch.bags.report.series import (
+    Events,
+    Grid,
+    PointSeries,
+    Range,
+    RunningMoments,
+    Spread,
+    States,
+)
 from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.experiments.stroke import list_events
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -45,7 +53,7 @@ Floats = NDArray[np.float64]
 Progress = Callable[[float, float], None]
 
 STRETCHES, FINE_STRETCHES = 240, 1200
-SHORTEST_STRETCH_S = 0.25
+MIN_INTERVAL_S = 0.25
 STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 NOTES_KEPT = 8
 LIVED_BEFORE_S = 10.0
@@ -79,7 +87,7 @@ class Flow:
 
 
 @dataclass(slots=True)
-class Port:
+class PortTotals:
     """What the readers of a topic said of it; what earlier starts of a node counted is in
     skipped, lost and refused, and taken from them what it had counted before the bag began."""
 
@@ -117,7 +125,7 @@ class Port:
 
 @dataclass(slots=True)
 class HostLoad:
-    """How often a host's launcher called it busy, and the worst that it reported."""
+    """Count how often a host was reported busy, and store the worst report."""
 
     reports: int = 0
     busy: int = 0
@@ -138,9 +146,9 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSaid:
-    """What a node's status messages said."""
+    """Summarize a node's status messages."""
 
-    cpu: Moments = field(default_factory=Moments)
+    cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
     starts: int = 0
     epoch: int | None = None
@@ -202,15 +210,15 @@ class Arm:
 
 
 class Session:
-    """All that is kept of a bag.  `scene`: the last that it holds."""
+    """Hold the summary of a bag. `scene`: the last one."""
 
     def __init__(
         self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
     ) -> None:
         self.info, self.metadata = info, reader.metadata
-        self.plan, self.git = _plan_of(reader), _json_of(reader, "git.json")
+        self.plan, self.git = _read_plan(reader), _read_json(reader, "git.json")
         length_s = max(info.duration_s, 1e-3)
-        stretches = int(np.clip(length_s / SHORTEST_STRETCH_S, 1, STRETCHES))
+        stretches = int(np.clip(length_s / MIN_INTERVAL_S, 1, STRETCHES))
         self.grid = Grid(info.start_ns, length_s, stretches)
         self.fine = Grid(info.start_ns, length_s, FINE_STRETCHES)
         self.clock_id = reader.metadata.get("recording", {}).get("clock_id", "")
@@ -218,7 +226,7 @@ class Session:
         self.scenes: list[str] = []
         self.events = Events()
         self.flows: dict[str, Flow] = {}
-        self.ports: dict[str, Port] = {}
+        self.ports: dict[str, PortTotals] = {}
         self.nodes: dict[str, NodeSaid] = {}
         self.hosts: dict[str, HostStatus] = {}
         self.loads: dict[str, HostLoad] = {}
@@ -227,8 +235,8 @@ class Session:
         self.estop = States(self.fine, ("released", "engaged"))
         self.arms = {side: Arm(self.grid, self.fine) for side in ("left", "right")}
         self.reasons: dict[str, int] = {}
-        self.finger_place, self.true_place = Places(self.fine), Places(self.fine)
-        self.sheet_place = Places(self.fine)
+        self.finger_place, self.true_place = PointSeries(self.fine), PointSeries(self.fine)
+        self.sheet_place = PointSeries(self.fine)
         self.push, self.force = Range(self.grid), Range(self.grid)
         self.body_methods: dict[str, int] = {}
         self.out_of_range = 0
@@ -343,7 +351,7 @@ class Session:
         lived_before = status.uptime_s - seconds > LIVED_BEFORE_S
         for port in status.inputs:
             if port.topic not in self.ports:
-                self.ports[port.topic] = Port(Spread(Grid(0, 1.0, 1)))
+                self.ports[port.topic] = PortTotals(Spread(Grid(0, 1.0, 1)))
             self.ports[port.topic].take(status.node, header.epoch, port, lived_before=lived_before)
 
     def _take_picture(self, message: Frame | StereoPair | TwinEye, seconds: float) -> None:
@@ -401,12 +409,12 @@ class Session:
 
 
 def named(label: str, correction: str) -> str:
-    """A picture's label with the correction, where it does not say so itself."""
+    """Add the correction to the label of an image, unless it contains it."""
     return label if correction in label else ", ".join(filter(None, (label, correction)))
 
 
 def _silent_after_s() -> dict[str, float]:
-    """After how long a topic counts as silent, for those with a rate and one writer."""
+    """Return the silence limit of topics with a rate and one writer."""
     return {
         topic.name: max(SILENT_PERIODS / topic.rate_hz[0], SHORTEST_SILENCE_S)
         for topic in TOPICS.values()
@@ -418,7 +426,7 @@ silent_after_s = _silent_after_s()
 
 
 def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
-    """Read what of a bag can be read, cut or whole; BagError where nothing can be."""
+    """Read a bag as far as possible, cut or whole; BagError if nothing can be read."""
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}
@@ -437,14 +445,14 @@ def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -
     return session
 
 
-def _plan_of(reader: BagReader) -> ResolvedGraph | None:
+def _read_plan(reader: BagReader) -> ResolvedGraph | None:
     try:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except (BagError, ValidationError):
         return None  # a bag of one's own making, or of other code: the page says that it is missing
 
 
-def _json_of(reader: BagReader, name: str) -> dict[str, Any]:
+def _read_json(reader: BagReader, name: str) -> dict[str, Any]:
     try:
         found = json.loads(reader.attachment(name))
     except (BagError, ValueError):

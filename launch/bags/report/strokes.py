@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
-from flexsheet.launch.bags.report.series import Grid, Moments, Range
+from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     edge_row,
@@ -59,7 +59,7 @@ class FingerRun:
     done_ns: int
     end_ns: int
     stroke_s: float | None
-    sums: dict[str, Moments] = field(default_factory=dict)
+    sums: dict[str, RunningMoments] = field(default_factory=dict)
     followed: FollowedFinger = field(default_factory=FollowedFinger)
 
     @property
@@ -84,7 +84,7 @@ class Side:
         self.finger: list[tuple[int, Floats]] = []
         self.edges: tuple[list[tuple[int, Floats]], ...] = ([], [])
 
-    def ripe(
+    def take_complete(
         self,
     ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
         """Tracks, and the times at which everything is known; what is not, stays for later."""
@@ -116,7 +116,7 @@ class SheetErrors:
         self._target_holds = True
         self.distance = {"measured": Range(grid), "true": Range(grid)}
         self.angle = {"measured": Range(grid), "true": Range(grid)}
-        self.contact = {name: Moments() for name in ("d", "theta", "true_d", "true_theta")}
+        self.contact = {name: RunningMoments() for name in ("d", "theta", "true_d", "true_theta")}
         self.runs: list[FingerRun] = []
 
     def take(self, message: Any, source_ns: int) -> None:
@@ -178,19 +178,19 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Work out what is ripe."""
+        """Work out what is take_complete."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
             self.measured, self.true = Side(), Side()
             self._contact, self._following = [], []
             return
         for name, side in (("measured", self.measured), ("true", self.true)):
-            ripe = side.ripe()
-            if ripe is None:
-                # Without edges nothing ever gets ripe.
+            take_complete = side.take_complete()
+            if take_complete is None:
+                # Without edges nothing ever gets take_complete.
                 del side.finger[:-BLOCK]
                 continue
-            finger, edges, times_ns = ripe
+            finger, edges, times_ns = take_complete
             if len(times_ns):
                 if any(run.stroke_s is not None for run in self.runs):
                     found = sheet_errors(scene, finger, edges, times_ns, shape=shape)
@@ -225,8 +225,8 @@ class SheetErrors:
             begin_ns, finish_ns = run.stroke_window_ns
             inside = (times_ns >= begin_ns) & (times_ns <= finish_ns)
             if run.stroke_s is not None and inside.any():
-                run.sums.setdefault(f"{prefix}delta_d", Moments()).take(d[inside])
-                run.sums.setdefault(f"{prefix}delta_theta", Moments()).take(theta[inside])
+                run.sums.setdefault(f"{prefix}delta_d", RunningMoments()).take(d[inside])
+                run.sums.setdefault(f"{prefix}delta_theta", RunningMoments()).take(theta[inside])
 
     def _add_followed(
         self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats

@@ -1,4 +1,4 @@
-"""From a bag to the report's file and numbers."""
+"""Write the report of a bag, and return its numbers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.bags.report.findings import findings_of
-from flexsheet.launch.bags.report.numbers import numbers_of
-from flexsheet.launch.bags.report.page import MARK, page_of
+from flexsheet.launch.bags.report.findings import find_problems
+from flexsheet.launch.bags.report.numbers import compute_numbers
+from flexsheet.launch.bags.report.page import MARK, render_page
 from flexsheet.launch.bags.report.session import Progress, Session, read_session
 from flexsheet.messages.bag import BagError
 from flexsheet.messages.files import DISK_ERRORS, write_error
 
 
 def default_output(bag: Path) -> Path:
-    """Beside the bag, named after it."""
+    """Return the path beside the bag, with its name."""
     return bag.with_suffix(".html")
 
 
@@ -30,7 +30,7 @@ def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]
         _check(output)
     session = read_session(bag, progress)
     if output is not None:
-        page, draft = page_of(session), _draft_of(output)
+        page, draft = render_page(session), _draft_path(output)
         try:
             draft.write_text(page, encoding="utf-8")
             draft.replace(output.resolve())
@@ -38,24 +38,24 @@ def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]
             raise _unwritable(output, error) from error
         finally:
             draft.unlink(missing_ok=True)
-    return result_of(session)
+    return make_result(session)
 
 
-def result_of(session: Session) -> dict[str, Any]:
-    """The numbers, with what was found in them."""
-    numbers = numbers_of(session)
-    return {"findings": [asdict(one) for one in findings_of(numbers)], **numbers}
+def make_result(session: Session) -> dict[str, Any]:
+    """Return the numbers and the findings."""
+    numbers = compute_numbers(session)
+    return {"findings": [asdict(one) for one in find_problems(numbers)], **numbers}
 
 
-def _draft_of(output: Path) -> Path:
-    """Where the page is written before it takes its place: a reader sees the old or the new."""
+def _draft_path(output: Path) -> Path:
+    """Return the temporary path of the page: readers see the old or the new page."""
     place = output.resolve()
     return place.with_name(f".{place.name}.{os.getpid()}.tmp")
 
 
 def _check(output: Path) -> None:
-    """Can the page go there, which is known only after the whole bag has been read?"""
-    draft = _draft_of(output)
+    """Raise BagError if the page cannot be written; checked before the bag is read."""
+    draft = _draft_path(output)
     try:
         draft.touch()
         draft.unlink()

@@ -1,0 +1,182 @@
+"""Write messages to bags, also on a disk that fills up: end the bag, and continue in another."""
+
+from __future__ import annotations
+
+import mimetypes
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import Clock
+from flexsheet.messages.files import free_bytes
+from flexsheet.messages.topics import Delivery, Topic
+from flexsheet.messages.types import Recording
+from flexsheet.nodes.recorder.parameters import RecorderParameters
+
+RETRY_NS = 5_000_000_000
+"""Pause after an error of the disk before the next attempt."""
+
+
+class BagRecording:
+    """Write messages to a bag while recording is requested.
+
+    A bag ends while there is still room for its index.  When twice that room is free again, another
+    bag begins with the last messages of all latched topics.  Errors of the disk are passed to
+    `on_error` and never raised while messages are written.
+
+    note: state of the recording, one line.  lost: messages that no bag holds since the last bag.
+    """
+
+    def __init__(
+        self,
+        parameters: RecorderParameters,
+        clock: Clock,
+        *,
+        plan_hash: str,
+        compress: bool,
+        on_error: Callable[[Exception], None],
+    ) -> None:
+        self._parameters, self._clock = parameters, clock
+        self._plan_hash, self._compress, self._on_error = plan_hash, compress, on_error
+        self._bag: BagWriter | None = None
+        self._path = Path()
+        self._latched: dict[tuple[str, str], tuple[Topic, Any, Header]] = {}
+        self._retry_ns = 0
+        self.requested = False
+        self.lost = 0
+        self.note = "waits for a request to record"
+
+    @property
+    def path(self) -> Path | None:
+        """The bag that is being written; None: none."""
+        return None if self._bag is None else self._bag.path
+
+    def start(self) -> None:
+        """Begin a bag named after the present time; BagError, OSError."""
+        self.requested, self.lost = True, 0
+        # The time of day is used for the name of the bag and for people only.
+        now = datetime.now(UTC)
+        self._path = Path(now.astimezone().strftime(str(self._parameters.bag)))
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BagError(f"{self._path.parent}: cannot be made: {error.strerror}") from error
+        self._begin_bag()
+        self.check_disk()
+
+    def set_requested(self, requested: bool) -> None:
+        """Begin a bag, or end the present one; an error of the disk is passed to `on_error`."""
+        try:
+            if requested and not self.requested:
+                self.start()
+            elif not requested:
+                self.requested, bag, self._bag = False, self._bag, None
+                if bag is not None:
+                    bag.close()
+                    self.note = f"recorded {bag.messages} messages in {bag.path}"
+        except (BagError, OSError) as error:
+            self._end_bag(error)
+
+    def check_disk(self) -> None:
+        """End the bag while there is room for its index, or begin another if there is room."""
+        if not self.requested:
+            return
+        free, keep = free_bytes(self._path.parent), self._parameters.keep_free_bytes
+        if self._bag is not None and free < keep:
+            self._end_bag(OSError(f"{free >> 20} MiB are free at {self._path.parent}"))
+        elif self._bag is None and free >= 2 * keep and self._clock.now_ns() >= self._retry_ns:
+            lost, self.lost = self.lost, 0
+            try:
+                self._begin_bag(lost_messages=str(lost))
+            except (BagError, OSError) as error:
+                self.lost += lost
+                self._end_bag(error)
+
+    def write(self, topic: Topic, frames: Any, header: Header) -> bool:
+        """Write a message, and return whether it is lost: requested, but in no bag.
+
+        The last message of each writer of a latched topic is stored for the next bag.  Requests to
+        record are not: they hold for one bag.
+        """
+        is_request = self._parameters.start_paused and topic.message is Recording
+        if topic.delivery is Delivery.LATCHED and not is_request:
+            self._latched[topic.name, header.writer] = (topic, frames, header)
+        if self._bag is not None:
+            try:
+                self._bag.write_frames(topic, frames, header, self._clock.now_ns())
+            except (BagError, OSError) as error:
+                self._end_bag(error)
+            else:
+                self.note = f"{self._bag.messages} messages in {self._bag.path}"
+                return False
+        self.lost += self.requested
+        return self.requested
+
+    def close(self) -> None:
+        """Close the bag; BagError if the disk did not take everything."""
+        if self._bag is not None:
+            self._bag.close()
+
+    def _begin_bag(self, **more: str) -> None:
+        recording = {
+            "clock_id": self._clock.id,
+            "started_ns": str(self._clock.now_ns()),
+            "started": datetime.now(UTC).isoformat(),
+            "plan_hash": self._plan_hash,
+            **more,
+        }
+        self._bag = bag = open_bag(
+            self._path, recording, compress=self._compress, attach=self._parameters.attach
+        )
+        for topic, frames, header in self._latched.values():
+            bag.write_frames(topic, frames, header, self._clock.now_ns())
+        bag.flush()
+        self.note = f"records to {bag.path}"
+
+    def _end_bag(self, error: Exception) -> None:
+        """Close the bag as it is, and report why it ends."""
+        bag, self._bag = self._bag, None
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+        self.note = f"NOT RECORDING: {error}"
+        self._on_error(error)
+        if bag is not None:
+            # The error of the disk is reported already, and a cut bag can be read.
+            with suppress(BagError):
+                bag.close()
+            if bag.messages == 0:
+                bag.path.unlink(missing_ok=True)
+
+
+def free_path(path: Path) -> Path:
+    """Return `path`, or the first of its names with -2, -3, ... that does not exist.
+
+    A restarted recorder therefore never overwrites a bag.
+    """
+    if not path.exists():
+        return path
+    for number in count(2):
+        candidate = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        if not candidate.exists():
+            return candidate
+    raise AssertionError("count() does not end")
+
+
+def open_bag(
+    path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
+) -> BagWriter:
+    """Open a new bag at a free path, with the attached files; BagError, OSError."""
+    bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
+    try:
+        for file in attach:
+            media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+            bag.add_attachment(file.name, file.read_bytes(), media_type)
+    except BaseException:
+        with suppress(BagError):
+            bag.close()
+        raise
+    return bag
