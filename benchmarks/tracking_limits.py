@@ -52,7 +52,7 @@ from flexsheet.nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from flexsheet.nodes.twin.finger import smoothstep
+from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.gestures import circle, hover, reach
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 
@@ -220,8 +220,8 @@ def beyond_the_volume(scene: Scene, beyond_mm: float, repetition: int) -> Stage:
     leaves_s, returns_s = BEFORE_S + MOVE_S, BEFORE_S + MOVE_S + DURING_S
 
     def motion(time_s: float) -> Floats:
-        out, _ = smoothstep(float(np.clip((time_s - BEFORE_S) / MOVE_S, 0.0, 1.0)))
-        back, _ = smoothstep(float(np.clip((time_s - returns_s) / MOVE_S, 0.0, 1.0)))
+        out, _ = minimum_jerk_profile(float(np.clip((time_s - BEFORE_S) / MOVE_S, 0.0, 1.0)))
+        back, _ = minimum_jerk_profile(float(np.clip((time_s - returns_s) / MOVE_S, 0.0, 1.0)))
         return np.asarray(still(1.0 + time_s) + np.array([way_m * (out - back), 0.0, 0.0]))
 
     frames = [Frame(t, clean()) for t in times(scene, returns_s + MOVE_S + AFTER_S)]

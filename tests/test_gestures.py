@@ -15,7 +15,12 @@ from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, PathJoin
-from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError, smoothstep, validate_path
+from flexsheet.nodes.twin.finger import (
+    FingerMotion,
+    FingerPathError,
+    minimum_jerk_profile,
+    validate_path,
+)
 from flexsheet.nodes.twin.gestures import (
     GESTURES,
     SAMPLE_S,
@@ -215,7 +220,7 @@ def test_a_reach_of_least_jerk_comes_out_as_it_was_meant(way_m: float, duration_
     times, places = minimum_jerk([0.0, 0.0, 0.0], [(duration_s, [way_m, 0.0, 0.0])])
     motion = validate_path(times, places, "spline")
     between = np.linspace(0.0, duration_s, 500)
-    share, rate = smoothstep(between / duration_s)
+    share, rate = minimum_jerk_profile(between / duration_s)
     found = [motion.at(time) for time in between]
     np.testing.assert_allclose([at[0] for at, _ in found], way_m * share, atol=1e-5)
     peak = 1.875 * way_m / duration_s
@@ -232,7 +237,9 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
     for joined_by in ("rounded_lines", "spline"):
         join: PathJoin = joined_by
         motion = validate_path(times, places, join)
-        errors = [motion.at(time)[0][0] - 0.05 * smoothstep(time / 0.5)[0] for time in times]
+        errors = [
+            motion.at(time)[0][0] - 0.05 * minimum_jerk_profile(time / 0.5)[0] for time in times
+        ]
         missed.append(np.abs(errors).max())
     assert missed[0] > 2.5e-4
     assert missed[1] < 1e-6

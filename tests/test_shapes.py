@@ -267,9 +267,9 @@ def test_one_is_as_many(shape: Shape) -> None:
 @solids
 def test_bad_queries_are_refused_and_far_ones_answered(shape: Shape) -> None:
     for bad in ([np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [2e6, 0.0, 0.0]):
-        with pytest.raises(ValueError, match="NaN, infinity or places beyond"):
+        with pytest.raises(ValueError, match="NaN, infinity or positions beyond"):
             shape.closest(bad)
-        with pytest.raises(ValueError, match="NaN, infinity or places beyond"):
+        with pytest.raises(ValueError, match="NaN, infinity or positions beyond"):
             shape.signed_distance(bad)
     for wrong in (1.0, [0.0, 0.0], np.zeros((2, 2, 3))):
         with pytest.raises(ValueError, match="wanted"):

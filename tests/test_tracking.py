@@ -250,7 +250,7 @@ def test_a_swing_is_met_between_the_points() -> None:
 
 
 def test_a_path_of_one_point_is_refused() -> None:
-    with pytest.raises(ValueError, match="two are needed"):
+    with pytest.raises(ValueError, match="two or more are needed"):
         interpolate_path(np.zeros((1, 3)), 0.01, 0.0)
 
 

@@ -123,7 +123,7 @@ def fit_sheet_model(
             used = off <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(off)))
             if used.sum() < 2 * size:
                 raise SheetModelFitError(
-                    f"{int((~used).sum())} of {len(pushes)} rows contradict the others: no law "
+                    f"{int((~used).sum())} of {len(pushes)} rows contradict the others: no model "
                     "fits them; check units and signs"
                 )
     freedom = max(len(solved.fun) - size, 1)
@@ -131,7 +131,7 @@ def fit_sheet_model(
     information = solved.jac.T @ solved.jac
     if np.linalg.cond(information) > 1e14:
         raise SheetModelFitError(
-            "the rows leave a number open: push at several stretches and depths"
+            "the rows do not determine all parameters: push at several stretches and depths"
         )
     deviations = np.sqrt(np.diag(np.linalg.inv(information)) * spread)
     law = model_at(solved.x)
@@ -175,9 +175,11 @@ def _predict(
     for number, push in enumerate(pushes):
         key = (push.edge_distance_m, push.position_m, push.finger_radius_m)
         groups.setdefault(key, []).append(number)
-    for (distance, place, radius), numbers in groups.items():
+    for (distance, position, radius), numbers in groups.items():
         depths = np.array([pushes[number].depth_m for number in numbers])
-        pressed = law.evaluate(distance / width_m, depths, position_m=place, finger_radius_m=radius)
+        pressed = law.evaluate(
+            distance / width_m, depths, position_m=position, finger_radius_m=radius
+        )
         forces[numbers], edges[numbers] = pressed.force_n, pressed.edge_force_n
     return forces, edges
 
@@ -237,12 +239,12 @@ def tabulate_pushes(
     ]
     if not cells or missing:
         what = f"no rows at stretch, x, y {missing[0]}" if missing else "no row is left"
-        raise SheetModelFitError(f"{what}: a table needs every combination of stretch and place")
+        raise SheetModelFitError(f"{what}: a table needs every combination of stretch and position")
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
     if not shallowest < deepest:
         raise SheetModelFitError(
-            "a table needs depths that all stretches and places have in common"
+            "a table needs depths that all stretches and positions have in common"
         )
     least = min(len({depth for depth, _ in rows}) for rows in cells.values())
     depths = np.geomspace(shallowest, deepest, max(2, min(least, 12)))

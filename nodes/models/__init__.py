@@ -1,1 +1,1 @@
-"""Computations that several nodes share: arrays in, arrays out; no sockets, no clock, no files."""
+"""Compute what several nodes need: arrays in, arrays out; no sockets, no clock, no files."""

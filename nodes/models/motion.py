@@ -134,7 +134,7 @@ class EdgeBound:
     speed_m_per_s: float
     reach_m: float
 
-    def share(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
+    def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
         """Return the factor (0..1) on linear and angular speed that keeps the edges within the
         limit."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
@@ -147,37 +147,43 @@ def follow_sheet(
     """Return the sheet `step_s` (> 0) later, moved towards `target`, which holds at the step's
     end."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
-    turned = vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T)
+    rotation = vector_from_rotation(
+        target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
+    )
     speed, turn_speed = (
         _length(
             desired_velocity(
-                error, velocity, max_speed=most, max_acceleration=sharpest, step_s=step_s
+                error,
+                velocity,
+                max_speed=max_speed,
+                max_acceleration=max_acceleration,
+                step_s=step_s,
             )
         )
-        for error, velocity, most, sharpest in (
+        for error, velocity, max_speed, max_acceleration in (
             (away, target.twist_world[:3], bounds.speed_m_per_s, bounds.acceleration_m_per_s2),
             (
-                turned,
+                rotation,
                 target.twist_world[3:],
                 bounds.turn_rad_per_s,
                 bounds.turn_acceleration_rad_per_s2,
             ),
         )
     )
-    share = edges.share(speed, turn_speed)
+    scale = edges.speed_scale(speed, turn_speed)
     shift, linear = follow(
         away,
         now.twist_world[:3],
         target.twist_world[:3],
-        max_speed=bounds.speed_m_per_s if share == 1.0 else share * speed,
+        max_speed=bounds.speed_m_per_s if scale == 1.0 else scale * speed,
         max_acceleration=bounds.acceleration_m_per_s2,
         step_s=step_s,
     )
     turn, angular = follow(
-        turned,
+        rotation,
         now.twist_world[3:],
         target.twist_world[3:],
-        max_speed=bounds.turn_rad_per_s if share == 1.0 else share * turn_speed,
+        max_speed=bounds.turn_rad_per_s if scale == 1.0 else scale * turn_speed,
         max_acceleration=bounds.turn_acceleration_rad_per_s2,
         step_s=step_s,
     )

@@ -164,5 +164,5 @@ def _desired_velocities(
         max_acceleration=bounds.stretch_acceleration_per_s2,
         step_s=step_s,
     )
-    scale = edges.share(float(np.linalg.norm(linear)), float(np.linalg.norm(angular)))
+    scale = edges.speed_scale(float(np.linalg.norm(linear)), float(np.linalg.norm(angular)))
     return np.concatenate([scale * linear, scale * angular, stretch_rate])

@@ -1,9 +1,9 @@
-"""Where each seen point of the object ought to be: reads the places that it is painted with.
+"""Map the image error over the object, by position codes that are drawn on it.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y` every point of the drawn object has the
-colour of the x or y at which the eye ought to see it on the imaginary screen: red and green the
-cosine and sine of a phase, blue the same over the whole screen, coarsely. What the eye's picture
-shows elsewhere is the error of the image, at each point and not on its outline only.
+In the patterns `coordinate_ramp_x` and `coordinate_ramp_y` every point of the drawn object has a
+colour that encodes the x or y at which the eye should see it on the imaginary screen. Red and green
+are cosine and sine of a phase; blue encodes the coarse position. The difference between decoded and
+seen position is the image error at each point.
 """
 
 from __future__ import annotations
@@ -19,39 +19,42 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 PERIOD_M, RANGE_M = 0.02, 0.24
-"""Of the phase, and of the coarse place; as `object.frag.glsl` paints them."""
+"""Period of the phase, and range of the coarse position, as in `object.frag.glsl`."""
 
 PURE = 0.06
-"""Red and green lie on a circle; farther off it than this share of its radius they are blended."""
+"""Red and green lie on a circle; a pixel that is farther off, relative to the radius, is blended.
+"""
 
 AGREES_M = 0.002
-"""Blue and the phase tell the same place; farther apart than this they are blended.  One step of
-blue is 1.2 mm."""
+"""Maximum difference between the positions by blue and by the phase; beyond it a pixel is blended.
+One step of blue is 1.2 mm."""
 
 RIM_PX = 3
-"""Pixels of the outline that are left out: a bit of black in them would shift their place."""
+"""Pixels of the outline that are left out, because black in them would shift their position."""
 
 COARSE_LIGHT = 0.1
-"""Blue of less is black: the least that is painted is twice that."""
+"""Blue below this is black: the least that is drawn is twice that."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorMap:
-    """errors_m: (rows, columns, 2), where a point is seen less where it ought to be, x right, y up;
-    not a number where nothing is seen.
+    """Hold the error of each seen point.
+
+    errors_m: (rows, columns, 2), seen minus expected position, x right, y up; NaN where nothing is
+    seen.
     """
 
     errors_m: Floats
 
     @property
     def sizes_m(self) -> Floats:
-        """Lengths (n,) of the errors of all points that are seen."""
+        """Return the lengths (n,) of the errors of all seen points."""
         sizes = np.linalg.norm(self.errors_m, axis=2)
         return np.asarray(sizes[np.isfinite(sizes)])
 
 
 def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
-    """Compare the eye's pictures (rows, columns, 3) of both patterns with where things are."""
+    """Compare the eye's images (rows, columns, 3) of both patterns with the expected positions."""
     seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     seen = cv2.erode(seen.astype(np.uint8), kernel, borderValue=0) > 0
@@ -71,7 +74,7 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """The painted place (rows, columns), m, and whether the colour is one that is painted."""
+    """Return the decoded position (rows, columns), m, and whether the colour is a valid code."""
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

@@ -313,7 +313,7 @@ class FingerMotion:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
         s = max(time_s, 0.0) / self.ease_s
-        share, _ = smoothstep(s)
+        share, _ = minimum_jerk_profile(s)
         before, after = self.amplitudes_before_m, self.amplitudes_m
         amplitudes = (
             before[0] + share * (after[0] - before[0]),
@@ -325,7 +325,7 @@ class FingerMotion:
     def at(self, time_s: float) -> FingerState:
         """Return the true fingertip `time_s` after the path was given."""
         position, velocity, amplitudes = self._steady(time_s)
-        _, share_rate = smoothstep(np.clip(time_s / self.ease_s, 0.0, 1.0))
+        _, share_rate = minimum_jerk_profile(np.clip(time_s / self.ease_s, 0.0, 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
         for (noise, deviation), amplitude, before, after in zip(
             noises, amplitudes, self.amplitudes_before_m, self.amplitudes_m, strict=True
@@ -343,7 +343,7 @@ class FingerMotion:
         )
 
 
-def smoothstep(s: Real) -> tuple[Real, Real]:
+def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
     """Return the minimum-jerk rise from 0 to 1 over s = 0..1 and its slope (Flash and Hogan
     1985)."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
@@ -358,7 +358,7 @@ def _reach(
     The result is position (m) and velocity (m/s).  The start's velocity decays by the quintic
     Hermite function s (1-s)^3 (1+3s), so that both are continuous.
     """
-    share, slope = smoothstep(s)
+    share, slope = minimum_jerk_profile(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)
     carried_slope = (1.0 - s) ** 2 * (1.0 + 2.0 * s - 15.0 * s * s)
     way = path.points[0] - start

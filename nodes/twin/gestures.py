@@ -35,12 +35,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
-from flexsheet.nodes.twin.finger import smoothstep
+from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]
-"""Times (n,) s from zero, and what a motion does at them: places (n, 3) m, or a way (n,) m."""
+"""Times (n,) s from zero, and surface positions (n, 3) m or distances (n,) m at them."""
 
 SAMPLE_S = 0.004
 WANDER_M = 0.0005
@@ -68,23 +68,24 @@ class Gesture(Protocol):
 
 
 def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
-    """Reaches of least jerk from `start` through places (3,), each given with its duration (s).
+    """Return reaches of minimum jerk from `start` through positions (3,), each with a duration (s).
 
-    A move to where the finger is, is a rest.
+    A move to the present position is a rest.
     """
     corners = np.array([start, *(place for _, place in moves)])
     ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
     times = _sampled_times(float(ends[-1]))
     move = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(moves) - 1)
     s = (times - ends[move]) / (ends[move + 1] - ends[move])
-    share, _ = smoothstep(s[:, None])
+    share, _ = minimum_jerk_profile(s[:, None])
     return times, corners[move] + share * (corners[move + 1] - corners[move])
 
 
 def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
-    """The way (n,) m of a finger that changes its speed from rest: (duration s, speed m/s at end).
+    """Return the distance (n,) m of a finger whose speed changes in phases (duration s, final speed
+    m/s).
 
-    Speed goes over as a reach's position does, so acceleration is continuous.
+    The speed changes by the minimum-jerk profile, so that the acceleration is continuous.
     """
     durations = np.array([duration for duration, _ in phases])
     speeds = np.array([0.0, *(speed for _, speed in phases)])
@@ -103,7 +104,7 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """A motion on the surface with its approach from above, a short rest, and the lift after."""
+    """Add an approach from above, a short rest and a lift to a motion on the surface."""
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -118,13 +119,13 @@ def touched(motion: Sampled) -> Sampled:
 
 
 def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
-    """The path of a motion that touches: the hand is held out, and steadied by the object."""
+    """Return the path of a motion in contact, with the tremor of a hand that is held out."""
     times, places = touched(motion)
     return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Touch lightly and hold still for 5 s.  Nothing of it is left to chance."""
+    """Touch lightly and hold still for 5 s; nothing is random."""
     touch = (0.0, 0.0, -TOUCH_M)
     return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
 
@@ -137,7 +138,7 @@ def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed: int) -> FingerPath:
-    """Ten reaches, by turns to a place on the surface and to one in the air above it."""
+    """Make ten reaches, alternating between the surface and the air above it."""
     generator = np.random.default_rng(seed)
     along_m, arc_m = touchable(scene)
     half = 0.5 * np.array([along_m, arc_m])
@@ -157,12 +158,12 @@ def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed:
 
 
 def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Unhurried reaches to and from the object, with rests."""
+    """Reach to and from the object without hurry, with rests."""
     return _reaches(scene, "reach", REACH_PEAK_M_PER_S, 0.4, seed)
 
 
 def reach_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Hurried reaches to and from the object, with hardly a rest."""
+    """Reach to and from the object in a hurry, with hardly a rest."""
     return _reaches(scene, "reach-fast", 3.0 * REACH_PEAK_M_PER_S, 0.1, seed)
 
 
@@ -176,14 +177,14 @@ def _taps(
     lift_m: float,
     seed: int,
 ) -> FingerPath:
-    """Taps on about the same place; intervals vary by 5 %, places by 2 mm.
+    """Tap at about the same position; intervals vary by 5 %, positions by 2 mm.
 
     A tap is a reach from `lift_m` above the surface to PRESS_M below it, a rest there, and a reach
-    back.  The finger does not brake before it touches: it is below the surface for `contact_s`.
+    back. The finger does not brake before contact: it is below the surface for `contact_s`.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
-    touch = float(np.interp(lift_m / (lift_m + PRESS_M), smoothstep(grid)[0], grid))
+    touch = float(np.interp(lift_m / (lift_m + PRESS_M), minimum_jerk_profile(grid)[0], grid))
     reach_s = 0.5 * (every_s - contact_s) / touch
     rest_s = every_s - 2.0 * reach_s
     start = (0.0, 0.0, lift_m)
@@ -198,25 +199,25 @@ def _taps(
 
 
 def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Three taps a second, each with 120 ms of contact."""
+    """Tap three times a second, each with 120 ms of contact."""
     return _taps(scene, "tap", count=15, every_s=0.333, contact_s=0.12, lift_m=0.012, seed=seed)
 
 
 def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Taps as fast as people can, 5.4 a second, each with 85 ms of contact."""
+    """Tap as fast as people can, 5.4 times a second, each with 85 ms of contact."""
     return _taps(
         scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
     )
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """End (m) of a stroke around the surface, half its way, and a speed (m/s) for it."""
+    """Return the half length (m) of a stroke around the surface, and its speed (m/s)."""
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
 
 def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Strokes around the surface that stop suddenly, half way and at the end; three each way."""
+    """Stroke around the surface; stop suddenly, half way and at the end, three times each way."""
     half, speed = _arc_run(scene)
     start_s, lag_s = 0.2, np.random.default_rng(seed).uniform(0.3, 0.6, 12)
     even_s = half / speed - 0.5 * (start_s + BRAKE_S)
@@ -229,7 +230,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Strokes to and fro that turn around suddenly, at moments that cannot be foreseen."""
+    """Stroke back and forth around the surface; reverse suddenly at unpredictable times."""
     half, speed = _arc_run(scene)
     generator = np.random.default_rng(seed)
     turn_s = 2.0 * BRAKE_S
@@ -247,9 +248,9 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Strokes to and fro around the surface while the finger pushes and eases, 0.7 times a second.
+    """Stroke around the surface while the depth oscillates 0.7 times a second.
 
-    The deepest push is a tenth of the working range's.
+    The maximum depth is a tenth of the working range's.
     """
     half, speed = _arc_run(scene)
     stroke_s = PEAK_OF_MEAN * 2.0 * half / speed
@@ -263,19 +264,21 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """The angle (n,) rad of so many turns, begun and ended at rest over a quarter of a turn."""
+    """Return the angle (n,) rad of some rounds, with start and end at rest over a quarter of a
+    round.
+    """
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
     return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
 
 
 def _drawing_m(scene: Scene) -> float:
-    """Radius (m) of a figure that is drawn on the surface."""
+    """Return the radius (m) of a figure that is drawn on the surface."""
     return min(0.02, *(0.5 * size for size in touchable(scene)))
 
 
 def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Four circles on the surface, at the speed that people explore one with."""
+    """Draw four circles on the surface, at the speed at which people explore one."""
     radius = _drawing_m(scene)
     times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
     places = np.stack(
@@ -285,7 +288,7 @@ def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Three figures of eight on the surface, slower in their bends."""
+    """Draw three figures of eight on the surface, slower in their bends."""
     radius = _drawing_m(scene)
     # Its length is 6.1 radii, by the integral of its speed below.
     times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)
@@ -297,7 +300,7 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _pressing(arcs: Floats, depth_m: float) -> Floats:
-    """Places (n, 3) on arcs (n,) around the surface's middle, `depth_m` below it."""
+    """Return positions (n, 3) on arcs (n,) around the surface's middle, `depth_m` below it."""
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
 
 
@@ -314,4 +317,4 @@ GESTURES: dict[str, Gesture] = {
     "circle": circle,
     "eight": eight,
 }
-"""By the name of their path."""
+"""Gestures by the name of their path."""

@@ -1,14 +1,16 @@
-"""The true sheet: a finite-element membrane that is clamped at two edges and pushed by a finger.
+"""Solve the true sheet: a finite-element membrane, clamped at two edges and pushed by a finger.
 
-Incompressible neo-Hookean rubber in plane stress, W = mu/2 (I1 - 3) with mu = E/3.  A membrane has
-no bending stiffness and would buckle into ever finer wrinkles; where the taut law would press, the
-energy is therefore relaxed to that of a tension field (Pipkin, IMA J. Appl. Math. 36, 1986): along
-the wrinkles uniaxial, across them free, and nothing where the sheet is slack.  The relaxed energy
-is convex in the strain, so that Newton's method with a line search comes down to its least.
+The material is incompressible neo-Hookean rubber in plane stress, W = mu/2 (I1 - 3) with mu = E/3.
+A membrane has no bending stiffness and would buckle into ever finer wrinkles. Where the taut law
+would give compression, the energy is therefore that of a tension field (Pipkin, IMA J. Appl. Math.
+36, 1986): uniaxial along the wrinkles, free across them, and zero where the sheet is slack. The
+relaxed energy is convex in the strain, so that Newton's method with a line search finds its
+minimum.
 
-Bilinear quadrilaterals with 2x2 Gauss points; the mesh is finer around the finger.  The fingertip
-is a rigid sphere that is pushed in along the sheet's normal, in steps; stiff penalties keep the
-sheet out of it, and what it has touched sticks to it, as rubber does to skin.
+The elements are bilinear quadrilaterals with 2x2 Gauss points; the mesh is finer around the finger.
+The fingertip is a rigid sphere that is pushed in along the sheet's normal, in steps. Stiff
+penalties keep the sheet out of it, and nodes that it has touched stick to it, as rubber does to
+skin.
 """
 
 from __future__ import annotations
@@ -20,30 +22,28 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from flexsheet.messages.errors import FlexsheetError
-
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 CELLS = 32
 MIN_CELL_FRACTION = 0.008
-"""Cell under the finger over the sheet's side: 1.9 mm of 240."""
+"""Cell size under the finger over the sheet's side: 1.9 mm of 240."""
 
 SLACK_TENSION = 2e-4
-"""Isotropic tension, in shear moduli, that keeps slack and wrinkled places from floating."""
+"""Isotropic tension, in shear moduli, that makes slack and wrinkled regions determinate."""
 
 CONTACT_PA_PER_M = 1e10
 """Pressure of the finger per depth of penetration: 0.01 mm under 10 N on 1 cm2."""
 
 MAX_STEP_RADII = 0.7
-"""Advance of the finger per step, in its radii: a longer one could jump through the sheet."""
+"""Maximum advance of the finger per step, in its radii; a longer one could pass the sheet."""
 
 MAX_ITERATIONS = 80
 
 
-class NotConvergedError(FlexsheetError, RuntimeError):
-    """The membrane's equilibrium was not found; the message gives the residual."""
+class NotConvergedError(RuntimeError):
+    """Raised when the membrane's equilibrium is not found; the message gives the residual."""
 
     code = "membrane"
     remedy = "Reduce the push: it is beyond the simulated membrane's range."
@@ -51,7 +51,7 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """width_m between the clamps when slack, height_m along them."""
+    """Hold the sheet: width_m between the clamps when slack, height_m along them."""
 
     width_m: float
     height_m: float
@@ -61,10 +61,13 @@ class Rubber:
 
 @dataclass(frozen=True, slots=True)
 class DeformedSheet:
-    """rest_m: (rows, columns, 2) from the left bottom corner.  positions: (rows, columns, 3) world.
+    """Hold the equilibrium of the sheet.
 
-    finger_force_n: (3,) of the sheet on the finger.  left_force_n, right_force_n: (3,) of the sheet
-    on the clamps.  iterations: Newton steps taken in all.
+    rest_m: (rows, columns, 2) from the left bottom corner.
+    positions: (rows, columns, 3) world.
+    finger_force_n: (3,) of the sheet on the finger.
+    left_force_n, right_force_n: (3,) of the sheet on the clamps.
+    iterations: total number of Newton steps.
     """
 
     rest_m: Floats
@@ -75,7 +78,7 @@ class DeformedSheet:
     iterations: int
 
     def triangles(self) -> Indices:
-        """(triangles, 3) indices into the flattened positions, counter-clockwise for the user."""
+        """Return (triangles, 3) indices of the flattened positions, facing the user."""
         rows, columns = self.positions.shape[:2]
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         right, above = corner + 1, corner + columns
@@ -88,7 +91,9 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """(cells + 1,) coordinates from 0 to `length_m`, finest at `focus_m`; uniform for None."""
+    """Return (cells + 1,) coordinates from 0 to `length_m`, finest at `focus_m`, or uniform for
+    None.
+    """
     if focus_m is None:
         return np.linspace(0.0, length_m, cells + 1)
     samples = np.linspace(0.0, length_m, 4001)
@@ -108,7 +113,7 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
 
 
 class _Mesh:
-    """The assembled form of one rectangular mesh."""
+    """Assemble forces and stiffness of one rectangular mesh."""
 
     def __init__(self, rubber: Rubber, x: Floats, y: Floats, slack_tension: float) -> None:
         self.slack_tension = slack_tension
@@ -153,7 +158,7 @@ class _Mesh:
         self._unique, self._size = unique, size
 
     def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
-        """F (elements, points, 3, 2) and C as (..., [C11, C22, C12]) at the Gauss points."""
+        """Return F (elements, points, 3, 2) and C (..., [C11, C22, C12]) at the Gauss points."""
         at_nodes = positions[self.elements].transpose(0, 2, 1)[:, None]
         f = at_nodes @ self.gradient
         a, b = f[..., 0], f[..., 1]
@@ -167,7 +172,7 @@ class _Mesh:
         )
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Gradient of the energy (nodes * 3,), and the element stiffness (elements, 12, 12)."""
+        """Return the energy's gradient (nodes * 3,) and element stiffness (elements, 12, 12)."""
         f, c = self.deformation(positions)
         stress, tangent = relaxed_stress(c, self.shear_modulus, self.slack_tension)
         g, weight = self.gradient, self.weight
@@ -196,7 +201,9 @@ class _Mesh:
         return total, blocks.reshape(elements, 12, 12)
 
     def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
-        """The sparse stiffness of the free coordinates; contact: (nodes, 3, 3) on the diagonal."""
+        """Return the sparse stiffness of the free coordinates; contact: (nodes, 3, 3) diagonal
+        blocks.
+        """
         values = np.bincount(self._slot, stiffness.ravel()[self._kept], minlength=len(self._unique))
         for node in np.nonzero(contact.any(axis=(1, 2)))[0]:
             dofs = self.number[3 * node : 3 * node + 3]
@@ -207,7 +214,7 @@ class _Mesh:
 
 
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Larger and smaller eigenvalue (...,) of C, and the larger one's unit vector (..., 2)."""
+    """Return eigenvalues (...,) of C, larger first, and the first's unit vector (..., 2)."""
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
     angle = 0.5 * np.arctan2(c[..., 2], half)
@@ -215,7 +222,7 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
-    """Energy per rest volume (...,) of C (..., 3) = [C11, C22, C12]: taut, wrinkled or slack."""
+    """Return the energy per rest volume (...,) of C (..., 3) = [C11, C22, C12]."""
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
     taut = small > stretched**-0.5
@@ -229,9 +236,10 @@ def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK
 def relaxed_stress(
     c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION
 ) -> tuple[Floats, Floats]:
-    """Second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent (..., 3, 3).
+    """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent (..., 3,
+    3).
 
-    The tangent takes the strain [E11, E22, 2 E12].  Derivatives of `relaxed_energy`.
+    Both are derivatives of `relaxed_energy`; the tangent is over the strain [E11, E22, 2 E12].
     """
     large, small, along = _eigen(c)
     taut = small > np.maximum(large, 1.0) ** -0.5
@@ -268,9 +276,9 @@ def relaxed_stress(
 
 
 class _Finger:
-    """A rigid sphere: nodes are kept out by a penalty on their depth, and stick once they touched.
+    """Keep nodes out of a rigid sphere by a penalty; nodes that it has touched stick to it.
 
-    stuck: (nodes,) which nodes stick; each is held at its place in `anchor` (nodes, 3).
+    stuck: (nodes,) which nodes stick, each at its position in `anchor` (nodes, 3).
     """
 
     def __init__(
@@ -287,7 +295,7 @@ class _Finger:
         return np.where(self._stuck, 0.0, np.maximum(self._radius - distance, 0.0)), outward
 
     def touching(self, positions: Floats) -> Bools:
-        """(nodes,) what sticks now or is pressed."""
+        """Return which nodes (nodes,) stick or are pressed."""
         return self._stuck | (self._depth(positions)[0] > 0.0)
 
     def energy(self, positions: Floats) -> float:
@@ -296,7 +304,7 @@ class _Finger:
         return float(0.5 * np.sum(self._stiffness * np.where(self._stuck, away, depth**2)))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Gradient (nodes, 3), and its derivative (nodes, 3, 3) less the part that could sink."""
+        """Return the gradient (nodes, 3), and the definite part of its derivative (nodes, 3, 3)."""
         depth, outward = self._depth(positions)
         stiff = np.where(depth > 0.0, self._stiffness, 0.0)
         held = np.where(self._stuck, self._stiffness, 0.0)
@@ -315,13 +323,16 @@ def solve(
     cells: int = CELLS,
     slack_tension: float = SLACK_TENSION,
 ) -> DeformedSheet:
-    """Equilibrium of the sheet between its edges, pushed by a fingertip from the user's side.
+    """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
-    world_from_..._edge: (4, 4), origin in the clamped edge's middle, y along it.  finger_tip: the
-    foremost point (3,) of the sphere, whose centre is `finger_radius_m` towards the user; None, or
-    a tip before the sheet or beside it, pushes nothing.  slack_tension: in shear moduli; with less
-    of it a sheet that hangs slack is not found, but one that is just not taut answers to small
-    pushes more truly.  NotConvergedError if no equilibrium was found.
+    world_from_..._edge: (4, 4), origin in the middle of the clamped edge, y along it.
+    finger_tip: the point (3,) of the sphere that is farthest from the user; its centre is
+    `finger_radius_m` towards the user. With None, or a tip before or beside the sheet, there is no
+    contact.
+    slack_tension: in shear moduli. A smaller one is more accurate for small pushes of a sheet that
+    is barely taut, but the equilibrium of a slack sheet is then not found.
+
+    Raises NotConvergedError if no equilibrium is found.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -387,7 +398,7 @@ def solve(
 
 
 def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber) -> Floats:
-    """(nodes,) 1 at the focus, falling to 0 at the clamps and, as far off, along them."""
+    """Return (nodes,) 1 at the focus, decreasing to 0 at the distance of the clamps."""
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus
     assert focus_x is not None
@@ -399,7 +410,7 @@ def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber)
 
 
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
-    """Newton's method with a line search on the energy; returns positions and steps taken."""
+    """Solve by Newton's method with a line search on the energy; return positions and steps."""
     positions = start.copy()
     scale = mesh.shear_modulus * float(mesh.weight.sum()) / float(np.ptp(mesh.rest[..., 0]))
 

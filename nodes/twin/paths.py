@@ -1,8 +1,8 @@
-"""Where a finger's path is laid: over the scene's object, within reach; and recorded paths.
+"""Map finger paths onto the scene's object, within the range of the arms; read recorded paths.
 
-A place is (along, arc, height), metres: along the object's x axis over its surface, around it from
-there, and out of it; the place (0, 0, 0) is the object's front, where it faces the user.  Motions
-are thought out in places and laid on the object of whatever scene there is.
+A surface position is (along, arc, height) in metres: along the object's x axis over its surface,
+around it from there, and along the normal. (0, 0, 0) is the object's front, which faces the user.
+Motions are defined in surface positions, so that they apply to the object of any scene.
 """
 
 from __future__ import annotations
@@ -26,47 +26,49 @@ FAR_M = 2.0
 MAX_DISTANCE_M = 0.5
 STRIDE_M = 0.001
 GRID_M = 0.003
-"""How far straightest ways go, in what strides, and how far apart the grid's places lie."""
+"""Maximum length of geodesics, their step, and the spacing of the grid."""
 
 WITHIN_ENDS = 0.8
 OF_WIDTH = 0.7
 OF_HEIGHT = 0.9
-"""Of an object that ends, of the sheet's width and of its usable half-height this is stroked."""
+"""Fractions that are stroked: of an object that ends, of the sheet's width and of its usable
+half-height."""
 
 MAX_CACHED_GROUNDS = 4
 _GROUNDS: dict[bytes, Ground] = {}
 
 SPEED_FRACTION = 0.8
-"""Of a finger's largest speed, that a path may ask for: unsteadiness comes on top."""
+"""Maximum speed of a path over the finger's; wander and tremor are added to it."""
 
 PRESS_FRACTION = 1.0 / 6.0
-"""Of the scene's push depth, that a recorded hand presses at most."""
+"""Maximum depth of a recorded hand, over the scene's push depth."""
 
 
 def map_to_surface(scene: Scene, places: Floats) -> Floats:
-    """World points (n, 3) of places (n, 3) on the scene's object."""
+    """Return world points (n, 3) of surface positions (n, 3) on the scene's object."""
     return _ground_of(scene).points(places)
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
-    """How far (m) along and around the surface a finger can stroke, from end to end.
+    """Return the lengths (m), along and around the surface, that a finger can stroke.
 
-    As far to both sides of the front as the object goes (0.8 of its length), the working range's
-    tilt allows, and the sheet is usable: around the object, one that is met at its middle.
+    They are limited by the object (0.8 of its length), by the working range's tilt, and by the
+    usable sheet, to the same distance on both sides of the front. Around the object the sheet is
+    met at its centre line.
     """
     return _ground_of(scene).touchable_m
 
 
 class Ground:
-    """The surface of a scene's object, its places laid out from its front.
+    """Map surface positions of a scene's object to points, from its front.
 
-    Places are measured along straightest ways (geodesics): first along the object's x axis, then at
-    right angles to that.  They are worked out on a grid, joined by bicubic splines, and put back on
-    the surface, so that a path over them is as smooth as the surface.
+    Positions are measured along geodesics: first along the object's x axis, then at right angles to
+    that. They are computed on a grid, interpolated by bicubic splines and projected onto the
+    surface. A path over them is therefore as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """FingerPathError for an object that turns no side to the user."""
+        """Raise FingerPathError for an object that turns no side to the user."""
         pose = scene.object.world_from_object
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._shape = make_shape(dict(scene.object.geometry))
@@ -97,7 +99,9 @@ class Ground:
         self._lay_out(front, np.cross(across, front.normal))
 
     def points(self, places: Floats) -> Floats:
-        """World points (n, 3) of places (n, 3); beyond what is touchable the last that is near."""
+        """Return world points (n, 3) of positions (n, 3); beyond the touchable range, the nearest
+        limit.
+        """
         along, arc = places[:, 0], places[:, 1]
         rough = np.column_stack([spline(along, arc, grid=False) for spline in self._splines])
         found = self._shape.closest(rough)
@@ -106,8 +110,9 @@ class Ground:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """How far one can go on from the front until it leans too much or ends, and whether it
-        ends."""
+        """Return the distance from the front to the limit of tilt or to the end, and whether it
+        ends.
+        """
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
             heading = heading - here.normal * (heading @ here.normal)
@@ -124,7 +129,7 @@ class Ground:
         return way_m, False
 
     def _lay_out(self, front: Nearest, heading: Floats) -> None:
-        """Splines of the surface over (along, arc), to a quarter beyond what is touchable."""
+        """Fit splines of the surface over (along, arc), to a quarter beyond the touchable range."""
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -139,8 +144,11 @@ class Ground:
 
 
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
-    """Where the object faces the user: what is nearest to one far away, else (where that is an end
-    of it) what he sees through its origin."""
+    """Return the surface point that faces the user.
+
+    That is the point nearest to a distant user. If it is an end of the object, it is the point that
+    the user sees through the origin.
+    """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
         return far
@@ -158,9 +166,9 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 
 
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
-    """Points and normals (k, n, 3) on straightest ways from points (n, 3), at ways (k,) m.
+    """Return points and normals (k, n, 3) on geodesics from points (n, 3), at distances (k,) m.
 
-    ticks: rising, as many before 0 as after it, which is the middle.
+    ticks: ascending, as many before 0 as after it; 0 is in the middle.
     """
     middle = len(ticks) // 2
     begun = shape.closest(starts)
@@ -186,7 +194,7 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _ground_of(scene: Scene) -> Ground:
-    """The scene's ground; the latest few are kept, since a path asks for it many times."""
+    """Return the scene's ground; the latest few are cached, since a path needs it many times."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _GROUNDS:
         while len(_GROUNDS) >= MAX_CACHED_GROUNDS:
@@ -203,7 +211,7 @@ def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """The times (n,), stretched by one factor if the path is too fast for the scene's finger."""
+    """Return times (n,), scaled if the path is too fast for the scene's finger."""
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
     slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
     return np.asarray((times_s - times_s[0]) * slower)
@@ -218,11 +226,13 @@ def place_path(
     wander_m: float,
     tremor_m: float,
 ) -> FingerPath:
-    """The path of a motion through places (n, 3) at times (n,), samples of something smooth.
+    """Return the path of a motion through positions (n, 3) at times (n,), samples of a smooth
+    motion.
 
-    It is made smaller by one factor if it must be to stay in the scene's finger volume, wander and
-    all, and slowed by one if it must be for the finger's speed.  Raises FingerPathError where the
-    volume does not hold the place that the motion shrinks to, the object's front.
+    The motion is scaled down by one factor if it leaves the scene's finger volume, wander included,
+    and slowed by one factor if it exceeds the finger's speed.
+
+    Raises FingerPathError where the volume does not contain the object's front.
     """
     margin_m = 4.0 * wander_m + 3.0 * tremor_m
     shrunk = next(
@@ -251,22 +261,24 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """A recorded fingertip's path brought into the scene, ready to be sent; named as its file.
+    """Map a recorded fingertip's path into the scene; it has the name of its file.
 
-    The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as hand trackers give them.  The
-    mapping keeps what a hand does and changes where it does it:
+    The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as from hand trackers. The mapping
+    preserves the motion and changes its location:
 
-    1. Turned: the recording's x, y, z become the world's x, y, z (right, up, towards the user).
-    2. Scaled, if it must be, by one factor, such that its middle 90 % fits what is touchable, and
-       50 mm of depth.
-    3. Moved: its median x, y is put before the object's middle.
-    4. Laid on: the depth becomes the height over the object's surface; the deepest 30 % press into
-       it, more and more reluctantly, to a sixth of `push_depth_m`, the rest hovers or reaches.
-       Height y becomes arc length over the surface, so that moving up and down strokes it.
-    5. Slowed, if it must be, by one factor, to 0.8 of the scene's finger speed.
+    1. Rotate: the recording's x, y, z become the world's x, y, z (right, up, towards the user).
+    2. Scale, if necessary, by one factor, so that the middle 90 % fits the touchable range and 50
+      mm of depth.
+    3. Translate: the median x, y is put before the object's middle.
+    4. Project: the depth becomes the height over the object's surface. The deepest 30 % press into
+    it, limited smoothly to a sixth of `push_depth_m`; the rest hovers or reaches. Height y becomes
+    arc length over the surface, so that moving up and down strokes it.
+    5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
-    Its samples are kept inside the scene's finger volume, and joined smoothly: what the hand did
-    between them, tremor and all, is kept.  Raises FingerPathError for another file.
+    The samples are limited to the scene's finger volume and joined smoothly, so that the motion
+    between them, tremor included, is preserved.
+
+    Raises FingerPathError for an invalid file.
     """
     recorded = _read_recording(csv_path)
     times_s, points = recorded[:, 0] - recorded[0, 0], recorded[:, 1:] * 1e-3
@@ -301,18 +313,18 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
 
 
 def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
-    """Values (n,) kept above a floor by a hyperbola, so that they turn there within some `bend`."""
+    """Limit values (n,) from below by a hyperbola, so that the transition has the width `bend`."""
     above = values - floor
     return np.asarray(floor + 0.5 * (above + np.hypot(above, bend)))
 
 
 def _soft_clip(values: Floats, half: float) -> Floats:
-    """Values (n,) kept within +-half, turning over a fifth of it."""
+    """Limit values (n,) to +-half, with a transition over a fifth of it."""
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 
 def _read_recording(csv_path: Path) -> Floats:
-    """The columns t_s, x_mm, y_mm, z_mm (n, 4); raises FingerPathError naming line and remedy."""
+    """Read columns t_s, x_mm, y_mm, z_mm (n, 4); raise FingerPathError with line and remedy."""
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:
         lines: Sequence[str] = csv_path.read_text(encoding="utf-8").splitlines()

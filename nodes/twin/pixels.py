@@ -1,10 +1,10 @@
-"""The twin's stereo camera: pixels of a fingertip with a bright mark, as a real rig would see it.
+"""Simulate the stereo camera: images of a fingertip with a bright marker, as of a real rig.
 
-Own optics: pinhole with Brown's distortion (`rig.py`), since the twin judges the camera model that
-the nodes use.  The fingertip is a tapered finger that ends in a small luminous bead, the mark,
-whose centre is the fingertip's point; around it is what `clutter.py` describes.  All is drawn ray
-by ray: what a ray meets or misses, smeared by the lens, by what is out of focus, by the pixel's own
-area and by the exposure's motion.  Then photon and read noise, saturation, whole numbers.
+The optics are the simulator's own, a pinhole with Brown's distortion (`rig.py`), because they are
+the reference of the camera model that the nodes use. The fingertip is a tapered finger that ends in
+a small luminous bead, the marker, whose centre is the fingertip's point; `clutter.py` describes its
+surroundings. All is drawn ray by ray, blurred by the lens, by defocus, by the pixel's area and by
+the motion during the exposure. Photon and read noise, saturation and rounding follow.
 """
 
 from __future__ import annotations
@@ -40,48 +40,46 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
-"""Rows and columns of a part of a picture."""
+"""Rows and columns of a part of an image."""
 
 Position = Callable[[float], Floats]
-"""The fingertip (3,) at so many seconds from the middle of the exposure."""
+"""Fingertip (3,) at a time in seconds from the middle of the exposure."""
 
 MOTION_STEP_PX = 0.7
-"""Motion within the exposure is summed at steps no longer than this; the blur closes the gaps.
-
-Within a step all stands still: what that leaves out would widen the blur by 4 % at most.
-"""
+"""Maximum step by which motion within the exposure is summed; the blur closes the gaps. The motion
+within a step would widen the blur by 4 % at most."""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
-"""World direction towards the lamp, about a unit: from the upper left."""
+"""World direction towards the lamp, of about unit length: from the upper left."""
 
 SHADE = 0.35
-"""How much darker skin is at a limb's flank than on its ridge."""
+"""Darkening of skin at a limb's flank relative to its ridge."""
 
 SIDE_LIGHT = 0.2
-"""How much brighter than the ridge the flank towards the lamp is, and darker the other."""
+"""Brightening of the flank towards the lamp relative to the ridge, and darkening of the other."""
 
 MIN_DEPTH_M = 0.02
-"""What comes nearer to a camera than this is not drawn."""
+"""Objects closer to a camera than this are not drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""Where along a limb its place in the picture is looked up to find the window that holds it."""
+"""Positions along a limb that are projected to find the window that contains it."""
 
 EMPTY_FRACTION = 1.2
-"""Overlapping windows are joined if that takes no more than so many times their pixels."""
+"""Maximum area of joined windows over the sum of theirs."""
 
 GRAIN = 1 << 21
-"""Length of the roll of normal deviates that pictures cut their noise from, at random places."""
+"""Number of normal deviates from which images take their noise, at random offsets."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Levels in digital numbers (0..255), linear.
+    """Describe the sensor; levels are digital numbers (0..255), linear.
 
     photons_per_level: full-well photons over 255; the variance of a level L is L over it.
     blur_px: standard deviation of the lens's point spread in focus.
-    aperture_m, focus_m: out of focus a point spreads to a disc of f * aperture * |1/z - 1/focus| px
-    across, drawn as a Gaussian of the same standard deviation, a quarter of that.
-    exposure: factor on all light; above 1 the mark saturates.
+    aperture_m, focus_m: out of focus, a point spreads to a disc of f * aperture * |1/z - 1/focus|
+    px in diameter. It is drawn as a Gaussian of the same standard deviation, a quarter of that.
+    exposure: factor on all light; above 1 the marker saturates.
     """
 
     marker_level: float = 215.0
@@ -97,19 +95,19 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Standard deviation of each level."""
+        """Return the standard deviation of each level."""
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     def spread_px(self, depth_m: float, focal_px: float) -> float:
-        """Standard deviation of a point at a depth: lens, focus, and the pixel's own area."""
+        """Return the standard deviation of a point at a depth: lens, focus, pixel area."""
         defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """The same, focused so far behind a depth that a point there spreads by `defocus_px`."""
+        """Return the sensor with a point at a depth out of focus by `defocus_px`."""
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
         if focus <= 0:
@@ -122,10 +120,10 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """One camera of the rig, the rays through its pixels, and its stack of noisy backgrounds.
+    """Hold one camera of the rig, the rays through its pixels, and its noisy backgrounds.
 
     slopes_x, slopes_y: x/z and y/z of each pixel's ray, in the camera.
-    canvas: where pictures are drawn; between pictures it equals the background.
+    canvas: where images are drawn; between images it equals the background.
     """
 
     side: Side
@@ -138,7 +136,9 @@ class Eye:
     noisy: list[Image]
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
-        """Pixel (2,) and depth (m) of a world point; the pixel is void when the depth is <= 0."""
+        """Return pixel (2,) and depth (m) of a world point; the pixel is invalid when the depth is
+        <= 0.
+        """
         x, y, z = (
             self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
         ).tolist()
@@ -147,7 +147,7 @@ class Eye:
         return np.array(pixel_of(self.lens, x / z, y / z)), z
 
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
-        """The part of the picture within reach of some pixels; None: none of it."""
+        """Return the part of the image within a distance of some pixels; None if there is none."""
         height, width = self.canvas.shape
         rows = slice(
             max(math.floor(min(y for _, y in pixels) - reach_px), 0),
@@ -197,9 +197,9 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """The same camera before the same background, with another mark or sensor for the rest.
+        """Return the same camera and background with another marker or sensor.
 
-        marker_offset_m: where the mark sits, from the fingertip, in the world's directions.
+        marker_offset_m: of the marker from the fingertip, in the world's directions.
         """
         other = copy.copy(self)
         other.sensor = self.sensor if sensor is None else sensor
@@ -210,10 +210,10 @@ class TwinCamera:
     def picture(
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Image, Image]:
-        """The left and right pictures of a fingertip at `position(seconds from mid-exposure)`.
+        """Return the left and right image of a fingertip at `position(seconds from mid-exposure)`.
 
-        mark: false draws a finger that wears none (rubbed off, or turned away).
-        time_s: where what moves of the clutter is at mid-exposure.
+        mark: whether the finger wears a marker.
+        time_s: time at mid-exposure of the clutter that moves.
         """
         instants_s, tips = self._instants(position, exposure_s)
         left, right = (
@@ -225,7 +225,7 @@ class TwinCamera:
     def levels(
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
-        """Both pictures (height, width) as light: before noise, saturation and rounding."""
+        """Return both images (height, width) as light: before noise, saturation and rounding."""
         instants_s, tips = self._instants(position, exposure_s)
         pictures = []
         for eye in self.eyes:
@@ -235,7 +235,7 @@ class TwinCamera:
         return pictures[0], pictures[1]
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
-        """Times (n,) from mid-exposure and fingertips (n, 3), close enough to sum motion over."""
+        """Return times (n,) from mid-exposure and fingertips (n, 3), dense enough to sum motion."""
         ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
         travel_px = 0.0
         for eye in self.eyes:
@@ -247,7 +247,7 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: Eye, windows: list[Window]) -> Image:
-        """The picture of what was drawn: a noisy background, the touched windows new on it."""
+        """Return the image: a noisy background with the touched windows drawn on it."""
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
             image[window] = self._read_out(eye.canvas[window])
@@ -309,11 +309,12 @@ class TwinCamera:
         *,
         lit: bool,
     ) -> Window | None:
-        """A tapered capsule between two world points (2, 3); None where it is not to be seen.
+        """Draw a tapered capsule between two world points (2, 3); None if it is not visible.
 
-        lit: by the lamp from its side; otherwise evenly.  Its motion over the exposure, `way` (m),
-        widens its edges; their profile is a cubic, within 2 % of the normal distribution.  Not for
-        what is thinner than its own edges.
+        lit: by the lamp from its side; otherwise evenly.
+
+        The motion over the exposure (m) widens its edges; their profile is a cubic, within 2 % of
+        the normal distribution. It is not valid for limbs thinner than their edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
         if min(z0, z1) <= MIN_DEPTH_M:
@@ -356,9 +357,9 @@ class TwinCamera:
     def _disc(
         self, eye: Eye, places: Floats, radius_m: float, level: float, *, adds: bool = False
     ) -> Window | None:
-        """A luminous ball at world points (n, 3) over the exposure; None: not to be seen.
+        """Draw a luminous ball at world points (n, 3) over the exposure; None if not visible.
 
-        adds: its light adds to what is there, instead of hiding it.
+        adds: its light adds to the background instead of hiding it.
         """
         in_camera = apply(eye.camera_from_world, places)
         if in_camera[:, 2].min() <= MIN_DEPTH_M:
@@ -377,7 +378,7 @@ class TwinCamera:
         return window
 
     def _eye(self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None) -> Eye:
-        """One camera with all that never moves drawn into its background."""
+        """Return one camera with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
         canvas = self._room(height, width)
@@ -445,7 +446,7 @@ class TwinCamera:
 
 @lru_cache(maxsize=4)
 def _slopes(lens: Lens, width: int, height: int) -> Floats:
-    """Slopes (height, width, 2) of the rays through all pixels; kept, since they take a while."""
+    """Return slopes (height, width, 2) of the rays through all pixels; cached."""
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     slopes = slopes_of(lens, pixels.astype(np.float64))
     slopes.setflags(write=False)
@@ -455,12 +456,12 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
 def rasterize_ball(
     eye: Eye, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
-    """Share of each pixel's light that comes from a ball, the mean over its centres (n, 3).
+    """Return the fraction of each pixel's light that comes from a ball, the mean over centres (n,
+    3).
 
-    Centres are in the camera's frame.  A ray passes one at distance |ray x centre| / |ray|.  A disc
-    of radius r smeared by a Gaussian s gives, at distance d, the light that a point displaced from
-    there finds inside: the non-central chi-square distribution of (d/s)^2 at (r/s)^2 with two
-    degrees of freedom.
+    Centres are in the camera's frame. A ray passes one at distance |ray x centre| / |ray|. A disc
+    of radius r blurred by a Gaussian s gives, at distance d, the non-central chi-square
+    distribution of (d/s)^2 at (r/s)^2 with two degrees of freedom.
     """
     single = np.float32
     u, v = eye.slopes_x[window], eye.slopes_y[window]
@@ -479,12 +480,12 @@ def rasterize_ball(
 
 
 def quantize(levels: Singles) -> Image:
-    """Digital numbers as the converter gives them: rounded, clipped at 0 and 255."""
+    """Return digital numbers as the converter does: rounded, clipped at 0 and 255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
 def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
-    """The marks and highlights that one camera sees."""
+    """Return the markers and highlights that one camera sees."""
     spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 
@@ -499,9 +500,9 @@ def _wipe(eye: Eye, windows: list[Window]) -> None:
 
 
 def disjoint(windows: list[Window]) -> list[Window]:
-    """Windows that cover the same pixels and do not overlap.
+    """Return windows that cover the same pixels and do not overlap.
 
-    Two that do become one, or where that would be mostly empty, the one is cut along the other.
+    Two that overlap are joined; if the result would be mostly empty, one is cut along the other.
     """
     apart: list[Window] = []
     pending = list(windows)
@@ -536,7 +537,7 @@ def _overlap(a: Window, b: Window) -> bool:
 
 
 def _beyond(one: Window, other: Window) -> list[Window]:
-    """What of a window is not in another that it overlaps: above, below, left and right of it."""
+    """Return the parts of a window outside another: above, below, left and right of it."""
     (rows, columns), (cut_rows, cut_columns) = one, other
     between = slice(max(rows.start, cut_rows.start), min(rows.stop, cut_rows.stop))
     parts = [

@@ -1,8 +1,7 @@
-"""The projector as it really is, the light that it throws on a flat sheet, and how far a wrong
-belief about it puts the picture off.
+"""Simulate the true projector and its light on a flat sheet; compute errors of its calibration.
 
-Its projection is the twin's own.  An unpushed sheet between two parallel edges is flat, so a plane
-stands for it here.
+Its projection is the simulator's own. An unpushed sheet between two parallel edges is flat, so that
+a plane represents it.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ RAYS = 2
 """Rays per camera pixel and direction."""
 
 ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
-"""Of the room behind, of the sheet at full light, and of the sheet by the projector's black."""
+"""Levels of the room behind, of the sheet at full light, and of the sheet in projected black."""
 
 SPREAD_PX = 0.5
-"""Standard deviation of a projector's pixel on the sheet: lens and rubber."""
+"""Standard deviation of a projector pixel's image on the sheet: lens and rubber."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
@@ -43,7 +42,7 @@ RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
-    """A projector as it might really stand where a scene has it by tape measure and data sheet."""
+    """Return a true projector near the pose that a tape measure gives, with true optics."""
     random = np.random.default_rng(seed)
 
     def deviation(*shape: int) -> Floats:
@@ -75,7 +74,7 @@ def make_true_projector(projector: Projector, *, seed: int) -> Projector:
 
 
 def _rpy(rotation: Floats) -> Floats:
-    """Roll, pitch, yaw about fixed x, y, z (rad), away from a pitch of 90 degrees."""
+    """Return roll, pitch, yaw about fixed x, y, z (rad); undefined at a pitch of 90 degrees."""
     return np.array(
         [
             np.arctan2(rotation[2, 1], rotation[2, 2]),
@@ -86,7 +85,7 @@ def _rpy(rotation: Floats) -> Floats:
 
 
 def sheet_poses(count: int) -> list[Floats]:
-    """Poses `world_from_sheet` (4, 4) as arms would hold the sheet: near and far, tilted about."""
+    """Return poses `world_from_sheet` (4, 4) that arms can hold: near and far, tilted."""
     poses = []
     for number in range(count):
         share = number / max(count - 1, 1)
@@ -99,7 +98,7 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """A stereo rig before a flat sheet that the projector lights from behind."""
+    """Simulate a stereo rig before a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """camera, projector: the true ones."""
@@ -115,7 +114,7 @@ class LitSheet:
     def pair(
         self, patterns: Sequence[Image], world_from_sheet: Floats
     ) -> tuple[list[Image], list[Image]]:
-        """What the left and the right camera see of each pattern on the sheet held there."""
+        """Return the left and right image of each pattern on the sheet at a pose."""
         pose = self._camera.world_from_left
         world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
         views = (world_from_left, world_from_left @ inverse(self._camera.right_from_left))
@@ -144,7 +143,7 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """The projector's column and row that light what rays see, and if that is the sheet."""
+        """Return the projector's column and row that light what rays see; also which hit it."""
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         points, ahead = on_plane(
             world_from_eye[:3, 3], directions @ world_from_eye[:3, :3].T, world_from_sheet
@@ -157,7 +156,10 @@ class LitSheet:
 
 
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Where rays (..., 3) from a point meet the x-y plane of a pose (4, 4), and if before it."""
+    """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
+
+    Returns the points, and whether the plane is before the origin of the ray.
+    """
     normal = plane[:3, 2]
     slant = directions @ normal
     share = ((plane[:3, 3] - origin) @ normal) / np.where(np.abs(slant) < 1e-9, np.nan, slant)
@@ -166,7 +168,7 @@ def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats,
 
 
 def pixels_lighting(projector: Projector, points: Floats) -> Floats:
-    """The projector's pixels (..., 2) that light world points (..., 3) before it."""
+    """Return the projector's pixels (..., 2) that light world points (..., 3) before it."""
     pose = projector.world_from_projector
     from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
     local = points @ from_world[:3, :3].T + from_world[:3, 3]
@@ -176,10 +178,10 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """How far (n,), m on the imaginary screen, points appear from where they ought to.
+    """Return the errors (n,), m on the imaginary screen, of the positions at which points appear.
 
-    Points on a grid of +-half_m on planes (4, 4) are lit by the pixels that `believed` names; the
-    true projector puts that light elsewhere on the plane.
+    Points on a grid of +-half_m on planes (4, 4) are lit by the pixels that `believed` computes;
+    the true projector puts that light elsewhere on the plane.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

@@ -1,8 +1,8 @@
-"""The stereo rig as it really stands, and how its lenses see.
+"""Simulate the true stereo rig and its lenses.
 
-A scene's camera block is a data sheet.  The device itself differs from it, by amounts that belong
-to that one device: only a calibration tells them.  The projection is the twin's own, since the twin
-judges the camera model that the nodes use.
+A scene's camera block is a data sheet. The device differs from it by amounts of its own, which only
+a calibration determines. The projection is the simulator's own, because it is the reference of the
+camera model that the nodes use.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ Floats = NDArray[np.float64]
 T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005
-"""Standard deviation of a focal length, as a share of it: between the devices of one make."""
+"""Relative standard deviation of a focal length between devices of one make."""
 
 ASPECT_DEVIATION = 0.0005
-"""Standard deviation of what tells fy from fx: square pixels, nearly."""
+"""Relative standard deviation of fy from fx: pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""Standard deviation of a principal point per 640 px of width: how a sensor sits behind a lens."""
+"""Standard deviation of a principal point per 640 px of width, from mounting the sensor."""
 
 RADIAL = (-0.30, 0.11)
 RADIAL_DEVIATION = (0.015, 0.01)
-"""k1 and k2 of the lenses of such rigs (66 degrees across), which no data sheet tells."""
+"""k1 and k2 of the lenses of such rigs (66 degrees across), which no data sheet gives."""
 
 TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
-"""Standard deviation, per axis, of where the right camera is screwed on."""
+"""Standard deviation, per axis, of the right camera's position."""
 
 ROTATION_DEVIATION_RAD = 0.004
-"""Standard deviation, per axis, of how the right camera is turned: 0.23 degrees."""
+"""Standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
 
 NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """The rig behind a data sheet: the same for the same device name, another for any other.
+    """Return the true rig of a data sheet, determined by the device name.
 
-    Deviations are normal, cut at two standard deviations.  Where the left camera stands in the
-    world is as the scene says, and so are size, rate and exposure.
+    Deviations are normal, limited to two standard deviations. The left camera's pose, the size,
+    rate and exposure are those of the scene.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
@@ -85,12 +85,12 @@ def make_true_camera(camera: StereoCamera) -> StereoCamera:
 
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
-    """Pixels (..., 2) of rays (x/z, y/z) (..., 2) through a lens, by Brown's distortion."""
+    """Project rays (x/z, y/z) (..., 2) to pixels (..., 2) by Brown's distortion."""
     return np.stack(_seen(lens, slopes[..., 0], slopes[..., 1]), axis=-1)
 
 
 def pixel_of(lens: Lens, slope_x: float, slope_y: float) -> tuple[float, float]:
-    """As `pixels_of` for one ray, many times faster."""
+    """Project one ray as `pixels_of` does, many times faster."""
     return _seen(lens, slope_x, slope_y)
 
 
@@ -104,7 +104,7 @@ def _seen(lens: Lens, u: T, v: T) -> tuple[T, T]:
 
 
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
-    """d(x, y)/d(u, v) of Brown's distortion, which is symmetric: its xx, xy, yy."""
+    """Return d(x, y)/d(u, v) of Brown's distortion, which is symmetric: xx, xy, yy."""
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -115,15 +115,15 @@ def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
 
 
 def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
-    """Pixels per unit of slope about a ray, the geometric mean over all directions."""
+    """Return pixels per unit of slope about a ray, the geometric mean over all directions."""
     xx, xy, yy = _slopes_of_distortion(lens, slope_x, slope_y)
     return math.sqrt(lens.fx_px * lens.fy_px * abs(xx * yy - xy * xy))
 
 
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
-    """Rays (x/z, y/z) (..., 2) behind pixels (..., 2): the inverse of `pixels_of`, by Newton.
+    """Return rays (x/z, y/z) (..., 2) of pixels (..., 2): inverts `pixels_of` by Newton's method.
 
-    Good wherever the distortion does not fold the picture over.
+    It is valid wherever the distortion is injective.
     """
     focal = np.array([lens.fx_px, lens.fy_px])
     slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)

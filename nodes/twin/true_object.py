@@ -1,4 +1,4 @@
-"""The object as it truly is, at rest or moved as its skin is, on a mesh of the twin's own."""
+"""Compute the true object, at rest or deformed as its skin, on a mesh of the simulator's own."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
-"""Vertices about the x axis, and rows of them along it."""
+"""Vertices around the x axis, and rows of them along it."""
 PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
-"""Of a mesh object's triangles, once they are cut up."""
+"""Maximum edge of a mesh object's triangles after subdivision."""
 NEAREST_VERTICES = 3
-"""Of a skin: the triangles about so many of them are looked at for the nearest point."""
+"""Number of nearest skin vertices whose triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
-    """The object as it is: vertices (vertices, 3) world, outward triangles, unit normals.
+    """Hold the true object: vertices (vertices, 3) world, outward triangles, unit normals.
 
-    Along a sharp edge vertices are doubled.  sunk_m: (vertices,) how far each is pushed in.
+    Along a sharp edge vertices are doubled.
+
+    sunk_m: (vertices,) depth by which each vertex is pushed in.
     colour: (3,) red, green, blue in full light, 0 to 1.
     """
 
@@ -42,7 +44,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """The scene's object, of any shape; of a plane the touchable rectangle."""
+    """Compute the scene's true object, of any shape; of a plane the touchable rectangle."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -73,10 +75,12 @@ class TrueBody:
     def displaced(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer], displacement: Floats
     ) -> TrueObject:
-        """Each point moved as the nearest point of a skin (skin vertices, 3) at rest.
+        """Return the object with each point displaced as the nearest point of a skin at rest.
 
-        displacement: (skin vertices, 3), linear within skin_triangles (triangles, 3).  ValueError
-        if it is of another skin, or the skin has no triangles.
+        skin_vertices: (skin vertices, 3).
+        displacement: (skin vertices, 3), linear within skin_triangles (triangles, 3).
+
+        Raises ValueError if it is of another skin, or the skin has no triangles.
         """
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
@@ -88,8 +92,10 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """The skin's vertices (vertices, 3) about each own one, and their weights; kept while the
-        skin is the same."""
+        """Return three skin vertices (vertices, 3) for each own vertex, and their weights.
+
+        The result is cached until the skin changes.
+        """
         key = skin_vertices.tobytes() + skin_triangles.tobytes()
         if self._skin is None or self._skin[0] != key:
             self._skin = key, *_feet(self._rest, skin_vertices, skin_triangles.astype(np.intp))
@@ -109,9 +115,9 @@ class TrueBody:
 
 
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Corners (points, 3) of the triangles that are nearest to points, and the weights there.
+    """Return corners (points, 3) of the triangles nearest to points, and barycentric weights.
 
-    ValueError where no triangle has an area.
+    Raises ValueError where no triangle has an area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
@@ -139,8 +145,10 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
 
 
 def _strip(rows: int, around: int) -> Indices:
-    """Triangles between closed rows of vertices, outward where the rows turn about +x with the
-    sine along y and the cosine along z."""
+    """Return triangles between closed rows of vertices.
+
+    They face outward where the rows run about +x with the sine along y and the cosine along z.
+    """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij"))
     here, beside = i * around + j, i * around + (j + 1) % around
     return np.concatenate(
@@ -152,18 +160,18 @@ def _strip(rows: int, around: int) -> Indices:
 
 
 def _fan(rim: Indices, centre: int) -> Indices:
-    """Triangles from a centre to a closed rim."""
+    """Return triangles from a centre to a closed rim."""
     return np.column_stack([np.full(len(rim), centre), rim, np.roll(rim, -1)])
 
 
 def _turned() -> Floats:
-    """Unit vectors (AROUND, 3) about the x axis."""
+    """Return unit vectors (AROUND, 3) about the x axis."""
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     return np.column_stack([np.zeros(AROUND), np.sin(angle), np.cos(angle)])
 
 
 def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
-    """Side and end caps of a cylinder along x; the caps have rims of their own."""
+    """Return side and end caps of a cylinder along x; the caps have rims of their own."""
     side = np.repeat(radius_m * _turned()[None], ALONG + 1, axis=0)
     side[..., 0] = length_m * np.linspace(-0.5, 0.5, ALONG + 1)[:, None]
     count = AROUND * (ALONG + 1)
@@ -175,7 +183,7 @@ def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
 
 
 def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
-    """A rectangle about the origin that faces +z."""
+    """Return a rectangle about the origin that faces +z."""
     x = np.linspace(-0.5, 0.5, PLANE_CELLS + 1)
     y, x = (v.ravel() for v in np.meshgrid(height_m * x, width_m * x, indexing="ij"))
     cell = np.arange(PLANE_CELLS)
@@ -189,7 +197,7 @@ def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
 
 
 def _directions() -> Floats:
-    """Unit vectors (directions, 3): rows about the x axis from -x to +x, the two poles last."""
+    """Return unit vectors (directions, 3): rows about the x axis from -x to +x, then both poles."""
     polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
     rows = np.sin(polar)[:, None, None] * _turned()
     rows[..., 0] = -np.cos(polar)[:, None]
@@ -197,7 +205,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """A closed surface through one point along each of `_directions`."""
+    """Return a closed surface with one vertex along each of `_directions`."""
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
@@ -227,7 +235,7 @@ def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
 
 
 def _cut_up(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
-    """All triangles in four, again and again, until no edge is longer than `MAX_EDGE_M`."""
+    """Divide all triangles into four, repeatedly, until no edge is longer than `MAX_EDGE_M`."""
     while True:
         corners = vertices[triangles]
         longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())

@@ -1,4 +1,4 @@
-"""Shapes of the virtual objects; `surface` defines what all of them offer."""
+"""Make the shapes of virtual objects; `surface` defines what all of them offer."""
 
 from __future__ import annotations
 

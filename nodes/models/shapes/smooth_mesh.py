@@ -106,8 +106,11 @@ class SmoothMeshShape:
     """Smooth a closed mesh over `smoothing_m`; see the module's text."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
-        """MeshError for a mesh that is no solid's surface or too small to be smoothed so;
-        ValueError for a length that is not positive."""
+        """Build the smooth surface of a closed mesh.
+
+        Raises MeshError for a mesh that bounds no solid or is too small for this smoothing, and
+        ValueError for a length that is not positive.
+        """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
         faces = np.asarray(triangles, dtype=np.int64)
@@ -140,10 +143,12 @@ class SmoothMeshShape:
         self._table, self._counts = self._support_table(1.1 * cover)
 
     def deviation_m(self) -> float:
-        """The largest distance of the mesh's vertices, edges' middles and triangles' centres from
-        the smooth surface; MeshError where it is more than `MAX_DEVIATION_RATIO` of `smoothing_m`.
+        """Return the largest distance of the mesh from the smooth surface.
 
-        Takes as long as some thousand queries, so a shape does not ask it of itself.
+        Vertices, midpoints of edges and centres of triangles are checked, which takes as long as
+        some thousand queries.
+
+        Raises MeshError where it is more than `MAX_DEVIATION_RATIO` of `smoothing_m`.
         """
         deviation = float(np.abs(self.closest(self._samples).height_m).max())
         if deviation > MAX_DEVIATION_RATIO * self.smoothing_m:
@@ -198,8 +203,10 @@ class SmoothMeshShape:
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """`closest` for one query (3,) whose descent from the point before ends well, as nearly all
-        do; else None."""
+        """Return `closest` for one query (3,) by a descent from the previous point.
+
+        Returns None if that descent does not converge, which is rare.
+        """
         feet = self._descend_one(query, before)
         if not feet.is_nearest[0]:
             return None
@@ -215,45 +222,47 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """The feet of queries (n, 3), going on from those found before, and which are undecided."""
+        """Return the nearest points of queries (n, 3), from previous points, and which are
+        undecided.
+        """
         if before is None:
             return self._nearest_of_all(queries)
         feet = self._descend(queries, before)
         undecided = np.zeros(len(queries), dtype=bool)
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
-            anew, undecided[lost] = self._nearest_of_all(queries[lost])
-            _put(feet, lost, anew)
+            found_again, undecided[lost] = self._nearest_of_all(queries[lost])
+            _put(feet, lost, found_again)
         return feet, undecided
 
     def _nearest_of_all(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """The nearest feet, whatever was found before.
+        """Return the nearest points, whatever was found before.
 
-        A descent from the nearest jet ends at distance D.  Any nearer place has a jet within the
-        cover c of it, which by the bound on curvature is at most sqrt(D^2 + c^2 (1 + 4 D / rho))
-        away; descents are made from those that `_select_starts` leaves of them as well.
+        A descent from the nearest jet ends at distance D. Any nearer point has a jet within the
+        cover c of it. By the bound on curvature, that jet is at most sqrt(D^2 + c^2 (1 + 4 D /
+        rho)) away. Further descents start from the jets that `_select_starts` leaves of them.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
         feet = self._descend(queries, self._on_jet(queries, nearest))
-        way = np.linalg.norm(queries - feet.point, axis=1)
+        distance = np.linalg.norm(queries - feet.point, axis=1)
         # A descent that ended farther away than it began went astray.
         begun = np.linalg.norm(queries - start, axis=1)
-        feet.is_nearest[way > begun + self._cover] = False
-        way = np.where(feet.is_nearest, way, begun)
-        slack = self._cover**2 * (1.0 + 2.0 * MAX_CURVATURE_RATIO * way / rho)
-        lists = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
+        feet.is_nearest[distance > begun + self._cover] = False
+        distance = np.where(feet.is_nearest, distance, begun)
+        slack = self._cover**2 * (1.0 + 2.0 * MAX_CURVATURE_RATIO * distance / rho)
+        lists = self._tree.query_ball_point(queries, np.sqrt(distance**2 + slack))
         undecided = np.zeros(len(queries), dtype=bool)
-        rows, jets = self._select_starts(queries, lists, feet.point, way)
+        rows, jets = self._select_starts(queries, lists, feet.point, distance)
         if len(rows):
             other = self._descend(queries[rows], self._centre[jets])
-            other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
+            other_distance = np.linalg.norm(queries[rows] - other.point, axis=1)
             for i in np.flatnonzero(other.is_nearest):
-                row, shorter = rows[i], way[rows[i]] - other_way[i]
+                row, shorter = rows[i], distance[rows[i]] - other_distance[i]
                 apart = float(np.linalg.norm(other.point[i] - feet.point[row])) > APART_RATIO * rho
                 if shorter > EQUAL_DISTANCE_M or not feet.is_nearest[row]:
                     _put(feet, rows[i : i + 1], other, np.array([i]))
-                    way[row], undecided[row] = other_way[i], False
+                    distance[row], undecided[row] = other_distance[i], False
                 elif apart and shorter > -EQUAL_DISTANCE_M:
                     undecided[row] = True
         lost = np.flatnonzero(~feet.is_nearest)
@@ -265,13 +274,13 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _select_starts(
-        self, queries: Floats, lists: list[list[int]], feet: Floats, way: Floats
+        self, queries: Floats, lists: list[list[int]], feet: Floats, distance: Floats
     ) -> tuple[Indices, Indices]:
-        """Rows of queries and jets that a point nearer than `way` (n,) may lie at, away from the
-        feet there were.
+        """Select the jets from which a nearer point may be found; return rows of queries, and jets.
 
-        Such a jet's own quadratic has a nearest point, a minimum, not far from the jet, and not
-        much farther away than `way`.  Of jets that lie within `rho` of one another one is taken.
+        The quadratic of such a jet has a nearest point that is a minimum, not far from the jet, and
+        not much farther than `distance` (n,). Of jets within `rho` of one another, one is taken.
+        Jets near the points `feet` that are known already are left out.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -289,8 +298,8 @@ class SmoothMeshShape:
         # Feet of quadratics are rough, hence the room that is given.
         reach = 1.5 * self._cover * np.maximum(values, MIN_CURVATURE_FACTOR)
         hopeful = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
-        rough_way = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
-        hopeful &= rough_way < way[rows] + self._cover
+        rough_distance = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
+        hopeful &= rough_distance < distance[rows] + self._cover
         rows, jets, offset = rows[hopeful], jets[hopeful], offset[hopeful]
         taken: dict[int, list[int]] = {}
         for i in np.argsort(np.square(offset).sum(1)):
@@ -320,18 +329,18 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """See `Shape`; to the jets' own places, which lie closer than `smoothing_m`."""
+        """See `Shape`; evaluated at the jets, which are closer to each other than `smoothing_m`."""
         offset = self._centre[:-1] - point
         height = offset @ normal
         across = np.einsum("ji,ji->j", offset, offset) - height * height
         within = np.flatnonzero((height > 0.0) & (across < radius_m * radius_m))
         if not len(within):
             return 0.0
-        share = (1.0 - np.sqrt(np.maximum(across[within], 0.0)) / radius_m) / (1.0 - RIM_FRACTION)
-        return float((height[within] * np.minimum(share, 1.0)).max())
+        weight = (1.0 - np.sqrt(np.maximum(across[within], 0.0)) / radius_m) / (1.0 - RIM_FRACTION)
+        return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Roughly the points (n, 3) nearest to queries of the quadratics of single jets (n,)."""
+        """Return rough nearest points (n, 3) of queries on the quadratics of single jets (n,)."""
         normal, operator = self._normal[jet], self._operator[jet]
         offset = queries - self._centre[jet]
         height = (offset * normal).sum(1)[:, None]
@@ -345,8 +354,11 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """For each jet those (padded with one that is infinitely far) whose supports reach the
-        points to which it is the nearest, within `cover` (j,) of it, and how many they are."""
+        """Return, for each jet, the jets whose supports reach its neighbourhood, and their number.
+
+        cover: (j,) radius of that neighbourhood: the points to which the jet is the nearest. Rows
+        are padded with a jet at infinity.
+        """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
         counts = np.array([len(one) for one in lists])
@@ -359,8 +371,10 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """f with its derivatives at points (n, 3) near the surface, see `LevelSet`; its support is
-        the sum of the weights."""
+        """Evaluate f with its derivatives at points (n, 3) near the surface, see `LevelSet`.
+
+        The support is the sum of the weights.
+        """
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
         normal, operator = self._normal[members], self._operator[members]
@@ -398,8 +412,10 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """The jet nearest to a point (3,), all whose supports may reach places around it, and their
-        centres (k, 3), normals (k, 3) and shape operators (k, 3, 3)."""
+        """Return the jet nearest to a point (3,), and the jets whose supports may reach near it.
+
+        Their centres (k, 3), normals (k, 3) and shape operators (k, 3, 3) follow.
+        """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
         return (
@@ -412,9 +428,9 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """`SmoothMeshShape._level` for the single points of one descent, see `LevelAt`.
+    """Evaluate `SmoothMeshShape._level` at the single points of one descent, see `LevelAt`.
 
-    Jets are looked up anew only after a longer way.
+    The list of jets is renewed only after a longer distance.
     """
 
     __slots__ = ("_asked_at", "_jets", "_shape")
@@ -457,7 +473,7 @@ class _LevelNear:
 
 
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
-    """The feet, those that f = 0 beyond a rim brought forth not called nearest."""
+    """Mark points where f = 0 beyond the rim of a thin part as not nearest."""
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
     return feet
@@ -469,7 +485,7 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Put the chosen of other feet into rows."""
+    """Store the chosen rows of other projections."""
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
     feet.steepness[rows], feet.support[rows] = other.steepness[chosen], other.support[chosen]
@@ -477,7 +493,7 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Points (j, 3), normals (j, 3) and shape operators (j, 3, 3) fitted about chosen vertices."""
+    """Fit points (j, 3), normals (j, 3) and shape operators (j, 3, 3) about selected vertices."""
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
 
@@ -498,8 +514,10 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Vertices of which no two that face the same way are nearer than `spacing`; every other vertex
-    has one of them so near."""
+    """Select vertices such that no two on the same side are closer than `spacing`.
+
+    Every other vertex has a selected one within that distance.
+    """
     taken, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
         if covered[vertex]:
@@ -511,7 +529,7 @@ def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) 
 
 
 def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
-    """The allowed vertices that edges join to `start` by way of allowed ones."""
+    """Return the allowed vertices that are connected to `start` through allowed ones."""
     found, edge = [start], [start]
     left = allowed - {start}
     while edge:
@@ -525,9 +543,9 @@ def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
 def _jet(
     origin: Floats, rough: Floats, around: Floats, rho: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Point, normal (3,), shape operator (3, 3) of the quadratic z(x, y) fitted to points (m, 3).
+    """Fit the quadratic z(x, y) to points (m, 3); return point, normal (3,), shape operator (3, 3).
 
-    z is along the rough normal; lengths are scaled by the fit's radius.  Of too few points the
+    z is along the rough normal; lengths are scaled by the fit's radius. For too few points the
     solution of least norm is taken.
     """
     reach = FIT_RATIO * rho

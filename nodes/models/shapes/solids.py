@@ -1,4 +1,4 @@
-"""Shapes with a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
+"""Define the shapes with a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class CylinderShape(Convex):
-    """Circular cylinder about the x axis, centred on the origin.
+    """Define a circular cylinder about the x axis, centred on the origin.
 
-    Only its side is touchable: the sheet is clamped along x, so that a finger beyond an end cap
-        gets the nearest point of the side's rim, with `on_edge`.
+    Only its side is touchable, because the sheet is clamped along x. A finger beyond an end cap
+    gets the nearest point of the side's rim, with `on_edge`.
     """
 
     radius_m: float
@@ -68,7 +68,7 @@ class CylinderShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class SphereShape(Convex):
-    """Sphere about the origin."""
+    """Define a sphere about the origin."""
 
     radius_m: float
 
@@ -91,7 +91,7 @@ class SphereShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """The half-space z <= 0, touchable on a rectangle of its face about the origin."""
+    """Define the half-space z <= 0, touchable on a rectangle of its face about the origin."""
 
     width_m: float
     height_m: float
@@ -120,7 +120,7 @@ class PlaneShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class EllipsoidShape(Convex):
-    """Ellipsoid about the origin, its semi-axes along x, y, z."""
+    """Define an ellipsoid about the origin, its semi-axes along x, y, z."""
 
     semi_axes_m: tuple[float, float, float]
 
@@ -227,9 +227,9 @@ class EllipsoidShape(Convex):
         root = (size - squares).max(axis=-1)
         for _ in range(60):
             below = root[:, None] + squares
-            share = np.square(size / below)
-            norm = np.sqrt(share.sum(-1))
-            step = (norm - 1.0) * norm**2 / (share / below).sum(-1)
+            squares_ratio = np.square(size / below)
+            norm = np.sqrt(squares_ratio.sum(-1))
+            step = (norm - 1.0) * norm**2 / (squares_ratio / below).sum(-1)
             root += step
             if not (np.abs(step) > 1e-15 * (np.abs(root) + squares.min())).any():
                 break
@@ -240,7 +240,7 @@ class EllipsoidShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class RoundedBoxShape(Convex):
-    """Box about the origin whose edges and corners are rounded by a ball.
+    """Define a box about the origin whose edges and corners are rounded by a ball.
 
     size_m: full extents along x, y, z, rounding included.
     edge_radius_m: at most half the smallest extent.
@@ -305,7 +305,7 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Half extents (3,) of the box that contains the ball's centre."""
+        """Return the half extents (3,) of the box that contains the ball's centre."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
@@ -353,9 +353,9 @@ def _directions(
     undecided = length < EQUAL_DISTANCE_M
     direction = offsets
     if undecided.any():
-        kept = np.zeros(3)
-        kept[list(across)] = 1.0
-        sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * kept
+        mask = np.zeros(3)
+        mask[list(across)] = 1.0
+        sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * mask
         blind = np.linalg.norm(sides, axis=-1) < EQUAL_DISTANCE_M
         sides = np.where(blind[..., None], FRONT, sides)
         direction = np.where(undecided[..., None], sides, offsets)

@@ -59,7 +59,7 @@ class Shape(Protocol):
 
         previous: the surface points of the previous queries, shaped as `points`.  Where several
             points are equally near, and inside the object also where a nearer one appears
-            elsewhere, the nearest point of the same neighbourhood is kept as long as it exists.
+            elsewhere, the nearest point of the same neighbourhood is returned as long as it exists.
             Leave it out for a new contact.
 
         Raises ValueError for NaN, infinity, another shape than (3,) or (n, 3), or points beyond
@@ -128,13 +128,13 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Return `points` as floats (3,) or (n, 3); ValueError says what is wrong with them."""
+    """Return `points` as floats (3,) or (n, 3); raise ValueError if they are not valid."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
         raise ValueError(f"{name} of shape {array.shape}, wanted (3,) or (n, 3)")
     # A comparison with NaN is false, hence the double negation.
     if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
-        raise ValueError(f"{name} hold NaN, infinity or places beyond {MAX_QUERY_M:g} m")
+        raise ValueError(f"{name} hold NaN, infinity or positions beyond {MAX_QUERY_M:g} m")
     return array
 
 
@@ -221,9 +221,9 @@ def descend(
         size = np.sqrt((step * step).sum(-1))
         step *= np.minimum(1.0, stride_m / np.maximum(size, 1e-300))[:, None]
         weingarten = tangent @ hessian @ tangent / length[:, None, None]
-        turned = unit + (weingarten @ step[:, :, None])[:, :, 0]
+        rotated = unit + (weingarten @ step[:, :, None])[:, :, 0]
         point[moving] = x + step
-        normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
+        normal[moving] = rotated / np.sqrt((rotated * rotated).sum(-1))[:, None]
         operator[moving] = weingarten
         # Bounded eigenvalues shrink the steps slowly, so that the last step must be far shorter.
         slow = values[:, 0] < MIN_EIGENVALUE
@@ -240,7 +240,7 @@ _IDENTITY = np.eye(3)
 
 Triple = tuple[float, float, float]
 LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
-"""As `LevelSet`, of a single point, in plain numbers."""
+"""Function as `LevelSet`, for a single point, in plain numbers."""
 
 
 def descend_one(
@@ -276,8 +276,8 @@ def descend_one(
             1.0 + multiplier * h11, multiplier * h12, 1.0 + multiplier * h22, slope
         )
         size = sqrt(t1 * t1 + t2 * t2 + fall * fall)
-        share = min(1.0, stride_m / max(size, 1e-300))
-        t1, t2, fall = share * t1, share * t2, share * fall
+        fraction = min(1.0, stride_m / max(size, 1e-300))
+        t1, t2, fall = fraction * t1, fraction * t2, fraction * fall
         x += t1 * e[0] + t2 * f[0] + fall * ux
         y += t1 * e[1] + t2 * f[1] + fall * uy
         z += t1 * e[2] + t2 * f[2] + fall * uz
@@ -287,10 +287,10 @@ def descend_one(
     basis = np.array([e, f])
     inner = np.array([[h11, h12], [h12, h22]]) / length
     # Rotated with the last step's part within the first tangent plane, like the operator.
-    turned = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
+    rotated = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
     return SurfaceProjections(
         np.array([[x, y, z]]),
-        (turned / sqrt(turned @ turned))[None],
+        (rotated / sqrt(rotated @ rotated))[None],
         (basis.T @ inner @ basis)[None],
         np.array([length]),
         np.array([support]),

@@ -131,7 +131,7 @@ def unify_winding(triangles: Indices) -> Indices:
     ):
         beside[a].append((b, turn))
         beside[b].append((a, turn))
-    turned = np.zeros(count, dtype=bool)
+    flipped = np.zeros(count, dtype=bool)
     seen = np.zeros(count, dtype=bool)
     for start in range(count):
         if seen[start]:
@@ -140,11 +140,11 @@ def unify_winding(triangles: Indices) -> Indices:
         for triangle in part:
             for near, turn in beside[triangle]:
                 if not seen[near]:
-                    seen[near], turned[near] = True, turned[triangle] ^ turn
+                    seen[near], flipped[near] = True, flipped[triangle] ^ turn
                     part.append(near)
-        if turned[part].sum() > 0.5 * len(part):
-            turned[part] = ~turned[part]
-    return np.where(turned[:, None], triangles[:, ::-1], triangles)
+        if flipped[part].sum() > 0.5 * len(part):
+            flipped[part] = ~flipped[part]
+    return np.where(flipped[:, None], triangles[:, ::-1], triangles)
 
 
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
@@ -248,8 +248,8 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that cut through one another.
 
-    Found is an edge of one that passes through the inside of another with which it shares no
-    vertex. Triangles that only touch, or overlap in one plane, are not found.
+    A pair counts if an edge of one passes through the inside of the other and they share no vertex.
+    Triangles that only touch, or overlap in one plane, are not found.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -307,11 +307,11 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
     inverse = 1.0 / np.where(slanted, determinant, 1.0)
     offset = start - corners[:, 0]
     u = (offset * across).sum(1) * inverse
-    turned = np.cross(offset, first)
-    v = (along * turned).sum(1) * inverse
-    way = (second * turned).sum(1) * inverse
+    normal_cross = np.cross(offset, first)
+    v = (along * normal_cross).sum(1) * inverse
+    t = (second * normal_cross).sum(1) * inverse
     inside = (u > 1e-9) & (v > 1e-9) & (u + v < 1.0 - 1e-9)
-    return np.asarray(slanted & inside & (way > 1e-9) & (way < 1.0 - 1e-9))
+    return np.asarray(slanted & inside & (t > 1e-9) & (t < 1.0 - 1e-9))
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
@@ -331,14 +331,14 @@ def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
         for i in range(3):
             j = (i + 1) % 3
             edge = corners[:, j] - corners[:, i]
-            share = ((points - corners[:, i]) * edge).sum(1) / (edge * edge).sum(1)
-            share = np.clip(share, 0.0, 1.0)
+            t = ((points - corners[:, i]) * edge).sum(1) / (edge * edge).sum(1)
+            t = np.clip(t, 0.0, 1.0)
             weights = np.zeros((len(points), 3))
-            weights[:, i], weights[:, j] = 1.0 - share, share
+            weights[:, i], weights[:, j] = 1.0 - t, t
             candidates.append(weights)
         every = np.stack(candidates, axis=1)
-        places = every @ corners
-        closest = np.square(places - points[:, None]).sum(2).argmin(axis=1)
+        points_on_edges = every @ corners
+        closest = np.square(points_on_edges - points[:, None]).sum(2).argmin(axis=1)
         chosen = every[np.arange(len(points)), closest]
         best = np.where(outside[:, None], chosen, best)
     return best
@@ -348,7 +348,7 @@ class Facets:
     """Find nearest points on the facets of a mesh."""
 
     def __init__(self, vertices: Floats, triangles: Indices) -> None:
-        """Build the search tree; MeshError for a mesh without triangles."""
+        """Build the search tree; raise MeshError for a mesh without triangles."""
         if not len(triangles):
             raise MeshError("a mesh without triangles has no surface")
         self.corners = vertices[triangles]

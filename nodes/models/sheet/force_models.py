@@ -207,16 +207,18 @@ def _slack_place(x: float, y: float) -> float:
 
 
 def _push_tension(
-    rubber: Rubber, stretch_ratio: float, depths: Floats, place: tuple[float, float]
+    rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
     """Return the force (n,), N, that a push adds on each clamp, and E t W."""
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
-    share = depths / rubber.width_m
-    scaled = share / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
-    near = 1.0 - min(place[0], MAX_RELATIVE_X) ** 2
-    where = near**-_PULL_X * (1.0 - _PULL_Y * min(place[1], 1.0) ** 2)
+    depth_ratio = depths / rubber.width_m
+    scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
+    near = 1.0 - min(relative[0], MAX_RELATIVE_X) ** 2
+    where = near**-_PULL_X * (1.0 - _PULL_Y * min(relative[1], 1.0) ** 2)
     taut = max(stretch_ratio, 1.0) ** -_PULL_STRETCH
-    added = _PULL * modulus * taut * where * share**2 * np.sqrt(scaled / (scaled + _PULL_KNEE))
+    added = (
+        _PULL * modulus * taut * where * depth_ratio**2 * np.sqrt(scaled / (scaled + _PULL_KNEE))
+    )
     return added, modulus
 
 
@@ -254,7 +256,7 @@ class ScaledSheetModel:
         x, y = relative_position(rubber, s, position_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
         strain = strain_measure(s, rubber.mooney_share)
-        share = depths / rubber.width_m
+        depth_ratio = depths / rubber.width_m
         radius = finger_radius_m / rubber.width_m / _FITTED_RADIUS
         height = rubber.height_m / rubber.width_m
         cubic = (
@@ -265,8 +267,8 @@ class ScaledSheetModel:
             * height**_SLACK_HEIGHT
             * _slack_place(x, y)
         )
-        force = cubic * share**3
-        slope = 3.0 * cubic * share**2
+        force = cubic * depth_ratio**3
+        slope = 3.0 * cubic * depth_ratio**2
         if strain > 0.0:
             near = 1.0 - min(x, MAX_RELATIVE_X) ** 2
             taut = (
@@ -277,7 +279,7 @@ class ScaledSheetModel:
                 * near**-_TAUT_X
                 * (1.0 - _TAUT_Y * min(y, 1.0) ** _TAUT_Y_POWER)
             )
-            u = share / strain**0.5
+            u = depth_ratio / strain**0.5
             bend = (u / _KNEE) ** _KNEE_SHARPNESS
             curve = u ** (_TAUT_POWER - 1.0) * (1.0 + bend) ** (-_KNEE_POWER / _KNEE_SHARPNESS)
             force = force + taut * strain**1.5 * curve * u
@@ -389,16 +391,16 @@ def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
-    logs, places = logs[keep], np.log(grid[keep])
+    logs, log_grid = logs[keep], np.log(grid[keep])
     result = np.zeros(wanted.shape)
     some = wanted > 0.0
     if len(logs) < 2 or not some.any():
         result[some] = grid[-1]
         return result
     asked = np.log(wanted[some])
-    power = (places[1] - places[0]) / (logs[1] - logs[0])
-    before = places[0] + power * (asked - logs[0])
-    result[some] = np.exp(np.where(asked < logs[0], before, np.interp(asked, logs, places)))
+    power = (log_grid[1] - log_grid[0]) / (logs[1] - logs[0])
+    before = log_grid[0] + power * (asked - logs[0])
+    result[some] = np.exp(np.where(asked < logs[0], before, np.interp(asked, logs, log_grid)))
     return result
 
 

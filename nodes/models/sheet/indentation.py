@@ -259,8 +259,8 @@ def _barycentric_weights(nodes: Floats, at: float) -> Floats:
 
     Barycentric form: Berrut and Trefethen, SIAM Review 46, 2004, equation (5.4).
     """
-    place = float(np.clip(at, *_bounds(nodes)))
-    away = place - nodes
+    clamped = float(np.clip(at, *_bounds(nodes)))
+    away = clamped - nodes
     at_node = np.flatnonzero(np.abs(away) < 1e-14 * max(float(np.ptp(nodes)), 1e-300))
     if len(at_node):
         return np.asarray(np.eye(len(nodes))[at_node[0]])

@@ -105,7 +105,7 @@ def push_path(
         ]
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
-        raise ValueError(f"place {position_m} is not on the sheet")
+        raise ValueError(f"position {position_m} is not on the sheet")
     grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
     state = _flat(grid, stretch_ratio)
     state = _solve_equilibrium(grid, state, None)
@@ -142,7 +142,7 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
 
     On either side x = sinh(k u) / sinh(k), u uniform, with the k that gives the finest cell.
     """
-    share = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
+    left_cells = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
 
     def side(extent: float, count: int) -> Floats:
         even = np.linspace(0.0, 1.0, count + 1)
@@ -156,7 +156,7 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
         result: Floats = extent * np.sinh(high * even) / np.sinh(high)
         return result
 
-    left, right = side(focus_m, share), side(length_m - focus_m, cells - share)
+    left, right = side(focus_m, left_cells), side(length_m - focus_m, cells - left_cells)
     return np.concatenate([focus_m - left[::-1], focus_m + right[1:]])
 
 
@@ -394,8 +394,8 @@ def _carried(
 
 def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
     """Solve the equilibrium near `start` with clamped and sticking nodes fixed."""
-    held = grid.clamped if ball is None else grid.clamped | ball.sticking
-    free = np.repeat(~held, 3)
+    fixed = grid.clamped if ball is None else grid.clamped | ball.sticking
+    free = np.repeat(~fixed, 3)
     positions, damping = start, 1e-7
     stiffness_scale = grid.force_scale / grid.centre[0]
     added = np.zeros((len(start), 3, 3))
@@ -422,15 +422,15 @@ def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats
         slope = float(solved @ downhill)
         step = np.zeros_like(start)
         step.reshape(-1)[free] = solved
-        share = min(1.0, 0.1 * grid.centre[0] / max(float(np.abs(step).max()), 1e-12))
+        fraction = min(1.0, 0.1 * grid.centre[0] / max(float(np.abs(step).max()), 1e-12))
         moved = False
         for _ in range(20 if slope > 0.0 else 0):
-            trial = positions + share * step
+            trial = positions + fraction * step
             value = energy(trial)
-            if value <= current - 1e-4 * share * slope + 1e-15 * abs(current):
+            if value <= current - 1e-4 * fraction * slope + 1e-15 * abs(current):
                 positions, current, moved = trial, value, True
                 break
-            share *= 0.5
+            fraction *= 0.5
         if not moved and damping > 1e3:
             break
         damping = damping * 30.0 if not moved else max(damping / 10.0, 1e-9)

@@ -45,7 +45,7 @@ class TabulatedSheetModel:
         axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
         shape = tuple(len(axis) for axis in axes)
         if 0 in shape or any((np.diff(axis) <= 0.0).any() for axis in axes):
-            raise ValueError("a table's stretches, depths and places must ascend")
+            raise ValueError("a table's stretches, depths and positions must ascend")
         if self.ratios.shape != shape:
             raise ValueError(f"a table of {self.ratios.shape} entries for axes of {shape}")
         if not (np.isfinite(self.ratios).all() and (self.ratios > 0.0).all()):
@@ -94,8 +94,8 @@ class TabulatedSheetModel:
         asked = {
             "stretch": (stretch_ratio, self.stretches),
             "depth": (depth_m, self.depths_m),
-            "place along x": (x, self.xs_m),
-            "place along y": (y, self.ys_m),
+            "position along x": (x, self.xs_m),
+            "position along y": (y, self.ys_m),
         }
         for what, (value, axis) in asked.items():
             if not axis[0] - 1e-9 <= value <= axis[-1] + 1e-9:
@@ -109,8 +109,8 @@ def _between(axis: Floats, value: float, entries: Floats) -> Floats:
         return np.asarray(entries[0])
     value = float(np.clip(value, axis[0], axis[-1]))
     upper = int(np.clip(np.searchsorted(axis, value), 1, len(axis) - 1))
-    share = (value - axis[upper - 1]) / (axis[upper] - axis[upper - 1])
-    return np.asarray((1.0 - share) * entries[upper - 1] + share * entries[upper])
+    t = (value - axis[upper - 1]) / (axis[upper] - axis[upper - 1])
+    return np.asarray((1.0 - t) * entries[upper - 1] + t * entries[upper])
 
 
 def make_tabulated_model(
@@ -130,11 +130,11 @@ def make_tabulated_model(
     for a, stretch in enumerate(stretches):
         for c, x in enumerate(xs_m):
             for d, y in enumerate(ys_m):
-                place = (float(x), float(y))
+                position = (float(x), float(y))
                 scaled = base.evaluate(
-                    float(stretch), depths_m, position_m=place, finger_radius_m=finger_radius_m
+                    float(stretch), depths_m, position_m=position, finger_radius_m=finger_radius_m
                 )
-                ratios[a, :, c, d] = measure(float(stretch), depths_m, place) / scaled.force_n
+                ratios[a, :, c, d] = measure(float(stretch), depths_m, position) / scaled.force_n
                 done += 1
                 progress(done, total)
     return TabulatedSheetModel(base, stretches, depths_m, xs_m, ys_m, ratios)
