@@ -25,6 +25,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -33,6 +34,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
@@ -52,7 +54,9 @@ IPC, IPC_PATH_BYTES = "ipc://", 107
 BIND_PATIENCE_S = 1.0
 IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
-SUBSCRIPTION_BYTES = 1 << 16
+MAX_SUBSCRIPTION_BYTES = 512
+"""Of a frame that a publisher is sent: the largest is the last one of a CURVE handshake."""
+
 HANDSHAKE_MS = 5000
 GIVEN_UP_S = 0.5
 CLOCKS_REMEMBERED = 16
@@ -140,7 +144,8 @@ class Publisher:
 
     bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
     keys: only hosts of this ring may connect by tcp; without it tcp is bound on loopback alone.
-    on_refused: told of connections that were refused.
+    on_refused: called with a sentence for each connection that was refused or closed; without a
+        running loop, on a thread of its own.
     """
 
     def __init__(
@@ -155,7 +160,9 @@ class Publisher:
         self.endpoints: list[str] = []
         self._last: list[Any] | None = None
         self._latched = topic.delivery is Delivery.LATCHED
-        self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
+        self._by_tcp = any(one.startswith("tcp:") for one in bind)
+        self._keys = keys if self._by_tcp else None
+        self._on_refused = on_refused
         self._domain: bytes | None = None
         if self._keys is not None:
             self._domain = Gatekeeper.admit(self._keys, on_refused)
@@ -166,12 +173,17 @@ class Publisher:
             raise
 
     def _open(self, bind: Sequence[str]) -> None:
-        self._loop = asyncio.get_running_loop() if self._latched else None
-        self._socket = _open_socket(zmq.XPUB if self._latched else zmq.PUB, self.topic)
+        # Only an XPUB socket can be read.  Reading it lets ZeroMQ free what ended connections used,
+        # although nothing is sent.
+        is_read = self._latched or self._keys is not None
+        self._loop = asyncio.get_running_loop() if is_read else None
+        self._socket = _open_socket(zmq.XPUB if is_read else zmq.PUB, self.topic)
         endpoints = []
         try:
             if self._latched:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+            if self._by_tcp:
+                ConnectionGuard.watch(self._socket, self._on_closed_by_guard)
             # What is bound before keys are set is open to this host, which ipc alone reaches.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
                 if endpoint.startswith("tcp:"):
@@ -181,6 +193,7 @@ class Publisher:
                         self._keys.serve(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
+            self._socket.disable_monitor()
             self._socket.close(linger=0)
             raise
         self.endpoints = endpoints
@@ -217,17 +230,32 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Send the last message again if somebody subscribed; until nobody else did meanwhile."""
-        while not self._socket.closed and self._new_subscribers() and self._last is not None:
-            self._send(self._last)
-
-    def _new_subscribers(self) -> bool:
-        found = False
-        try:
-            while True:
+        """Read a batch of subscriptions; send the last message again if there is a new one."""
+        if self._socket.closed or self._loop is None:
+            return
+        found = drained = False
+        for _ in range(BATCH):
+            try:
                 found |= self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
-        except zmq.Again:
-            return found
+            except zmq.Again:
+                drained = True
+                break
+        if found and self._last is not None:
+            self._send(self._last)
+            # `_send` may have taken the event of another subscription away from the loop.
+            drained = False
+        if not drained and not self._loop.is_closed():
+            self._loop.call_soon(self._serve_late_subscribers)
+
+    def _on_closed_by_guard(self, address: str, reason: str) -> None:
+        """Report a closed connection, on the loop if there is one; called on the guard's thread."""
+        text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
+        if self._loop is None:
+            self._on_refused(text)
+            return
+        # Nobody reads the report of a loop that has ended.
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._on_refused, text)
 
     def forget(self) -> None:
         """Keep nothing for late subscribers any more, until the next message."""
@@ -250,6 +278,7 @@ class Publisher:
         if unbind:
             for endpoint in self.endpoints:
                 self._socket.unbind(endpoint)
+        self._socket.disable_monitor()
         self._socket.close(linger=LINGER_MS)
 
     def _dismiss(self) -> None:
@@ -654,8 +683,11 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         options[zmq.MAXMSGSIZE] = topic.max_bytes + REFUSABLE_BYTES
         options |= VANISHED
     else:
-        # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
-        options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES
+        # A publisher is sent subscriptions and handshakes; `ConnectionGuard` bounds their sum.  So
+        # the queue needs no limit.  Where one is full when its sender hangs up, libzmq 4.3.5 aborts
+        # the process with the next heartbeat.
+        options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
+        options[zmq.RCVHWM] = 0
     for option, value in options.items():
         opened.setsockopt(option, value)
     return opened
