@@ -30,7 +30,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.console.desk import Desk, Files, Finger, ReleaseError
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.node import Node, NodeParameters, Output, parameters_of
-from flexsheet.nodes.runner import Links
+from flexsheet.nodes.runner import NodeTransport
 from tests.arm_states import arm_state
 from tests.test_security import target
 from tests.waiting import until
@@ -104,7 +104,7 @@ class Street:
         self.rings = make_rings(plan, run, None)
         config = node_config(plan, plan.nodes[BRIDGE], run)
         class_ = node_class(config.type)
-        self.links = Links(config, structlog.get_logger())
+        self.links = NodeTransport(config, structlog.get_logger())
         self.bridge = class_(
             parameters_of(class_).model_validate(config.parameters),
             name=config.name,
@@ -162,7 +162,7 @@ class Street:
 
 @contextmanager
 def street_of(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
-    monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
+    monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
     street = Street(plan)
     monkeypatch.setattr(street.bridge, "deliver", street.hear)
     street.links.open_inputs(street.bridge)

@@ -34,7 +34,7 @@ ATTACKERS = 4
 MAX_GROWTH_KB = 256_000
 """What is stored before the guard's thread runs on a busy computer; the attack would take 1 GB."""
 
-MAX_CONNECTIONS_OF_ATTACKER = 60
+MAX_CONNECTIONS_OF_ATTACKER = 12
 DEADLINE_S = 60
 
 PUBLISHER = """
