@@ -102,11 +102,19 @@ def ring_of_two(folder: Path) -> Iterator[KeyRing]:
     del os.environ[RING_VARIABLE]
 
 
+async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publisher:
+    """Open a publisher on this loop that another thread sends with: the loop stops reading it."""
+    publisher = Publisher(topic, bind, keys=keys)
+    await asyncio.sleep(0)
+    asyncio.get_running_loop().remove_reader(publisher._socket.fileno())
+    return publisher
+
+
 def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict[str, Any]]:
     """Per payload: p50 and p99 of both designs, and the medians of their ratios per round."""
 
     async def open_publisher(topic: Topic, endpoint: str) -> Publisher:
-        return Publisher(topic, [endpoint], keys=keys)
+        return await open_for_thread(topic, [endpoint], keys)
 
     async def close_publisher(publisher: Publisher) -> None:
         publisher.close()

@@ -41,9 +41,7 @@ from rich.progress import Progress
 from benchmarks import keys, messaging, peers
 from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
 from flexsheet.launch.methods.results import machine_name
-from flexsheet.messages.bus import Publisher
 from flexsheet.messages.security import KeyRing
-from flexsheet.messages.topics import Topic
 
 CLONE_NEWNET = 0x40000000
 ADDRESSES = ("10.78.0.1", "10.78.0.2")
@@ -116,10 +114,12 @@ class KeyedLine(BusLine):
     """A publisher with keys, which needs a loop that turns."""
 
     def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: keys.Loop) -> None:
-        async def opened(topic: Topic, bind: list[str]) -> Publisher:
-            return Publisher(topic, bind, keys=ring)
-
-        super().__init__(OURS_KEYED, payload, place, lambda topic, at: loop.do(opened(topic, at)))
+        super().__init__(
+            OURS_KEYED,
+            payload,
+            place,
+            lambda topic, at: loop.do(keys.open_for_thread(topic, at, ring)),
+        )
         self._loop = loop
 
     def close(self) -> None:

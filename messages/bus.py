@@ -3,15 +3,15 @@
 A publisher binds, subscribers connect, in any order; either side may be restarted.  A subscriber
 reads its plain (not asyncio) sockets in a callback of the loop and calls the handler right there:
 of the designs in `benchmarks/messaging.py` this has the least latency, and there is no pending
-`recv` that could be cancelled with a message in it.
+`recv` whose cancellation could lose a message.
 
-A subscriber has one socket per host that it hears, so that it knows from where each message comes:
-a host is believed only what its own writers say.  Beyond loopback nothing is bound or connected
-without keys (`flexsheet.messages.security`).
+A subscriber has one socket per host that it reads, so that it knows from which host each message
+comes.  It accepts from a host only messages of the writers that run there.  Beyond loopback nothing
+is bound or connected without keys (`flexsheet.messages.security`).
 
-ZeroMQ's file descriptor is edge-triggered: it tells that something changed, not that something is
-there, and any call on the socket may swallow the news.  So each callback reads until nothing is
-left or comes back by itself, and nothing but the callback touches a socket that is being read.
+ZeroMQ's file descriptor is edge-triggered: it signals that a state changed, not that a message is
+ready, and any call on the socket can clear the signal.  So each callback reads until the socket is
+empty or schedules itself again, and no other code uses a socket that is being read.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -33,6 +34,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
 from flexsheet.messages.topics import Delivery, Topic
@@ -40,25 +42,27 @@ from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]
-Objection = Callable[[Any, Header], str | None]
-"""Says why a message must not be taken although all its fields are right; None: it may."""
+MessageFilter = Callable[[Any, Header], str | None]
+"""Returns why a valid message is not accepted, or None if it is."""
 
-QUEUE_SECONDS = 0.5
-QUEUE_LENGTH = 1000
-QUEUE_LENGTH_MIN = 16
-QUEUE_BYTES = 1 << 30
+QUEUE_S = 0.5
+MAX_QUEUE_LENGTH = 1000
+MIN_QUEUE_LENGTH = 16
+MAX_QUEUE_BYTES = 1 << 30
 BATCH = 256
 LINGER_MS = 500
 IPC, IPC_PATH_BYTES = "ipc://", 107
-BIND_PATIENCE_S = 1.0
+BIND_TIMEOUT_S = 1.0
 IPC_CLOSING_S = 0.02
-REFUSABLE_BYTES = 256 << 20
-SUBSCRIPTION_BYTES = 1 << 16
-HANDSHAKE_MS = 5000
-GIVEN_UP_S = 0.5
-CLOCKS_REMEMBERED = 16
+MAX_EXCESS_BYTES = 256 << 20
+MAX_SUBSCRIPTION_BYTES = 512
+"""Size limit of the frames that a publisher receives; the largest ends a CURVE handshake."""
 
-# As plain numbers: what Python's enumerations do with them takes longer than ZeroMQ.
+HANDSHAKE_MS = 5000
+REOPEN_DELAY_S = 0.5
+MAX_PAST_CLOCKS = 16
+
+# Plain numbers, because operations on Python's enumerations take longer than ZeroMQ's calls.
 EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 NOBLOCK, NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -66,14 +70,14 @@ _log = logging.getLogger("flexsheet.bus")
 
 
 HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
-"""Publishers ask by tcp, and tell subscribers to expect it; within a host nobody vanishes unseen.
+"""Publishers send heartbeats by tcp only; ipc reports by itself that a process has ended.
 
-A subscriber must not ask by itself: libzmq 4.3.5 aborts the process when its heartbeat comes due
-after a publisher has gone whose messages still fill the queue.  For the same reason no publisher
-asks where it need not: a reader that is busy for long answers nothing, and is then hung up on.
+Subscribers send none: libzmq 4.3.5 aborts the process when a heartbeat is due after the publisher
+has disconnected while its messages still fill the queue.  A reader that is busy for long answers
+none, and would be disconnected; so publishers send none by ipc.
 """
 
-VANISHED = {
+TCP_KEEPALIVE_OPTIONS = {
     zmq.TCP_KEEPALIVE: 1,
     zmq.TCP_KEEPALIVE_IDLE: 1,
     zmq.TCP_KEEPALIVE_INTVL: 1,
@@ -81,11 +85,10 @@ VANISHED = {
     zmq.TCP_MAXRT: 5000,
     zmq.CONNECT_TIMEOUT: 2000,
 }
-"""A subscriber leaves it to its system to ask whether the publisher's is there still, and hangs up
-after 5 s without an answer, at once where it was started anew meanwhile.
+"""Kernel probes by which a subscriber detects within 5 s that the publisher's host has gone.
 
-The publisher's heartbeats are not enough: libzmq 4.3.5 waits for the next one only until a message
-comes, and a subscriber says nothing by which it could learn that nobody listens any more.
+A host that restarted meanwhile is detected at once.  The publisher's heartbeats are not enough:
+libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
@@ -93,19 +96,19 @@ HANDSHAKE_FAILED: dict[int, str] = {
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not speak with our keys; does it run without any?",
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "did not prove that it has its key",
 }
-COMING_BACK = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
-WATCHED = zmq.EVENT_DISCONNECTED | sum(COMING_BACK) | sum(HANDSHAKE_FAILED)
+RECONNECTED = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
+MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAILED)
 
 
 class BusError(FlexsheetError, RuntimeError):
-    """A socket that cannot be had; the sentence names topic and endpoint."""
+    """A socket cannot be opened; the text names topic and endpoint."""
 
     code = "bus"
     remedy = "Another graph has the endpoint. End that graph, or run `flexsheet doctor --sweep`."
 
 
 class Counts(Protocol):
-    """Where a subscriber counts what its handler does not see."""
+    """Counters of the messages that a subscriber does not pass to its handler."""
 
     dropped: int
     gaps: int
@@ -113,24 +116,23 @@ class Counts(Protocol):
 
 
 def queue_length(topic: Topic) -> int:
-    """Messages that either end of a connection holds for a reader that is busy.
+    """Return how many messages each end of a connection queues for a busy reader.
 
-    ZeroMQ refuses the newest when it is full, so on `latest` topics the queue must outlast the
-    longest handler: half a second at the topic's highest rate.  On others it is as long as memory
-    allows.
+    A full queue drops the newest message.  So on `latest` topics the queue must outlast the slowest
+    handler: half a second at the topic's highest rate.  On others memory limits it.
     """
     if topic.delivery is Delivery.LATEST and topic.rate_hz is not None:
-        wanted = round(QUEUE_SECONDS * topic.rate_hz[1])
+        wanted = round(QUEUE_S * topic.rate_hz[1])
     else:
-        wanted = min(QUEUE_LENGTH, QUEUE_BYTES // topic.max_bytes)
-    return max(QUEUE_LENGTH_MIN, wanted)
+        wanted = min(MAX_QUEUE_LENGTH, MAX_QUEUE_BYTES // topic.max_bytes)
+    return max(MIN_QUEUE_LENGTH, wanted)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a subscriber connects to, and who may speak there; None: anybody.
+    """An endpoint that a subscriber connects to, and the writer expected there; None: any.
 
-    host: whose key must answer at a tcp endpoint, where there are keys.
+    host: the host whose key must answer at a tcp endpoint, if there are keys.
     """
 
     endpoint: str
@@ -139,12 +141,14 @@ class Source:
 
 
 class Publisher:
-    """Sends the messages of one topic to whoever is connected; needs a running loop if latched or
-    if there are keys.
+    """Sends the messages of one topic to all subscribers.
+
+    A latched topic and keys need a running loop.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
     keys: only hosts of this ring may connect by tcp; without it tcp is bound on loopback alone.
-    on_refused: told of connections that were refused.
+    on_refused: called with a sentence for each connection that was refused or closed; without a
+        running loop, on a thread of its own.
     """
 
     def __init__(
@@ -159,23 +163,30 @@ class Publisher:
         self.endpoints: list[str] = []
         self._last: list[Any] | None = None
         self._latched = topic.delivery is Delivery.LATCHED
-        self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
+        self._by_tcp = any(one.startswith("tcp:") for one in bind)
+        self._keys = keys if self._by_tcp else None
+        self._on_refused = on_refused
         self._domain: bytes | None = None
         if self._keys is not None:
             self._domain = Gatekeeper.admit(self._keys, on_refused)
         try:
             self._open(bind)
         except BaseException:
-            self._dismiss()
+            self._unregister_keys()
             raise
 
     def _open(self, bind: Sequence[str]) -> None:
-        self._loop = asyncio.get_running_loop() if self._latched else None
-        self._socket = _open_socket(zmq.XPUB if self._latched else zmq.PUB, self.topic)
+        # Only an XPUB socket can be read.  Reading it lets ZeroMQ free what ended connections used,
+        # although nothing is sent.
+        is_read = self._latched or self._keys is not None
+        self._loop = asyncio.get_running_loop() if is_read else None
+        self._socket = _open_socket(zmq.XPUB if is_read else zmq.PUB, self.topic)
         endpoints = []
         try:
             if self._latched:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
+            if self._by_tcp:
+                ConnectionGuard.watch(self._socket, self._on_closed_by_guard)
             # What is bound before keys are set is open to this host, which ipc alone reaches.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
                 if endpoint.startswith("tcp:"):
@@ -185,6 +196,7 @@ class Publisher:
                         self._keys.serve(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
+            self._socket.disable_monitor()
             self._socket.close(linger=0)
             raise
         self.endpoints = endpoints
@@ -193,15 +205,15 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Open anew where a key is ours no more, or somebody's who may be connected."""
+        """Open the socket again if this host's key or that of a host of the ring has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
 
     def send(self, message: Message, header: Header) -> None:
-        """Hand the message to the socket; never blocks.
+        """Pass the message to the socket without blocking.
 
-        Its large arrays are not copied and must not be changed afterwards.  Raises WireError for a
+        Large arrays are not copied and must not be changed afterwards.  Raises WireError for a
         message that is larger than the topic allows.
         """
         frames = encode(message, header, max_bytes=self.topic.max_bytes)
@@ -211,7 +223,7 @@ class Publisher:
             self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
-        # A PUB socket drops for a subscriber whose queue is full, which that one sees as a gap.
+        # ZeroMQ drops the message for a subscriber whose queue is full, which counts it as a gap.
         send = self._socket.send
         if len(frames) == 1:
             send(frames[0], NOBLOCK)
@@ -221,32 +233,47 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Send the last message again if somebody subscribed; until nobody else did meanwhile."""
-        while not self._socket.closed and self._new_subscribers() and self._last is not None:
-            self._send(self._last)
-
-    def _new_subscribers(self) -> bool:
-        found = False
-        try:
-            while True:
+        """Read a batch of subscriptions; send the last message again if there is a new one."""
+        if self._socket.closed or self._loop is None:
+            return
+        found = drained = False
+        for _ in range(BATCH):
+            try:
                 found |= self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
-        except zmq.Again:
-            return found
+            except zmq.Again:
+                drained = True
+                break
+        if found and self._last is not None:
+            self._send(self._last)
+            # `_send` may have taken the event of another subscription away from the loop.
+            drained = False
+        if not drained and not self._loop.is_closed():
+            self._loop.call_soon(self._serve_late_subscribers)
+
+    def _on_closed_by_guard(self, address: str, reason: str) -> None:
+        """Report a closed connection, on the loop if there is one; called on the guard's thread."""
+        text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
+        if self._loop is None:
+            self._on_refused(text)
+            return
+        # Nobody reads the report of a loop that has ended.
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._on_refused, text)
 
     def forget(self) -> None:
-        """Keep nothing for late subscribers any more, until the next message."""
+        """Discard the message for late subscribers; the next one sent replaces it."""
         self._last = None
 
     def close(self) -> None:
-        """Give the endpoints free; what was sent is still delivered for half a second."""
+        """Release the endpoints; messages sent before are still delivered for half a second."""
         if self._socket.closed:
             return
         for endpoint in self.endpoints:
-            # ZeroMQ leaves the file; removed before the socket closes, it cannot be a successor's.
+            # ZeroMQ leaves the file.  Before the socket closes it cannot be a successor's file.
             if endpoint.startswith(IPC):
                 Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
         self._close_socket(unbind=False)
-        self._dismiss()
+        self._unregister_keys()
 
     def _close_socket(self, *, unbind: bool) -> None:
         if self._loop is not None and not self._loop.is_closed():
@@ -254,9 +281,10 @@ class Publisher:
         if unbind:
             for endpoint in self.endpoints:
                 self._socket.unbind(endpoint)
+        self._socket.disable_monitor()
         self._socket.close(linger=LINGER_MS)
 
-    def _dismiss(self) -> None:
+    def _unregister_keys(self) -> None:
         if self._domain is not None:
             Gatekeeper.dismiss(self._domain)
             self._domain = None
@@ -265,18 +293,18 @@ class Publisher:
 class Subscriber:
     """Receives one topic and calls `on_message(message, header)` on the loop's thread.
 
-    connect: the endpoints of all writers; a writer may come later or come again.  A `Source` says
-        besides who may write there, and a host by whose key it is known.
-    counts: gets what was superseded or overflown, lost on the way, or refused.
-    on_problem: told in a sentence of losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
-        topics, where losing is meant), of the first refusal for each cause, and of an exception in
-        `on_message`, which ends nothing.
-    on_handshake_failed: gets the problem of each handshake that fails; None: `on_problem` does.
-    unopened: call `on_message(frames, header)` with every message that came, whatever the topic's
-        delivery; its fields are not looked at.
-    keys: ours and those of the hosts; without it tcp leads to loopback alone.
-    plan: only messages of this plan are taken; None: of any.
-    objection: asked about each message before it is handed over.
+    connect: the endpoints of all writers; a writer may start later or restart.  A `Source` also
+        names the writer expected there, and the host whose key must answer.
+    counts: counters of superseded, lost and rejected messages.
+    on_problem: called with a sentence for losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
+        topics, which may lose messages), for the first rejection of each cause, and for an
+        exception in `on_message`, after which the subscriber continues.
+    on_handshake_failed: called with the problem of each failed handshake; None: `on_problem`.
+    unopened: call `on_message(frames, header)` with every message, whatever the topic's
+        delivery; the fields are not validated.
+    keys: this host's key and those of the others; without it tcp connects to loopback only.
+    plan: accept only messages of this plan; None: of any.
+    message_filter: called with each valid message before `on_message`.
     """
 
     def __init__(
@@ -291,14 +319,14 @@ class Subscriber:
         unopened: bool = False,
         keys: KeyRing | None = None,
         plan: str | None = None,
-        objection: Objection | None = None,
+        message_filter: MessageFilter | None = None,
     ) -> None:
         self.topic, self.counts, self.on_problem = topic, counts, on_problem
         self.on_handshake_failed = on_handshake_failed or on_problem
-        self._on_message, self._objection, self._plan = on_message, objection, plan
+        self._on_message, self._message_filter, self._plan = on_message, message_filter, plan
         self._latched = topic.delivery is Delivery.LATCHED
-        newest_only = topic.delivery is Delivery.LATEST and not unopened
-        self._seen: dict[str, _Writer] = {}
+        latest_only = topic.delivery is Delivery.LATEST and not unopened
+        self._writers_seen: dict[str, _Writer] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
         self._started = False
@@ -306,39 +334,43 @@ class Subscriber:
         for one in connect:
             source = one if isinstance(one, Source) else Source(one)
             by_host.setdefault(source.host, []).append(source)
-        self._lines = [
-            _Line(self, host, sources, keys, newest_only=newest_only, unopened=unopened)
+        self._connections = [
+            _HostConnection(self, host, sources, keys, latest_only=latest_only, unopened=unopened)
             for host, sources in (by_host or {None: []}).items()
         ]
 
     def start(self) -> None:
-        """Connect and begin to deliver; needs a running loop."""
+        """Connect and start to deliver; needs a running loop."""
         if self._started:
             raise BusError(f'topic "{self.topic.name}": this subscriber has been started already')
         try:
-            for line in self._lines:
-                line.open()
+            for connection in self._connections:
+                connection.open()
         except BaseException:
             self.close()
             raise
         self._started = True
 
     def close(self) -> None:
-        """Stop at once; may be called from the handler."""
-        for line in self._lines:
-            line.close()
+        """Stop at once; the handler may call this."""
+        for connection in self._connections:
+            connection.close()
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Connect anew to hosts whose key has changed, and to all when our own has."""
-        for line in self._lines:
-            if line.secured and not line.closed and (change.own or line.host in change.hosts):
-                line.close()
-                line.open()
+        """Connect again to hosts whose key has changed, and to all if this host's key has."""
+        for connection in self._connections:
+            if (
+                connection.secured
+                and not connection.closed
+                and (change.own or connection.host in change.hosts)
+            ):
+                connection.close()
+                connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """The envelope, its sequence number accounted for; None if refused or seen before.
+        """Read the envelope and count lost messages; None if it is rejected or a repetition.
 
-        writers: who may speak where it came from; None: anybody.
+        writers: the writers expected at the endpoint; None: any.
         """
         try:
             envelope = read_envelope(frames, self.topic)
@@ -355,9 +387,9 @@ class Subscriber:
                     f"{header.writer} belongs to plan {header.plan!r:.40}, here it is "
                     f"{self._plan}; start all hosts with the same launch file, scene and settings",
                 )
-            known = self._seen.get(header.writer)
+            known = self._writers_seen.get(header.writer)
             if known is None:
-                self._seen[header.writer] = _Writer(header)
+                self._writers_seen[header.writer] = _Writer(header)
                 return envelope
             lost = known.follow(header)
         except WireError as error:
@@ -374,11 +406,11 @@ class Subscriber:
         return envelope
 
     def deliver(self, envelope: Envelope) -> None:
-        """Validate and hand over."""
+        """Validate the message and call the handler."""
         header = envelope.header
         try:
             message = envelope.open()
-            why = None if self._objection is None else self._objection(message, header)
+            why = None if self._message_filter is None else self._message_filter(message, header)
             if why is not None:
                 raise WireError("forbidden", why)
         except WireError as error:
@@ -387,7 +419,7 @@ class Subscriber:
         self.call(message, header)
 
     def call(self, message: Any, header: Header) -> None:
-        """Call the handler; what it raises ends nothing."""
+        """Call the handler; report an exception and continue."""
         try:
             self._on_message(message, header)
         except Exception as error:
@@ -397,7 +429,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a message that is not taken; its cause is told once."""
+        """Count a rejected message; report the first of each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
@@ -405,8 +437,8 @@ class Subscriber:
 
     def _count_gap(self, lost: int, writer: str) -> None:
         self.counts.gaps += lost
-        newest_only = self.topic.delivery is Delivery.LATEST
-        if not newest_only and self.counts.gaps >= self._report_gaps_from:
+        latest_only = self.topic.delivery is Delivery.LATEST
+        if not latest_only and self.counts.gaps >= self._report_gaps_from:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
                 f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
@@ -415,22 +447,23 @@ class Subscriber:
 
 
 class _Writer:
-    """How far a writer has come; what lies before is not taken again.
+    """Newest start and sequence number of a writer; older messages are rejected as replayed.
 
-    A restart on the same clock is known by its later epoch, one after a reboot by a new clock,
-    which then never is the former one again.
+    A restart on the same clock has a later epoch.  A restart after a reboot has a new clock; the
+    former clocks are then rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
 
     def __init__(self, header: Header) -> None:
         self.clock_id, self.epoch, self.sequence = header.clock_id, header.epoch, header.sequence
-        self.past_clocks: deque[str] = deque(maxlen=CLOCKS_REMEMBERED)
+        self.past_clocks: deque[str] = deque(maxlen=MAX_PAST_CLOCKS)
 
     def follow(self, header: Header) -> int:
-        """Messages lost before this one; below 0: it is not new, -1 for the newest again.
+        """Return the number of messages lost before this one.
 
-        Raises WireError for a message from before the writer's newest start.
+        Below 0 the message is not new; -1 is a repetition of the newest.  Raises WireError for a
+        message from before the writer's newest start.
         """
         if header.clock_id != self.clock_id:
             if header.clock_id in self.past_clocks:
@@ -450,8 +483,8 @@ class _Writer:
         return 0
 
 
-class _Line:
-    """One socket of a subscriber: what one host says on its topic."""
+class _HostConnection:
+    """One socket of a subscriber: the messages of one host."""
 
     def __init__(
         self,
@@ -460,11 +493,11 @@ class _Line:
         sources: list[Source],
         keys: KeyRing | None,
         *,
-        newest_only: bool,
+        latest_only: bool,
         unopened: bool,
     ) -> None:
         self._subscriber, self.host, self._sources, self._keys = subscriber, host, sources, keys
-        self._newest_only, self._unopened = newest_only, unopened
+        self._latest_only, self._unopened = latest_only, unopened
         rate_hz = subscriber.topic.rate_hz
         self._fresh_ns = 0 if rate_hz is None else int(0.5e9 / rate_hz[1])
         known = [one.writer for one in sources if one.writer is not None]
@@ -472,8 +505,8 @@ class _Line:
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._told: set[int] = set()
-        self._lost: set[bytes] = set()
+        self._reported_events: set[int] = set()
+        self._disconnected: set[bytes] = set()
 
     @property
     def closed(self) -> bool:
@@ -481,25 +514,25 @@ class _Line:
 
     @property
     def secured(self) -> bool:
-        """Whether keys are asked for."""
+        """Whether the connection uses keys."""
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:
-        """Connect and begin to read."""
+        """Connect and start to read."""
         topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
         try:
             if self._unopened:
-                # Who takes frames gives way to others, for seconds on a busy computer.  A full
-                # queue would leave the publisher's heartbeats unread, and what follows once it has
-                # hung up is the abort that `_open_socket` tells of.
+                # A recorder has low priority and may not run for seconds on a busy computer.  A
+                # full queue would leave the publisher's heartbeats unread, so that it disconnects,
+                # and libzmq would abort as `HEARTBEATS` describes.
                 self._socket.setsockopt(zmq.RCVHWM, 0)
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             if self.secured:
-                self._monitor = self._socket.get_monitor_socket(WATCHED)
-                self._loop.add_reader(self._monitor.fileno(), self._hear_of_connections)
-                self._loop.call_soon(self._hear_of_connections)
+                self._monitor = self._socket.get_monitor_socket(MONITORED_EVENTS)
+                self._loop.add_reader(self._monitor.fileno(), self._handle_monitor_events)
+                self._loop.call_soon(self._handle_monitor_events)
             for source in self._sources:
                 _check_endpoint(topic, source.endpoint)
                 if self._keys is not None and self.host is not None:
@@ -517,7 +550,7 @@ class _Line:
             self.close()
             raise
         self._loop.add_reader(self._socket.fileno(), self._read)
-        # The calls above may have swallowed the first wake-up.
+        # The calls above can have cleared the first signal.
         self._loop.call_soon(self._read)
 
     def close(self) -> None:
@@ -532,57 +565,57 @@ class _Line:
             self._monitor = None
         for one in opened:
             one.close(linger=0)
-        self._lost.clear()
+        self._disconnected.clear()
 
-    def _hear_of_connections(self) -> None:
-        """The loop's callback: where ZeroMQ gives a connection up, make it anew by and by.
+    def _handle_monitor_events(self) -> None:
+        """Connect again later where ZeroMQ has ended a connection for good; a loop callback.
 
-        It does so where keys were refused, and where what came was not what the other end sent.
+        ZeroMQ does so after a refused key and after data that was changed on the way.
         """
         while self._monitor is not None:
             try:
-                news = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
+                event_fields = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
             except zmq.Again:
                 break
-            event, endpoint = int(news["event"]), bytes(news["endpoint"])
-            if event in COMING_BACK:
-                self._lost.discard(endpoint)
+            event, endpoint = int(event_fields["event"]), bytes(event_fields["endpoint"])
+            if event in RECONNECTED:
+                self._disconnected.discard(endpoint)
                 continue
-            self._lost.add(endpoint)
+            self._disconnected.add(endpoint)
             if self._loop is not None:
-                self._loop.call_later(GIVEN_UP_S, self._reopen, self._socket)
-            if event in HANDSHAKE_FAILED and event not in self._told:
-                self._told.add(event)
+                self._loop.call_later(REOPEN_DELAY_S, self._reopen, self._socket)
+            if event in HANDSHAKE_FAILED and event not in self._reported_events:
+                self._reported_events.add(event)
                 self._subscriber.on_handshake_failed(
                     f'topic "{self._subscriber.topic.name}": host {self.host} '
                     f"{HANDSHAKE_FAILED[event]}"
                 )
 
     def _reopen(self, lost: zmq.Socket[bytes] | None) -> None:
-        if lost is self._socket and self._lost and not self.closed:
+        if lost is self._socket and self._disconnected and not self.closed:
             self.close()
             self.open()
 
     def _read(self) -> None:
-        """The loop's callback: deliver what is there, or a batch of it and come back."""
+        """Deliver the messages that have arrived, in batches; a loop callback."""
         if self._socket is None or self._socket.closed or self._loop is None:
             return
         drained = False
         try:
-            drained = self._deliver_newest() if self._newest_only else self._deliver_every()
+            drained = self._deliver_newest() if self._latest_only else self._deliver_every()
         finally:
             if not drained and not self._socket.closed:
                 self._loop.call_soon(self._read)
 
     def _deliver_newest(self) -> bool:
-        """Hand over the newest message of each writer; the fields of others are not looked at.
+        """Deliver the newest message of each writer, without validating the others.
 
-        The first is handed over at once where it left its writer less than half a period ago.
+        The first message is delivered at once if it is younger than half a period.
         """
         newest: dict[str, Envelope] = {}
         drained = False
         for number in range(BATCH):
-            # Asking for events costs less than the exception of a recv in vain.
+            # Reading the events costs less than the exception of a `recv` without a message.
             if number and not self._has_more():
                 drained = True
                 break
@@ -595,11 +628,11 @@ class _Line:
                 continue
             header = envelope.header
             if not number and 0 <= time.monotonic_ns() - header.publish_ns < self._fresh_ns:
-                # Nothing newer is to be expected yet: it need not wait for the answer.  Stamps of
-                # another clock at worst let an older one pass before a newer.
+                # No newer message can have arrived yet, so the events need not be read first.
+                # With stamps of another clock an older message may be delivered before a newer.
                 self._deliver(envelope)
                 continue
-            # Taken out first, so that the order is that of arrival.
+            # Removed first, so that the order is that of arrival.
             self._subscriber.counts.dropped += newest.pop(header.writer, None) is not None
             newest[header.writer] = envelope
         for envelope in newest.values():
@@ -629,7 +662,7 @@ class _Line:
         return bool(events & POLLIN)
 
     def _receive(self) -> list[Any] | None:
-        """The frames of one message, or None where there is none; large ones are not copied."""
+        """Return the frames of one message without a copy, or None if there is no message."""
         if self._socket is None or self._socket.closed:
             return None
         try:
@@ -652,28 +685,32 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.LINGER: LINGER_MS,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 500,
-        # Whoever connects and says nothing is not kept.
+        # Connections without a handshake are closed.
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }
     if kind == zmq.SUB:
-        # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
-        # merely too large is let in, to be refused and counted; this limit saves the memory.
-        options[zmq.MAXMSGSIZE] = topic.max_bytes + REFUSABLE_BYTES
-        options |= VANISHED
+        # A larger frame makes ZeroMQ end the connection for good without a report.  So frames that
+        # are only too large for the topic are received, rejected and counted.  This limit bounds
+        # the memory.
+        options[zmq.MAXMSGSIZE] = topic.max_bytes + MAX_EXCESS_BYTES
+        options |= TCP_KEEPALIVE_OPTIONS
     else:
-        # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
-        options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES
+        # A publisher is sent subscriptions and handshakes; `ConnectionGuard` bounds their sum.  So
+        # the queue needs no limit.  Where one is full when its sender hangs up, libzmq 4.3.5 aborts
+        # the process with the next heartbeat.
+        options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
+        options[zmq.RCVHWM] = 0
     for option, value in options.items():
         opened.setsockopt(option, value)
     return opened
 
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
-    """Bind and return the endpoint with its port filled in."""
+    """Bind the socket and return the endpoint with its actual port."""
     _check_endpoint(topic, endpoint)
     if keys is None:
         _refuse_beyond_loopback(topic, endpoint)
-    patience_ends = time.monotonic() + BIND_PATIENCE_S
+    deadline_s = time.monotonic() + BIND_TIMEOUT_S
     while True:
         try:
             if _ipc_is_served(endpoint):
@@ -686,8 +723,8 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
                     f'topic "{topic.name}": {endpoint} cannot be bound: {error.strerror}; '
                     "is its folder or address on this host?"
                 ) from error
-            # A writer that was just closed keeps its endpoint until ZeroMQ's thread lets go of it.
-            if time.monotonic() > patience_ends:
+            # ZeroMQ's thread releases the endpoint of a closed writer a little later.
+            if time.monotonic() > deadline_s:
                 raise BusError(
                     f'topic "{topic.name}": {endpoint} is in use by another process; '
                     "is the same launch file running already?"
@@ -698,7 +735,7 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 
 
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
-    """Refuse what ZeroMQ would take silently (a port of 99999) or explain badly."""
+    """Raise BusError for endpoints that ZeroMQ accepts silently or reports unclearly."""
     transport, _, place = endpoint.partition("://")
     port = place.rpartition(":")[2]
     if transport == "tcp" and port != "*" and not (port.isdecimal() and 0 < int(port) < 1 << 16):
@@ -715,7 +752,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
-    """Nothing speaks beyond this machine without keys."""
+    """Raise BusError for a tcp endpoint beyond loopback; called where there are no keys."""
     transport, _, place = endpoint.partition("://")
     if transport != "tcp":
         return
@@ -732,7 +769,7 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
 
 
 def _ipc_is_served(endpoint: str) -> bool:
-    """Whether somebody listens there: binding would take the path from under him."""
+    """Return whether a process listens at the path; binding would take the path from it."""
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):
         return False
@@ -740,7 +777,7 @@ def _ipc_is_served(endpoint: str) -> bool:
         try:
             probe.connect(path)
         except ConnectionRefusedError:
-            # The file is a killed writer's, or one that is closing now will remove it: not ours!
+            # Either a killed writer left the file, or a writer that closes now will remove it.
             time.sleep(IPC_CLOSING_S)
             return False
         except OSError:

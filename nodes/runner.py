@@ -1,4 +1,4 @@
-"""Runs one node live: its inputs and outputs on sockets, its timers on the loop, its status out.
+"""Runs one node live: connects its ports to sockets, runs its timers and publishes its status.
 
 The launcher writes a `NodeConfig` to a file and starts one process per node with it; a test may
 call `run_node` in its own loop.
@@ -23,7 +23,7 @@ import uvloop
 from pydantic import BaseModel, ConfigDict
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.bus import Objection, Publisher, Source, Subscriber
+from flexsheet.messages.bus import MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import Delivery, Topic, topic_named
@@ -42,7 +42,7 @@ KEYS_PERIOD_S = 1.0
 class PortConfig(BaseModel):
     """One port of a node: the topic it is connected to and where.
 
-    endpoints: ZeroMQ's; those of an input may say who writes there.
+    endpoints: ZeroMQ endpoints; those of an input can name the writer expected there.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -53,11 +53,11 @@ class PortConfig(BaseModel):
 
 
 class NodeConfig(BaseModel):
-    """All that one node's process needs to know.
+    """Configuration of one node's process.
 
-    keys_file: of a `KeyRing`, where there are keys.
+    keys_file: the file of a `KeyRing`; None: there are no keys.
     estop_resetters: writers that may reset an e-stop; None: all.
-    clocks: where the host's clock node says what the others' clocks show; None: there is one host.
+    clocks: the topic on which the host's clock node reports other hosts' clocks; None: one host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -75,7 +75,7 @@ class NodeConfig(BaseModel):
     ready_fd: int | None = None
 
 
-class Links:
+class NodeTransport:
     """The sockets of one node, by topic (outputs) and by port (inputs)."""
 
     def __init__(self, config: NodeConfig, log: Any) -> None:
@@ -131,11 +131,11 @@ class Links:
                 on_problem=partial(self._tell, node),
                 unopened=node.takes_frames,
                 keys=self.keys,
-                # How others are must be seen most of all when they are not as they should be.
+                # The status of nodes with another plan must be shown as well.
                 plan=None
                 if node_input.topic.message in (Status, HostStatus)
                 else self._config.plan_hash,
-                objection=self._objection(node_input.topic),
+                message_filter=self._message_filter(node_input.topic),
             )
             subscriber.start()
             self._subscribers.append(subscriber)
@@ -143,7 +143,7 @@ class Links:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Let a node that moves something be stopped though its launcher does not answer."""
+        """Open a socket that stops a node with devices although its launcher does not respond."""
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -157,24 +157,24 @@ class Links:
         node.last_error = text
         self._log.warning("input", problem=text)
 
-    def _objection(self, topic: Topic) -> Objection | None:
+    def _message_filter(self, topic: Topic) -> MessageFilter | None:
         allowed = self._config.estop_resetters
         if topic.message not in (EStop, Arming) or allowed is None:
             return None
 
-        def objection(word: EStop | Arming, header: Header) -> str | None:
-            asks = not word.engaged if isinstance(word, EStop) else word.ready
-            if not asks or header.writer in allowed:
+        def rejection_reason(message: EStop | Arming, header: Header) -> str | None:
+            permits = not message.engaged if isinstance(message, EStop) else message.ready
+            if not permits or header.writer in allowed:
                 return None
             return (
                 f"{header.writer} may not reset an e-stop or let the arms move; the launch file "
                 "says whose hosts may: hosts.NAME.may_reset_estop"
             )
 
-        return objection
+        return rejection_reason
 
     def renew_keys(self) -> None:
-        """Read the keys again if they have changed, and connect anew what that concerns."""
+        """Read the keys again if they have changed, and reconnect the sockets concerned."""
         if self.keys is None:
             return
         try:
@@ -219,15 +219,15 @@ async def run_timer(node: Node, number: int, timer: Timer) -> None:
         await asyncio.sleep(due_s - now_s)
 
 
-async def run_keys(links: Links) -> None:
-    """Look once a second whether keys have changed."""
+async def run_keys(links: NodeTransport) -> None:
+    """Check once a second whether keys have changed."""
     while True:
         await asyncio.sleep(KEYS_PERIOD_S)
         links.renew_keys()
 
 
 async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
-    """Publish the node's status once a second, and report to the launcher that the loop runs."""
+    """Publish the node's status once a second, and signal the launcher that the loop runs."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
@@ -236,9 +236,10 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
-    """Make the status message, with rates, ages, losses and errors of every port.
+    """Make the status message with rates, ages, drops and errors of every port.
 
-    Degraded: an error or a loss since the last status. A gap on a `latest` topic does not count.
+    Degraded: an error, a rejection or a gap since the last status, gaps of `latest` topics
+    excepted.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -269,7 +270,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     """Build the node, connect it, and run it until `stop` is set or a task of it fails."""
     class_ = node_class(config.type)
     log = structlog.get_logger().bind(node=config.name)
-    links = Links(config, log)
+    links = NodeTransport(config, log)
     node = class_(
         parameters_of(class_).model_validate(config.parameters),
         name=config.name,
@@ -297,7 +298,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         tasks.append(asyncio.create_task(stop.wait()))
         if links.keys is not None:
             tasks.append(asyncio.create_task(run_keys(links)))
-        # Objects of setup live on; unfrozen, the garbage collector would traverse them in a cycle.
+        # Without this the collector would scan the objects made by `setup` while the node runs.
         gc.collect()
         gc.freeze()
         heartbeat.beat()
@@ -316,8 +317,8 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
 async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
     """Cancel tasks until they have ended.
 
-    Once is not always enough: a library under a handler can swallow a cancellation (as `wait_for`
-    of Python 3.11 does when its result comes at the same moment).
+    A library within a handler can suppress a cancellation, as `wait_for` of Python 3.11 does when
+    its result arrives at the same moment.
     """
     pending = {task for task in tasks if not task.done()}
     while pending:
@@ -327,10 +328,9 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """Report to the launcher over a pipe that the node is set up (first byte) and alive (others).
+    """The pipe to the launcher: the first byte reports that the node is ready, others that it runs.
 
-    fd: the writing end, None without a launcher. A launcher that does not read never blocks the
-    node.
+    fd: the pipe's end; None without a launcher.  Writing never blocks.
     """
 
     def __init__(self, fd: int | None) -> None:
@@ -340,8 +340,8 @@ class Heartbeat:
 
     def beat(self) -> None:
         if self._fd is not None:
-            # A full pipe holds enough beats.  A broken one means that the launcher is gone, and its
-            # lifeline ends this process.
+            # A full pipe holds enough beats.  If the launcher has ended, its lifeline ends this
+            # process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
@@ -349,13 +349,13 @@ class Heartbeat:
 async def run_until_signal(config: NodeConfig) -> None:
     """Run the node until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    # A launcher that is gone is reported by the kernel and by the lifeline, with a signal each.
+    # The kernel and the lifeline each send a signal when the launcher has ended.
     with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
         await run_node(config, stop)
 
 
 def main(config_path: str) -> int:
-    """Entry of a node's process; returns its exit code."""
+    """Run a node's process and return its exit code."""
     config = NodeConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[
@@ -370,7 +370,7 @@ def main(config_path: str) -> int:
     try:
         uvloop.run(run_until_signal(config))
     except Exception as error:
-        # The last place that can say why the process ends; the launcher reads the exit code.
+        # The last point that can log why the process ends; the launcher reads the exit code.
         structlog.get_logger().error("node ends", node=config.name, error=str(error), exc_info=True)
         return 1
     return 0

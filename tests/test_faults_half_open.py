@@ -208,7 +208,7 @@ async def test_a_computer_that_loses_its_power_in_mid_stream_is_missed_and_heard
 
 async def listen(ring: Path, endpoint: str, record: Path) -> None:
     """Write down the epoch and number of all that is heard; patient for 2 s in place of 5."""
-    bus.VANISHED[zmq.TCP_MAXRT] = 2000
+    bus.TCP_KEEPALIVE_OPTIONS[zmq.TCP_MAXRT] = 2000
     with record.open("a", buffering=1) as file:
 
         def hear(_: TwinFinger, header: Header) -> None:

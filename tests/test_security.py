@@ -27,7 +27,7 @@ from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, SheetTarget
 from flexsheet.messages.wire import encode
 from flexsheet.nodes.node import PortCounts
-from flexsheet.nodes.runner import Links, NodeConfig
+from flexsheet.nodes.runner import NodeConfig, NodeTransport
 from tests.hosts import Hosts, hosts
 from tests.network import Cut
 from tests.test_messages_bus import ForeignPublisher, finger, pictures, stop
@@ -226,7 +226,7 @@ class Meddler(Cut):
 async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
     street: Street, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
+    monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
     mouth = street.mouth()
     chance = random.Random(2)
 
@@ -477,23 +477,23 @@ def node_config(**keys: Any) -> NodeConfig:
 
 
 def test_who_may_reset_an_estop() -> None:
-    links = Links(node_config(estop_resetters=("tools",)), None)
-    objection = links._objection(ESTOP)
+    links = NodeTransport(node_config(estop_resetters=("tools",)), None)
+    objection = links._message_filter(ESTOP)
     assert objection is not None
     reset = EStop(engaged=False, reason="")
     arm, tools = replace(HEADER, writer="arm_left_bridge"), replace(HEADER, writer="tools")
     assert "may not reset" in str(objection(reset, arm))
     assert objection(reset, tools) is None
     assert objection(stop("all may stop"), arm) is None
-    assert links._objection(FINGER) is None
-    assert Links(node_config(), None)._objection(ESTOP) is None
+    assert links._message_filter(FINGER) is None
+    assert NodeTransport(node_config(), None)._message_filter(ESTOP) is None
 
 
 def test_a_forbidden_message_is_counted_and_not_handed_over() -> None:
     ear = Ear()
     subscriber = Subscriber(
         ESTOP, [], ear.hear, ear.counts, on_problem=ear.problems.append,
-        objection=lambda message, header: None if message.engaged else "not so",
+        message_filter=lambda message, header: None if message.engaged else "not so",
     )  # fmt: skip
     for number, engaged in enumerate((True, False, True), start=8):
         message = EStop(engaged=engaged, reason="")

@@ -31,7 +31,7 @@ from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles, 
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.node import Node, NodeParameters, Output, parameters_of
-from flexsheet.nodes.runner import Links
+from flexsheet.nodes.runner import NodeTransport
 from tests.arm_states import arm_state
 from tests.test_security import target
 from tests.waiting import until
@@ -105,7 +105,7 @@ class Street:
         self.rings = make_rings(plan, run, None)
         config = node_config(plan, plan.nodes[BRIDGE], run)
         class_ = node_class(config.type)
-        self.links = Links(config, structlog.get_logger())
+        self.links = NodeTransport(config, structlog.get_logger())
         self.bridge = class_(
             parameters_of(class_).model_validate(config.parameters),
             name=config.name,
@@ -163,7 +163,7 @@ class Street:
 
 @contextmanager
 def street_of(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
-    monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
+    monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
     street = Street(plan)
     monkeypatch.setattr(street.bridge, "deliver", street.hear)
     street.links.open_inputs(street.bridge)

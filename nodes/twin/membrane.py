@@ -42,7 +42,7 @@ MAX_STEP_RADII = 0.7
 MAX_ITERATIONS = 80
 
 
-class NotConvergedError(RuntimeError):
+class NotConvergedError(FlexsheetError, RuntimeError):
     """Raised when the membrane's equilibrium is not found; the message gives the residual."""
 
     code = "membrane"
