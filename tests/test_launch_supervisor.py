@@ -523,7 +523,7 @@ def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
         environment = {**os.environ, **({runs.RUN_VARIABLE: tag} if tag else {})}
         processes[name] = subprocess.Popen(["sleep", "1000"], env=environment)
     try:
-        wait_until(lambda: len(runs.orphans()) == 1, "sleep to be started")
+        wait_until(lambda: len(runs.find_orphans()) == 1, "sleep to be started")
         assert runs.sweep() == [processes["orphan"].pid]
         assert processes["orphan"].poll() is not None
         assert processes["living"].poll() is None
@@ -536,10 +536,10 @@ def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
 
 
 def test_old_runs_are_tidied_up(runs_root: Path) -> None:
-    for i in range(runs.FINISHED_RUNS_KEPT + 3):
+    for i in range(runs.MAX_FINISHED_RUNS + 3):
         (runs_root / f"1.{i}.1").mkdir(parents=True)
     runs.sweep()
-    assert len(runs.all_runs()) == runs.FINISHED_RUNS_KEPT
+    assert len(runs.all_runs()) == runs.MAX_FINISHED_RUNS
 
 
 def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:
