@@ -45,7 +45,7 @@ class Span:
 Work = Callable[[Span], Awaitable[Any]]
 
 SIDES = ("left", "right")
-LONGEST_M = 0.24 * 1.15
+MAX_LENGTH_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
 """A bridge that says nothing for so long follows nothing."""
@@ -300,7 +300,9 @@ async def main() -> int:
         assert scene is not None
         pair = read_arm(lab.folder, "left", scene), read_arm(lab.folder, "right", scene)
         cases = rows(results, pair, wanted(lab.folder), gaps(lab.folder))
-    bad = [one for one in results if one.back_s is None or one.faults or one.longest_m > LONGEST_M]
+    bad = [
+        one for one in results if one.back_s is None or one.faults or one.longest_m > MAX_LENGTH_M
+    ]
     violations = [one.trouble for one in bad]
     speed = max(arm.fastest() for arm in pair)
     violations += ["joint speed"] if speed > 1.0 else []

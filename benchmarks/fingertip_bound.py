@@ -29,7 +29,7 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 FULL_LEVEL = 255.0
 NUISANCES = 4
 MAX_CONDITION = 1e10
-"""Of the information with its diagonal scaled to one; beyond it, something cannot be told."""
+"""Largest condition number of the information matrix, scaled to a diagonal of one."""
 
 
 class BoundError(ValueError):

@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 MEMORY_MIB = 2048
-LONGEST_S = 20
+MAX_S = 20
 FOUND = ("crash", "oom", "timeout")
 """How atheris names the files of what it finds."""
 
-LONGEST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
 MODULES = {
     "wire": ("flexsheet.messages.wire", "flexsheet.messages.bus", "flexsheet.messages.arrays"),
@@ -78,8 +78,8 @@ def hunt(name: str, corpus: Path, seconds: float) -> None:
         f"-max_total_time={seconds:.0f}",
         f"-artifact_prefix={corpus}/",
         f"-rss_limit_mb={MEMORY_MIB}",
-        f"-timeout={LONGEST_S}",
-        f"-max_len={LONGEST_BYTES}",
+        f"-timeout={MAX_S}",
+        f"-max_len={MAX_BYTES}",
         "-print_final_stats=1",
         "-verbosity=1",
     ]

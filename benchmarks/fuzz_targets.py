@@ -325,7 +325,7 @@ def run_wire(data: bytes) -> bool:
 
 
 def mutate_wire(data: bytes, chance: random.Random) -> bytes:
-    """Of the header's values, of its bytes, or of the frames."""
+    """Mutate the header's values, its bytes, or the frames."""
     frames = [bytes(one) for one in wire_frames(data)[1]]
     kind = chance.randrange(10)
     if kind < 6:
@@ -427,7 +427,7 @@ def joined(records: Sequence[Record]) -> bytes:
 
 
 def mutate_bag(data: bytes, chance: random.Random) -> bytes:
-    """Of its records, of those within a chunk (its check sum made right), or of the bytes."""
+    """Mutate its records, those within a chunk (with a correct check sum), or the bytes."""
     if chance.random() < 0.2 or not data.startswith(MAGIC):
         return mutate_bytes(data, chance)
     records = records_of(data[len(MAGIC) :])
@@ -528,7 +528,7 @@ BOMB = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]\n" 
 
 
 def mutate_yaml(data: bytes, chance: random.Random) -> bytes:
-    """Of its values, or of its text with what YAML is known to stumble over."""
+    """Mutate its values, or its text with constructs that YAML parsers handle badly."""
     text = data.decode(errors="replace")
     kind = chance.randrange(10)
     if kind < 6:
@@ -770,7 +770,7 @@ def modbus_seeds() -> list[bytes]:
 
 
 def run_modbus(data: bytes) -> bool:
-    """As the answer of an arm, and its registers as a status and as a command."""
+    """Decode it as the answer of an arm, and its registers as a status and as a command."""
     taken = fake_arm().ask(data)
     body = data[10 : 10 + 2 * _REGISTERS]
     registers = list(struct.unpack(f">{len(body) // 2}H", body[: len(body) // 2 * 2]))
@@ -809,7 +809,7 @@ def _mxt_controller() -> MxtController:
 
 
 def run_mxt(data: bytes) -> bool:
-    """As an answer, and packet by packet as commands."""
+    """Decode it as an answer, and packet by packet as commands."""
     taken = True
     try:
         status = decode_answer(data)

@@ -41,7 +41,7 @@ WITHOUT, WITH = NODES_USE, "the same with keys"
 
 
 def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
-    """As nodes listen to another host; the key ring is the one that the environment names."""
+    """Subscribe as nodes do to another host; the key ring is that of the environment."""
 
     async def run() -> None:
         ended = asyncio.get_running_loop().create_future()

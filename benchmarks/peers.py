@@ -39,7 +39,7 @@ DORA_STARTS_S, DORA_ENDS_S = 20.0, 5.0
 
 
 def raw_bytes(payload: Payload) -> bytearray:
-    """As many bytes as our message has, in one piece; they begin with sequence and stamp."""
+    """Make one block as long as our message; it begins with sequence and stamp."""
     return bytearray(b"".join(encode(payload.make(0), header_of(0, 0))))
 
 
@@ -265,7 +265,7 @@ class DdsLine:
 
 
 def dds_value(value: Any) -> Any:
-    """As the binding wants it: octets, or a list of numbers."""
+    """Convert the bytes to the type of the binding: octets, or a list of numbers."""
     if isinstance(value, np.ndarray):
         return value.tobytes() if value.dtype == np.uint8 else value.ravel().tolist()
     return list(value) if isinstance(value, tuple) else value

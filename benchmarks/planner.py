@@ -76,7 +76,7 @@ def geometries() -> dict[str, Mapping[str, Any]]:
 
 
 def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlanner:
-    """As the planner makes it of its own parameters, the object in the world's frame."""
+    """Make the planner's model from its own parameters, the object in the world frame."""
     here = Pose(position_m=np.zeros(3), rpy_rad=np.zeros(3))
     body = scene.object.model_validate(
         {**dict(scene.object), "geometry": dict(geometry), "world_from_object": here}
@@ -104,7 +104,7 @@ def make_compliance(scene: Scene) -> ComplianceController:
     return compliance
 
 
-def anew(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
+def copy_planner(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
     """The same plan with nothing done yet: a mesh's takes a second to make."""
     other = copy.copy(plan)
     other._contact_state = copy.copy(plan._contact_state)  # it changes by assignment only
@@ -155,7 +155,7 @@ def time_steps(
     fingers = session(shape)
     times = np.full(len(fingers), np.inf)
     for _ in range(REPEATS):
-        steps = list(follow(anew(plan), fingers, compliance))
+        steps = list(follow(copy_planner(plan), fingers, compliance))
         times = np.minimum(times, [took for took, _ in steps])
     phases = np.array([planned.command.phase for _, planned in steps])
     cells = []
@@ -186,7 +186,7 @@ def normal_error_deg(
     )
     still = np.repeat(fingers[:1], 90, axis=0)
     above = still + 0.02 * normals[0]
-    steps = list(follow(anew(plan), np.concatenate([above, still, fingers]), compliance))
+    steps = list(follow(copy_planner(plan), np.concatenate([above, still, fingers]), compliance))
     found = shape.closest(fingers, previous=np.repeat(points[:1], count, axis=0))
     return float(
         np.degrees(

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.faults import LONGEST_M, Result, Span, kill, kill_launcher, tried
+from benchmarks.faults import MAX_LENGTH_M, Result, Span, kill, kill_launcher, tried
 from flexsheet.launch.running.runs import MAX_FINISHED_RUNS, RUN_VARIABLE
 from flexsheet.launch.running.tools import READER_RECONNECT_S
 from flexsheet.messages.bag import FLUSH_PERIOD_S
@@ -251,7 +251,7 @@ def moves_under_estop(arm: Arm) -> float:
 
 
 async def restore(lab: Lab) -> None:
-    """After a fault that has left the arms stuck: all launchers anew, so that the rest counts."""
+    """Restart all launchers after a fault that left the arms stuck, so that later faults count."""
     for host in HOSTS:
         await lab.cable(host)
     for process in lab.launchers.values():
@@ -327,7 +327,7 @@ def evaluate(lab: Lab, results: list[Result], watch: Watch) -> dict[str, Any]:
     violations = [f"stuck after: {one.trouble}" for one in results if one.back_s is None]
     violations += [f"{one.trouble}: {', '.join(one.faults)}" for one in results if one.faults]
     longest_m = max((one.longest_m for one in results), default=0.0)
-    if longest_m > LONGEST_M:
+    if longest_m > MAX_LENGTH_M:
         violations.append(f"sheet of {1e3 * longest_m:.0f} mm")
     speeds = []
     for side in ("left", "right"):

@@ -2,7 +2,7 @@
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.shapes [MESH METRES_PER_UNIT]
 
-Prints the time of a single query for every shape, anew and on from the point before; then for a
+Prints the time of a single query for every shape, without and with the previous point; then for a
 mesh (an ellipsoid's by default), for several lengths of smoothing: how far it leaves the mesh, the
 share of its area that is an edge, and the largest second derivative of the normal along straightest
 ways, beside that of facets and of blended vertex normals.  Under two minutes.
@@ -62,9 +62,9 @@ def time_queries(name: str, shape: Shape) -> None:
     base = shape.closest(rng.uniform(-0.05, 0.05, (QUERIES, 3)))
     near = base.point + rng.uniform(-0.01, 0.01, (QUERIES, 1)) * base.normal
     before = shape.closest(near + MOVED_M / np.sqrt(3.0)).point
-    anew = microseconds(lambda i: shape.closest(near[i]))
+    first = microseconds(lambda i: shape.closest(near[i]))
     going_on = microseconds(lambda i: shape.closest(near[i], previous=before[i]))
-    print(f"{name:12}  anew {anew}   going on {going_on}", flush=True)
+    print(f"{name:12}  first {first}   next {going_on}", flush=True)
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float) -> tuple[Floats, Floats, Bools]:

@@ -74,9 +74,9 @@ Floats = NDArray[np.float64]
 SAMPLE_S = 10.0
 WARM_UP_S = 600.0
 WARM_UP_SHARE = 0.25
-"""Of a run that is shorter than four warm-ups."""
+"""Warm-up, as a fraction of a run that is shorter than four warm-ups."""
 
-SHORTEST_FIT_S = 900.0
+MIN_FIT_S = 900.0
 """Over less time than that, caches that fill look like leaks."""
 
 READER_NICE = 15
@@ -84,11 +84,11 @@ READER_NICE = 15
 GROWTH_B_PER_H = 2 << 20
 """Surely more than this is a finding: 0.3 GB in a week."""
 
-LEAST_GROWTH_B = 1 << 20
+MIN_GROWTH_B = 1 << 20
 DRIFT_RATIO = 1.2
-"""Of the last third's median latency over the first third's."""
+"""Largest ratio of the last third's median latency to the first third's."""
 
-LEAST_DRIFT_MS = 1.0
+MIN_DRIFT_MS = 1.0
 LAUNCHER = "launcher"
 MIB = 1 << 20
 
@@ -428,14 +428,14 @@ def start_busy_process() -> subprocess.Popen[bytes]:
 
 
 def give_way() -> None:
-    """Of the process that reads bags while the graph is being measured."""
+    """Return the memory of the process that reads bags during the measurement."""
     os.nice(READER_NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def slope(times_s: Floats, values: Floats) -> Slope | None:
     """Theil and Sen's: the median of the slopes between all pairs; None over too short a time."""
-    if times_s[-1] - times_s[0] < SHORTEST_FIT_S:
+    if times_s[-1] - times_s[0] < MIN_FIT_S:
         return None
     found = theilslopes(values, times_s / 3600.0)
     return Slope(float(found.slope), float(found.low_slope), float(found.high_slope))
@@ -446,7 +446,7 @@ def warm_up_s(lived_s: float) -> float:
 
 
 def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
-    """What became of a process; of one that was started anew, of its newest start."""
+    """What became of a process; of one that was restarted, of its newest start."""
     pid = samples[-1].pid
     ours = [one for one in samples if one.pid == pid]
     settled_from_s = ours[0].time_s + warm_up_s(ours[-1].time_s - ours[0].time_s)
@@ -534,7 +534,7 @@ def findings(result: dict[str, Any]) -> list[str]:
         memory = process["uss"]
         rate = memory["slope_per_h"]
         grown = memory["end"] - memory["settled"]
-        if rate and rate["low_per_h"] > GROWTH_B_PER_H and grown > LEAST_GROWTH_B:
+        if rate and rate["low_per_h"] > GROWTH_B_PER_H and grown > MIN_GROWTH_B:
             found.append(
                 f"{name}: memory grows by {rate['per_h'] / MIB:.1f} MiB/h "
                 f"(at least {rate['low_per_h'] / MIB:.1f})"
@@ -572,7 +572,7 @@ def drifts(windows: Sequence[dict[str, Any]]) -> list[str]:
         if third < 2 or len(medians) < len(windows):
             continue
         early, late = np.median(medians[:third]), np.median(medians[-third:])
-        if late > DRIFT_RATIO * early and late - early > LEAST_DRIFT_MS:
+        if late > DRIFT_RATIO * early and late - early > MIN_DRIFT_MS:
             found.append(
                 f"exposure {what[:-3].replace('_', ' ')}: {early:.1f} ms became {late:.1f}"
             )

@@ -48,7 +48,7 @@ DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
 STEP_M, STEPS = 2e-5, 300
 FROM_M = (0.004, 0.003)
-FINEST_TOUCH_ANGLE_RAD = 0.7
+MIN_TOUCH_ANGLE_RAD = 0.7
 """The finest mesh is touchable over less of the front, so that its table fits into memory."""
 
 
@@ -177,7 +177,7 @@ def measure(scene: Scene, spacing_m: float) -> None:
     """Precompute one mesh, cold and warm, slide over it, print."""
     spec = body.make_soft_body_spec(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
-        mesh = replace(spec.mesh, touch_angle_rad=FINEST_TOUCH_ANGLE_RAD)
+        mesh = replace(spec.mesh, touch_angle_rad=MIN_TOUCH_ANGLE_RAD)
         spec = replace(spec, mesh=mesh)
     with tempfile.TemporaryDirectory() as folder:
         times = [time.perf_counter()]

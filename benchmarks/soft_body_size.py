@@ -55,7 +55,7 @@ CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
 """Wider than the method's range, so that the contact grows with the depth."""
-TABLE_BYTES, MOST_PLACES = 400_000_000, 800
+TABLE_BYTES, MAX_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
 STEPS = 600
 SLOW_STEP_M = 2e-5
@@ -99,7 +99,7 @@ def patch_of(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
     front = touched[int(touched[:, 2].argmax())]
     order = np.argsort(np.abs(touched - front).max(axis=1), kind="stable")
     kept = np.zeros(len(touched), dtype=bool)
-    kept[order[: min(MOST_PLACES, TABLE_BYTES // row_bytes)]] = True
+    kept[order[: min(MAX_PLACES, TABLE_BYTES // row_bytes)]] = True
     faces = mesh.contact_faces[kept[mesh.contact_faces].all(axis=1)]
     return np.unique(faces), faces
 

@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000] [--json]
 
 A finger makes gestures, slow and fast, before the sheet; after half a second, in which it is seen
-alone, it is in a crowd drawn anew for every 2000 frames: beads like the mark that swing past it or
+alone, it is in a crowd redrawn for every 2000 frames: beads like the mark that swing past it or
 lie still, lamps' images in one view or both, some brighter than the mark, cables before it all; its
 mark is hidden at random for up to a second, and frames are lost.  The triangulator has the shipped
 calibration.  Prints
@@ -76,7 +76,7 @@ MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
 
 SOLE_CANDIDATE_TIME_S = 0.5
 BLINKS_PER_S = 0.4
-LONGEST_BLINK_FRAMES = 60
+MAX_BLINK_FRAMES = 60
 LOST_FRAMES_SHARE = 0.01
 SIGMAS = (3, 4, 5, 6)
 BEYOND_MM = (0.3, 1.0, 5.0)
@@ -145,7 +145,7 @@ def gestures(scene: Scene, random: np.random.Generator) -> Iterator[FingerPath]:
 def exposures(
     scene: Scene, alone: TwinCamera, crowded: TwinCamera, count: int, random: np.random.Generator
 ) -> Iterator[Frame]:
-    """So many frames at the camera's rate, some lost, the mark hidden now and then."""
+    """Make a number of frames at the camera's rate; some are lost, in some the marker is hidden."""
     period_s = 1.0 / scene.camera.rate_hz
     hidden_until = -1
     tick = taken = 0
@@ -153,7 +153,7 @@ def exposures(
         tick += 1
         camera = alone if tick * period_s < SOLE_CANDIDATE_TIME_S else crowded
         if camera is crowded and tick > hidden_until and random.random() < BLINKS_PER_S * period_s:
-            length = LONGEST_BLINK_FRAMES ** random.random()
+            length = MAX_BLINK_FRAMES ** random.random()
             hidden_until = tick + int(length)
         if random.random() >= LOST_FRAMES_SHARE:
             taken += 1

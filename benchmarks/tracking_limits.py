@@ -69,7 +69,7 @@ AFTERMATH_S = 0.3
 """What comes so soon after a gap or a step of the clock counts as disturbed by it."""
 
 CHARTS = ROOT / "docs" / "charts"
-LARGEST_DEFOCUS_APERTURE_M = 0.05
+MAX_DEFOCUS_APERTURE_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +259,7 @@ def _exact_camera(baseline_mm: float, scene: Scene) -> TwinCamera:
 def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Stage:
     motion = drawing(scene, repetition)
     depth_m = clean().eyes[0].see(motion(BEFORE_S))[1]
-    aperture = Sensor(aperture_m=LARGEST_DEFOCUS_APERTURE_M)
+    aperture = Sensor(aperture_m=MAX_DEFOCUS_APERTURE_M)
     sensor = aperture.out_of_focus(defocus_px, round(depth_m, 2), scene.camera.left.fx_px)
     return passing(scene, motion, before(_camera(Clutter(), sensor)))
 

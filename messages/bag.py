@@ -50,7 +50,7 @@ CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
 SUMMARY_RECORD_BYTES_MAX = 64 << 20
 CHUNK_BYTES_MAX = 256 << 20
-"""Of a chunk unpacked; a writer closes one after 1 MiB, or with the message that goes beyond."""
+"""Largest uncompressed chunk; a writer closes a chunk with the message that exceeds 1 MiB."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")

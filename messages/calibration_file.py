@@ -97,7 +97,7 @@ def read_calibration(
     if content["version"] != version:
         raise CalibrationFileError(
             f"{path}: version: {content['version']!r}, this program reads {version}; "
-            f"calibrate anew with `{command}`"
+            f"calibrate again with `{command}`"
         )
     try:
         return kind.model_validate(content)

@@ -18,7 +18,7 @@ class Clock(Protocol):
 
 
 def boot_id() -> str:
-    """The kernel's random identity of this boot; CLOCK_MONOTONIC starts anew with it."""
+    """The kernel's random identity of this boot; CLOCK_MONOTONIC restarts with it."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 

@@ -34,13 +34,13 @@ MAX_BYTES_PER_S = 256
 """An encrypted answer to a heartbeat has 40 bytes, once per second."""
 
 MAX_CONNECTIONS_PER_ADDRESS = 64
-"""Of one publisher: nodes of a computer that read the topic, its recorder and its tools."""
+"""Connections of a publisher per address: nodes of a computer, its recorder and its tools."""
 
 EXCLUSION_S = 1.0
 """How long an address that sent too much is refused; connections that it already has stay open."""
 
 RECEIVE_BUFFER_BYTES = 16_384
-"""Of each connection; what it holds is still read after the connection was closed."""
+"""Receive buffer of a connection; its content is still read after the connection is closed."""
 
 THREAD_NAME = "connection guard"
 TCP_INFO_FORMAT, TCP_INFO_BYTES_RECEIVED = "=Q", 128

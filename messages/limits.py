@@ -41,7 +41,7 @@ MAX_STRETCH_RATIO = 10.0
 """Natural rubber breaks below it."""
 
 MAX_NUMBER = 1e9
-"""Of a number without a unit."""
+"""Largest magnitude of a number without a unit."""
 
 MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50
@@ -84,16 +84,16 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""By the end of a name, the longest first."""
+"""Largest magnitudes by the suffix of a name; longer suffixes first."""
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""Of fields that must be above zero; a fraction of what any device resolves."""
+"""Smallest values of fields above zero; a fraction of the resolution of any device."""
 
 MIN_POSITIVE = 1e-9
-"""Of those without such a unit."""
+"""Smallest value of fields above zero without such a unit."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""Of a rotation matrix times its transpose, per element: 0.05 mm at half a metre."""
+"""Largest error of an element of R Rᵀ for a rotation matrix R: 0.05 mm at half a metre."""
 
 
 class LimitedModel(BaseModel):

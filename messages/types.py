@@ -150,7 +150,7 @@ class SheetTarget(Message):
 ArmMode = Literal[
     "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
 ]
-"""Of them "starting" is no fault: the arm has not answered since its bridge was started."""
+"""Mode of an arm; in "starting" the arm has not answered since its bridge was started."""
 
 
 class ArmState(Message):

@@ -51,12 +51,12 @@ DTYPES = tuple(
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
 HEADER_BYTES_MAX = 1 << 20
-"""Of the header frame: larger arrays are frames of their own.  Its smallest values, a byte each,
-take up to 64 times as much as objects."""
+"""Largest header frame; larger arrays have frames of their own.  Its smallest values, a byte each,
+take up to 64 times as much memory as objects."""
 
 ELEMENTS_MAX = 4096
-"""Of an array or a map in the header.  An array that only claims to be long asks for its room
-before its elements are there, and may be the first element of another one."""
+"""Most elements of an array or a map in the header.  A decoder allocates the announced length
+before it reads the elements, and arrays can be nested."""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2

@@ -22,7 +22,7 @@ Ints = NDArray[np.int64]
 Field = Callable[[Floats], Floats]
 """Points (k, 3) to vectors (k, 3), or to gradients (k, 3, 3) with the derivative last."""
 
-MOST_ITERATIONS = 40
+MAX_ITERATIONS = 40
 SYMMETRIC = {"SymmetricMode": True}
 SETTLED = 1e-9
 """Newton's last step over the displacement."""
@@ -195,7 +195,7 @@ def equilibrium(
     moved = np.zeros(3 * len(solid.nodes))
     for share in np.arange(1, steps + 1) / steps:
         step = np.zeros_like(moved)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             matrix = tangent_matrix(solid, moved.reshape(-1, 3))
             residual = solid.forces(moved.reshape(-1, 3)).ravel() - share * loads
             step[held] = share * values - moved[held]

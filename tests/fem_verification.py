@@ -20,7 +20,7 @@ import pytest
 Record = Callable[[str, Any], None]
 """Pytest's fixture `record_property`."""
 KEY = "verified"
-"""Of what is recorded: (what, as measured, tolerance), plain text that crosses processes."""
+"""Values to record: (name, measured, tolerance), plain text that crosses processes."""
 
 
 def at_most(record: Record, what: str, measured: float, limit: float) -> None:

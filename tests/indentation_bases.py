@@ -13,14 +13,14 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 
 RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
 RADIUS_M = 0.007
-LEAST_STRETCH, MAX_STRETCH_RATIO, DEEPEST_M = 1.04, 1.06, 0.03
+MIN_STRETCH, MAX_STRETCH_RATIO, DEEPEST_M = 1.04, 1.06, 0.03
 ELEMENT_CELLS = 20
 
 
 @cache
 def few_dents() -> IndentationBasis:
     within = IndentationRange(
-        LEAST_STRETCH,
+        MIN_STRETCH,
         MAX_STRETCH_RATIO,
         DEEPEST_M,
         stretch_nodes=2,

@@ -244,11 +244,11 @@ class Lab:
         return process.returncode, output.decode()
 
     async def cable(self, host: str, **values: Any) -> None:
-        """As that of `Network`."""
+        """See `Network`."""
         await self.network.cable(host, **values)
 
     def run_directory(self, host: str) -> Path | None:
-        """Of the newest launcher there that has got so far as to write its plan."""
+        """Return the directory of the newest launcher there that has written its plan."""
         found = sorted(
             (self.folder / host / "r").glob("*/plan.json"), key=lambda path: path.stat().st_mtime_ns
         )
@@ -318,7 +318,7 @@ class Lab:
     async def _stroke(self) -> None:
         """Tell it so in each run of the main computer, and whenever it is through.
 
-        A twin that is started anew within a run takes the path again by itself, which is latched.
+        A twin that is restarted within a run takes the path again by itself, which is latched.
         """
         plan = self.plan()
         scene = plan.scene_message()
@@ -373,7 +373,7 @@ class Lab:
         raise AssertionError(f"{node} does not run on {host}")
 
     def restarts(self, host: str, node: str) -> int:
-        """How often it has been started anew; -1 while it is not ready."""
+        """How often it has been restarted; -1 while it is not ready."""
         status = self.status(host)
         found = [one for one in status.nodes if one.name == node] if status else []
         return found[0].restarts if found and found[0].state == "ready" else -1

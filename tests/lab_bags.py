@@ -111,7 +111,7 @@ class Arm:
         here = np.flatnonzero(there)
         steps_s = (sent[later[there]] - sent[here]) * 1e-9
         speeds = np.abs(commanded[later[there]] - commanded[here]) / steps_s[:, None]
-        # Across a time without commands the arm may have been started anew elsewhere.
+        # Across a time without commands the arm may have been restarted elsewhere.
         return float((speeds[steps_s < 2 * SPEED_OVER_S] / SPEED_RAD_PER_S).max(initial=0.0))
 
     def leaves_range(self) -> bool:

@@ -44,7 +44,7 @@ def geometry(shape: str) -> dict[str, Any]:
 
 @cache
 def scene_solid(shape: str) -> SolidMesh:
-    """As the solver meshes it, with the support of the scene."""
+    """Mesh the object as the solver does, with the support of the scene."""
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     body = content["object"]
     body.pop("support_angle_rad", None)

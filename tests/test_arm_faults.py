@@ -35,7 +35,7 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.alone
 
-LONGEST_M = 0.24 * 1.09
+MAX_LENGTH_M = 0.24 * 1.09
 TIMEOUT_S, LATE_S = 0.25, 0.4
 PATIENT = {"timeout_s": TIMEOUT_S, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}
@@ -141,7 +141,7 @@ async def mid_stroke(
         try:
             await stroke.lasts(40)
             yield stroke
-            assert stroke.max_length_m() <= LONGEST_M
+            assert stroke.max_length_m() <= MAX_LENGTH_M
         finally:
             task.cancel()
             with suppress(asyncio.CancelledError):

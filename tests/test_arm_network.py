@@ -30,7 +30,7 @@ pytestmark = pytest.mark.alone
 PATIENT = {"arming": "auto", "timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}
 SIDES = ("left", "right")
-LONGEST_M = 0.24 * 1.09
+MAX_LENGTH_M = 0.24 * 1.09
 
 
 @dataclass
@@ -221,7 +221,7 @@ async def test_a_cable_drawn_in_mid_stroke_holds_then_stops_both_arms_until_it_i
             computers.plug(cut, into_switch=True)
             await until(lambda: watch.modes() == {"follow"})
         everything = [state for states in watch.states.values() for state in states]
-        assert max(state.edge_distance_m or 0.0 for state in everything) <= LONGEST_M
+        assert max(state.edge_distance_m or 0.0 for state in everything) <= MAX_LENGTH_M
         assert {state.faults for state in everything if state.mode != "disconnected"} == {()}
 
 

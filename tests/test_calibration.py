@@ -245,7 +245,7 @@ def without(key: str) -> Callable[[str], str]:
     [
         (
             lambda text: text.replace("version: 2", "version: 1", 1),
-            "version: 1, this program reads 2; calibrate anew",
+            "version: 1, this program reads 2; calibrate again",
         ),
         (without("version"), 'no key "version"'),
         (without("device"), "device: Field required"),

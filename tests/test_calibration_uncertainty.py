@@ -281,13 +281,13 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
     distance_m = shipped.uncertainty.working_distance_m
-    fit, anew = calibrated(
+    fit, again = calibrated(
         make_true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
     )
     slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
     shifts = slopes @ (fit.rig - numbers_of(shipped))
-    depth_m = np.hypot(anew.depth_std_m, shipped.uncertainty.depth_std_m)
-    lateral_m = np.hypot(anew.lateral_std_m, shipped.uncertainty.lateral_std_m)
+    depth_m = np.hypot(again.depth_std_m, shipped.uncertainty.depth_std_m)
+    lateral_m = np.hypot(again.lateral_std_m, shipped.uncertainty.lateral_std_m)
     assert np.sqrt(np.mean(shifts[:, 2] ** 2)) < 2.5 * depth_m
     assert np.sqrt(np.mean(np.sum(shifts[:, :2] ** 2, axis=1))) < 2.5 * lateral_m
 

@@ -109,7 +109,7 @@ def test_a_driver_that_stamps_the_beginning_of_the_exposure(
 def test_stamps_of_another_clock_give_way_to_the_arrival(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene, stamp_ns: int
 ) -> None:
-    """Of one camera alone: the two are compared by one kind of stamp."""
+    """Check one camera alone, since the two are compared by one kind of stamp."""
     left, right = cameras
     with reading(bag, scene) as reader:
         for number in range(LAPSES):

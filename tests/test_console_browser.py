@@ -76,7 +76,7 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
     """Put markup wherever the page shows a name or a text that others choose."""
     scene = cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
-    page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.of(scene))
+    page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.from_scene(scene))
     page.show_problem(MARKUP)
     page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)

@@ -234,7 +234,7 @@ async def end_recording(page: Page, heard: Heard) -> None:
 
 
 def height_m(heard: Heard) -> float:
-    """Of the fingertip over the side of the cylinder that the first scene shows."""
+    """Return the height of the fingertip over the side of the first scene's cylinder, m."""
     finger, solid = heard.last("twin/finger"), heard.messages["scene"][0].object
     across = finger.position_world_m[1:] - solid.world_from_object.position_m[1:]
     return float(np.linalg.norm(across)) - solid.geometry.radius_m

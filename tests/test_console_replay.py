@@ -65,7 +65,7 @@ def test_a_bag_is_shown_as_it_was_at_any_moment(bag: Path) -> None:
     one, again = timeline.latest("scene", Scene), timeline.latest("scene", Scene)
     assert one is not None
     assert again is not None
-    assert one[0] is again[0], "the scene is not drawn anew at each frame"
+    assert one[0] is again[0], "the scene is not redrawn at each frame"
     timeline.seconds = -1.0
     assert timeline.latest("fingertip", Fingertip) is None
     assert list_bags(bag.parent.parent) == ["sub/a.mcap"]

@@ -91,7 +91,7 @@ class Launchers:
         return self
 
     async def arms(self, modes: dict[str, str]) -> None:
-        """As bridges do: say how the arms are, until cancelled."""
+        """Publish the arms' states as bridges do, until cancelled."""
         publishers = {}
         for side in modes:
             writer = self.plan.writers[f"arm_{side}"][0]
@@ -118,7 +118,7 @@ class Launchers:
         return endpoint.replace(RUN_DIRECTORY, str(self.folder))
 
     def say(self, estop: EStop, *, before_ns: int = 0) -> None:
-        """As a tool on main does; before_ns: of a time so long ago, negative: in the future."""
+        """Publish as a tool on main does.  before_ns: age of the stamp; negative: in the future."""
         self._sequence += 1
         now_ns = self._clock.now_ns() - before_ns
         self._tool.send(

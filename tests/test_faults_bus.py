@@ -47,7 +47,7 @@ async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Roo
 
 
 def large_pictures(number: int) -> StereoPair:
-    """Of 100 KB."""
+    """Make a message of 100 KB."""
     left, right = (np.full((200, 250), number % 250, np.uint8) for _ in range(2))
     return StereoPair(device="test", exposure_s=0.001, dropped_frames=0, left=left, right=right)
 

@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 SIDES: tuple[Side, Side] = ("left", "right")
 TICK_NS, TARGET_HZ, STORM = 166_667, 60, 100
 ANSWER_S, BEAT_S = 0.001, 1 / 140.8
-LONGEST_M = 0.24 * 1.09
+MAX_LENGTH_M = 0.24 * 1.09
 
 
 @dataclass
@@ -250,4 +250,4 @@ async def test_a_storm_of_targets_breaks_no_limit_and_stops_no_cycle(
         assert faults == {()}
     assert (np.abs(bench.speeds) <= SPEED_RAD_PER_S).all()
     lengths_m = [one.edge_distance_m or 0.0 for states in bench.states.values() for one in states]
-    assert max(lengths_m) <= LONGEST_M
+    assert max(lengths_m) <= MAX_LENGTH_M

@@ -125,8 +125,8 @@ def test_the_place_of_first_touch_stays_until_the_finger_lifts() -> None:
     away, held = locate_sticking(SHAPE, np.array([0.003, 0.001, RADIUS + 0.01]), held)
     assert held is None
     assert away.depth_m < 0.0
-    anew, held = locate_sticking(SHAPE, np.array([0.005, 0.0, RADIUS - 0.001]), held)
-    assert anew.surface[0] == pytest.approx(0.005)
+    again, held = locate_sticking(SHAPE, np.array([0.005, 0.0, RADIUS - 0.001]), held)
+    assert again.surface[0] == pytest.approx(0.005)
 
 
 def test_slipping_leaves_the_drag_that_friction_holds() -> None:

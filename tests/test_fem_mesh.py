@@ -114,14 +114,14 @@ def mesh(name: str, spacing: float = SPACING) -> SolidMesh:
 
 
 def solid_volume(solid: SolidMesh) -> float:
-    """Of the curved elements."""
+    """Return the volume of the curved elements."""
     points, weights = quadrature()
     jacobian = np.einsum("qak,eai->eqik", shape_gradients(points), solid.nodes[solid.elements])
     return float((np.linalg.det(jacobian) * weights).sum())
 
 
 def hull_area(solid: SolidMesh, faces: Ints) -> float:
-    """Of curved six-node faces, by a rule of degree 4 (Dunavant, 1985)."""
+    """Integrate over curved six-node faces by a rule of degree 4 (Dunavant, 1985)."""
     total = 0.0
     for a, weight in (
         (0.445948490915965, 0.223381589678011),

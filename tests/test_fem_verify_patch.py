@@ -36,7 +36,7 @@ def inner_of(solid: SolidMesh) -> Ints:
 
 
 def patch_error(nodes: Floats, elements: Ints, nu: float) -> float:
-    """Of inner nodes, when the hull is moved by a linear field; over the field's largest value."""
+    """Return the relative error of inner nodes under a linear boundary field."""
     matrix = stiffness_matrix(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=nu)
     exact = (nodes @ GRADIENT.T).ravel()
     held = dofs_of(np.unique(boundary_faces(elements)))

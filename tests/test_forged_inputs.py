@@ -33,7 +33,7 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S, forward
 from tests.fingertips import fingertip
 from tests.test_arm_loop import paper_scene
-from tests.test_faults_storm import LONGEST_M, SIDES, Bench
+from tests.test_faults_storm import MAX_LENGTH_M, SIDES, Bench
 
 Floats = NDArray[np.float64]
 Random = np.random.Generator
@@ -152,7 +152,7 @@ class ForgedBench(Bench):
     def assert_within_limits(self) -> None:
         assert self.max_tool_speed <= MAX_TOOL_SPEED
         assert self.max_joint_ratio <= 1.0
-        assert self.max_length_m <= LONGEST_M
+        assert self.max_length_m <= MAX_LENGTH_M
         for states in self.states.values():
             for state in states:
                 # Whoever does not follow says why.

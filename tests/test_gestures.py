@@ -247,7 +247,7 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
 
 @gestures
 def test_halving_the_samples_changes_no_gesture(gesture: Gesture) -> None:
-    """So the samples hold the whole motion."""
+    """The samples hold the whole motion."""
     path = gesture(SCENE)
     whole = validate_path(path.times_s, path.positions_world_m, "spline")
     keep = np.unique(np.append(np.arange(0, len(path.times_s), 2), len(path.times_s) - 1))

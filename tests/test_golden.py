@@ -1,4 +1,4 @@
-"""The renderer draws what it drew; see `tests/golden_pictures.py` for how to draw anew."""
+"""The renderer draws what it drew; see `tests/golden_pictures.py` for how to redraw."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.golden_pictures import CASES, FOLDER
 
 Image = NDArray[np.uint8]
 
-MOST_MEAN = 3.0
+MAX_MEAN = 3.0
 """Levels of 255, over the lit pixels: other windows and samples leave up to 2.7, a pixel's shift of
 the object 4.5 and more."""
-MOST_OFF, OFF_LEVELS = 0.02, 40
+MAX_OFF, OFF_LEVELS = 0.02, 40
 """Share of those pixels that may differ by more levels: outlines between other samples."""
 
 
@@ -42,14 +42,14 @@ def difference(picture: Image, wanted: Image) -> tuple[float, float]:
 
 def agree(picture: Image, wanted: Image) -> bool:
     mean, share = difference(picture, wanted)
-    return mean <= MOST_MEAN and share <= MOST_OFF
+    return mean <= MAX_MEAN and share <= MAX_OFF
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
     mean, share = difference(CASES[name](context), golden(name))
-    assert mean <= MOST_MEAN
-    assert share <= MOST_OFF
+    assert mean <= MAX_MEAN
+    assert share <= MAX_OFF
 
 
 def test_no_two_goldens_are_alike() -> None:

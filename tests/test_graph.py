@@ -37,7 +37,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 STROKE_S = 4.0
 KILLED = "triangulator"
 MIN_FRAMES = 20
-"""So many frames say whether they are in order and drawn from the newest data."""
+"""Number of frames that shows whether they are in order and drawn from the newest data."""
 
 
 def processes_of_run(run_id: str) -> list[psutil.Process]:

@@ -472,7 +472,7 @@ def ignores_sigint(pid: int) -> bool:
 def test_an_interrupt_that_is_ignored_by_inheritance_ends_a_graph(
     tmp_path: Path, runs_root: Path, started: list[subprocess.Popen[str]], ready: bool
 ) -> None:
-    """As in a background job of a shell script, which ends it by `kill -INT`."""
+    """Start it as a background job of a shell script, which ends it by `kill -INT`."""
     path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
     process = start_command(started, "launch", str(path), sigint=signal.SIG_IGN)
     if ready:
@@ -543,7 +543,7 @@ def test_old_runs_are_tidied_up(runs_root: Path) -> None:
 
 
 def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:
-    """As with ROS 2 sourced, which has a package named launch."""
+    """Put a foreign package named launch on the path, as ROS 2 does."""
     for name in ("launch", "nodes", "messages"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('the foreign one')\n")

@@ -281,7 +281,7 @@ async def test_the_librarys_fault_that_the_link_guards_against_is_there(
 ) -> None:
     """A late answer is taken for the next request's, when the connection is kept open.
 
-    If this fails the library has mended it; the guard stays, for the network may be late as well.
+    If this fails the library has fixed it; the guard stays, for the network may be late as well.
     """
     # Far beyond the client's time-out, which a busy machine may notice late.
     monkeypatch.setattr(twin_arms, "LATE_S", 1.0)

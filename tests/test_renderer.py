@@ -386,7 +386,7 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
 async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a folded sheet, whose share the stage finds (tests/test_renderer_failures.py)."""
+    """Make the frame of a folded sheet (tests/test_renderer_failures.py)."""
     monkeypatch.setattr(
         "flexsheet.nodes.renderer.scene_renderer.occluded_fraction",
         lambda mesh, eye, projector: 0.25,

@@ -437,7 +437,7 @@ def test_of_a_hundred_thousand_forgeries_none_is_taken(topic: str) -> None:
     assert accepted.total() == 0, {kind: n for kind, n in accepted.items() if n}
     assert ear.counts.rejected == tried.total() == 34_000
     assert len(ear.problems) <= 12, "each cause is told once"
-    assert len(subscriber._seen) == 1, "nobody makes it remember more"
+    assert len(subscriber._writers_seen) == 1, "nobody makes it remember more"
     offer(plain(encode(message, replace(HEADER, sequence=2**63 - 1))))
     assert len(ear.heard) == 3, "the true writer is heard on"
 

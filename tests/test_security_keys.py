@@ -195,7 +195,7 @@ ONE, TWO = new_key_pair()[0], new_key_pair()[0]
         (ONE, ONE, 'hosts.left.key: is also the key of host "main"; give each host its own key'),
         (ONE, "secret", 'hosts.left.key: "secret" is not a public key'),
     ],
-    ids=["one without", "two alike", "no key"],  # keys are drawn anew; names of tests must not be
+    ids=["one without", "two alike", "no key"],  # keys are redrawn; names of tests must not be
 )
 def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, said: str) -> None:
     given = {"main": {**HOSTS["main"], "key": main}, "left": {**HOSTS["left"], "key": left}}
@@ -281,7 +281,7 @@ async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, key
         await until(lambda: sum("keys of" in line for line in said) >= 2)
         plan = load_graph(Path(plan.launch_file))
         await heard(plan, main)
-        assert main.pids | left.pids == pids, "nothing was started anew"
+        assert main.pids | left.pids == pids, "nothing was restarted"
 
 
 async def test_a_host_without_its_secret_does_not_start(tmp_path: Path, keys: Path) -> None:

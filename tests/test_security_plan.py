@@ -52,7 +52,7 @@ class Hand(Node):
 
 @pytest.fixture(autouse=True)
 def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Of runs and keys of the test's own, with a short path."""
+    """Make a folder for the test's runs and keys, with a short path."""
     with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as name:
         monkeypatch.setenv(runs.ROOT_VARIABLE, f"{name}/runs")
         monkeypatch.setenv(KEYS_VARIABLE, f"{name}/keys")

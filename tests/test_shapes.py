@@ -215,9 +215,9 @@ def test_where_several_points_are_as_near_the_front_or_the_earlier_one_is_taken(
     shape: Shape, point: tuple[float, float, float]
 ) -> None:
     query = np.array(point)
-    anew = shape.closest(query)
-    assert bool(anew.undecided)
-    assert anew.normal[2] > 0.8
+    again = shape.closest(query)
+    assert bool(again.undecided)
+    assert again.normal[2] > 0.8
     behind = shape.closest(np.array([point[0], 0.0, -0.2])).point
     assert shape.closest(query, previous=behind).normal[2] < -0.8
     # A point without a direction says nothing.

@@ -42,7 +42,7 @@ def test_the_arms_limit_and_the_planners_model_give_the_same_edge_force(height_m
         height_m=height_m,
         thickness_m=0.001,
         young_modulus_pa=1e6,
-        longest_m=0.3,
+        max_length_m=0.3,
         max_edge_force_n=20.0,
         max_twist_rad=0.1,
         min_flange_distance_m=0.1,

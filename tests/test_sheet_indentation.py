@@ -19,8 +19,8 @@ from flexsheet.nodes.models.sheet.indentation import (
 from tests.indentation_bases import (
     DEEPEST_M,
     ELEMENT_CELLS,
-    LEAST_STRETCH,
     MAX_STRETCH_RATIO,
+    MIN_STRETCH,
     RADIUS_M,
     RUBBER,
     few_dents,
@@ -76,7 +76,7 @@ def test_any_push_has_a_finite_shape_of_bounded_depth(
     assert np.abs(offsets[:, [0, -1]]).max() < 1e-4
     fits = not shapes.invalid_reason(stretch, place, depth)
     inside = (
-        LEAST_STRETCH <= stretch <= MAX_STRETCH_RATIO
+        MIN_STRETCH <= stretch <= MAX_STRETCH_RATIO
         and depth <= DEEPEST_M
         and abs(place[0]) <= shapes.xs_m[-1]
         and abs(place[1]) <= shapes.ys_m[-1]

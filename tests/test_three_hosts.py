@@ -22,7 +22,7 @@ from tests.lab_bags import Span, gaps, held, read_arm, wanted
 from tests.waiting import DEADLINE_S
 
 SIDES = ("left", "right")
-LONGEST_M = 0.24 * 1.15
+MAX_LENGTH_M = 0.24 * 1.15
 TURNED_RAD = 0.15
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
@@ -60,7 +60,7 @@ def judge_words(lab: Lab) -> None:
     assert states
     assert isinstance(states[0], ArmState)
     longest = max(state.edge_distance_m or 0.0 for state in states)
-    assert longest <= LONGEST_M
+    assert longest <= MAX_LENGTH_M
     said = {fault for state in states if state.mode != "disconnected" for fault in state.faults}
     assert {fault for fault in said if not fault.startswith("e-stop")} == set()
 
@@ -136,7 +136,7 @@ async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> 
 
 
 async def last_weeks_plan_is_refused(lab: Lab) -> None:
-    """One computer is started with an old launch file; both sides say so, and it is mended."""
+    """One computer is started with an old launch file; both sides say so, and it is fixed."""
     old = lab.launch_file.with_name("last-week.yaml")
     old.write_text(lab.launch_file.read_text().replace("watchdog_s: 0.8", "watchdog_s: 0.7"))
     theirs, ours = load_graph(old).hash, lab.plan().hash
@@ -219,7 +219,7 @@ async def the_doctor_asks_all(lab: Lab) -> None:
 
 
 async def a_stop_outlives_all_launchers(lab: Lab) -> None:
-    """Said beside an arm, where nobody may reset it; then all is killed and started anew."""
+    """Said beside an arm, where nobody may reset it; then all is killed and restarted."""
     code, words = await lab.run("left", "arms", "stop", "--reason=a hand in the sheet")
     assert code == 0, words
     for process in lab.launchers.values():

@@ -21,7 +21,7 @@ BEGIN_S = stroke.stroke_window_s(SECONDS)[0]
 
 
 def angle(times_s: Floats) -> Floats:
-    """Of a stroke that wanders, about the cylinder's axis."""
+    """Return the angle of a wandering stroke about the cylinder's axis."""
     wander = 0.01 * np.sin(2 * np.pi * 0.7 * times_s) + 0.006 * np.sin(2 * np.pi * 1.9 * times_s)
     return np.asarray(np.radians(6.0) * (times_s - BEGIN_S) + wander)
 

@@ -12,7 +12,7 @@ DEADLINE_S = 120.0
 """Only a failing test waits so long: a machine with far more to do than it can is no failure."""
 
 NOTHING_COMES_S = 0.3
-"""So long is waited for what shall not come."""
+"""Time to wait before concluding that an event does not occur."""
 
 Condition = Callable[[], object]
 

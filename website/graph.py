@@ -11,7 +11,7 @@ from dataclasses import dataclass
 Place = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
-"""Of a box."""
+"""Size of a box, px."""
 
 STYLE = """
   text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }

@@ -64,7 +64,7 @@ OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
 REACHED_COLOR = "#dcefdc"
 
 THINNED = 600
-"""So many samples decide whether a base would do there, before all are asked."""
+"""Number of samples that decide whether a base position is worth a complete check."""
 
 
 @dataclass(frozen=True, slots=True)

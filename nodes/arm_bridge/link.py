@@ -83,7 +83,7 @@ class Freshness(StrEnum):
     FIRST = "first"
     """The first answer since the start of the link or of the controller."""
     FRESH = "fresh"
-    """The counters have advanced, so the joints are measured anew."""
+    """The counters have advanced, so the joints are measured again."""
     REPEATED = "repeated"
     """The counters of the previous answer, for at most MAX_UNCHANGED_S."""
     STALLED = "stalled"

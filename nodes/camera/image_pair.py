@@ -140,7 +140,7 @@ def skew_reason(skew_s: float, limit_s: float) -> str:
     """Describe why a pair was rejected for its skew."""
     return (
         f"skew {1e3 * skew_s:.1f} ms, at most {1e3 * limit_s:g} ms wanted; cameras that run freely "
-        "keep their skew until they are started anew, a common trigger has none"
+        "keep their skew until they are restarted, a common trigger has none"
     )
 
 

@@ -56,7 +56,7 @@ class OpenCvSource(CameraSource):
         "usable stamps; null: half the exposure",
     )
     silence_s: Positive = Field(
-        default=1.0, description="without a pair for so long, the device is opened anew"
+        default=1.0, description="without a pair for so long, the device is opened again"
     )
 
 

@@ -120,8 +120,8 @@ def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> F
         spacing_m=SPACING_M,
     ).rest_world_m
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
-    foremost = skin[(skin @ rotation[:, 2]).argmax()]
-    return transform(rotation, foremost - rotation @ np.array([*place_m, 0.0]))
+    nearest_to_user = skin[(skin @ rotation[:, 2]).argmax()]
+    return transform(rotation, nearest_to_user - rotation @ np.array([*place_m, 0.0]))
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:

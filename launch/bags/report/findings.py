@@ -11,16 +11,16 @@ from flexsheet.messages.busy import BUSY_REMEDY
 Gravity = Literal["bad", "doubtful"]
 
 SLOW_RATIO = 0.5
-"""Of the least rate that the table of topics expects, as on the console's page."""
+"""Fraction of a topic's minimum rate below which it counts as slow, as in the console."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""Of the time: with the finger lost for longer, that is said."""
+"""Largest fraction of the time without a valid fingertip that is no finding."""
 
 FULL_RATIO = 1.0
-"""Of a limit."""
+"""Ratio to a limit above which a value is a finding."""
 
 ROUNDING = 1.02
-"""What the measuring of speeds and forces may be off."""
+"""Tolerance of measured speeds and forces, as a ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""Of the time: a computer that is busy for longer is a fault."""
+"""Fraction of the time above which an overloaded computer is a fault."""
 
 CHECKED = (
     "whether the computers were busy; "

@@ -57,7 +57,7 @@ MIN_INTERVAL_S = 0.25
 STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 NOTES_KEPT = 8
 LIVED_BEFORE_S = 10.0
-SILENT_PERIODS, SHORTEST_SILENCE_S = 10.0, 0.5
+SILENT_PERIODS, MIN_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
 """Joint and tool speeds are taken over so long: single stamps are not even enough."""
 
@@ -416,7 +416,7 @@ def named(label: str, correction: str) -> str:
 def _silent_after_s() -> dict[str, float]:
     """Return the silence limit of topics with a rate and one writer."""
     return {
-        topic.name: max(SILENT_PERIODS / topic.rate_hz[0], SHORTEST_SILENCE_S)
+        topic.name: max(SILENT_PERIODS / topic.rate_hz[0], MIN_SILENCE_S)
         for topic in TOPICS.values()
         if topic.rate_hz is not None and not topic.many_writers
     }
