@@ -55,9 +55,10 @@ try: setup
 lint: $(DEV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python -m tests.check_words
 	$(BIN)/mypy
 
-# What tests would else compute one by one, in each of their processes.
+# The sheet's deflection shapes, which tests would otherwise compute in each of their processes.
 cached: $(DEV_STAMP)
 	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
 
