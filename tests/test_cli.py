@@ -446,7 +446,7 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
     assert shown == ["number 2", "number 3", "number 4"]
     # What a person said of an e-stop then, he does not say now.
     assert "tools" not in {header.writer for name, _, header, _ in entries if name == "estop"}
-    assert "a person's word" in said.err
+    assert "an e-stop or its reset is not repeated" in said.err
 
 
 def test_without_a_graph_that_is_said(

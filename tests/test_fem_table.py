@@ -37,6 +37,7 @@ from flexsheet.nodes.fem_solver.table import (
     count_valid_levels,
 )
 from tests.soft_bodies import Here, cylinder_spec
+from tests.waiting import wait_until
 
 Floats = NDArray[np.float64]
 
@@ -322,5 +323,6 @@ def test_an_interrupted_computation_stops_its_workers_at_once() -> None:
     with suppress(Interrupted), local_processes(1) as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
         busy = executor.submit(time.sleep, 60)
+        wait_until(busy.running, "the worker to begin")
         raise Interrupted
     assert isinstance(busy.exception(), BrokenProcessPool)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -331,6 +331,7 @@ def forger(
 
 
 @settings(max_examples=5, deadline=None)
+@example(kinds=["not rigid"], seed=0, share=0.05)
 @given(
     kinds=st.lists(st.sampled_from([*STATES, "future"]), min_size=1, max_size=3),
     seed=seeds,

@@ -295,7 +295,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
     found = check_sheet(transform(np.eye(3), [-0.1, 0.0, 0.0]), turned, left=True, limits=SHEET)
     if angle > 0.201 and np.linalg.norm(turned[:3, 3] - [-0.1, 0.0, 0.0]) < 0.2401:
         assert found is not None
-        assert f"turned by {np.degrees(angle):.1f}" in found or "force" in found
+        assert f"rotated by {np.degrees(angle):.1f}" in found or "force" in found
 
 
 @pytest.mark.parametrize("seed", [1, 2])

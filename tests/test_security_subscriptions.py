@@ -135,16 +135,25 @@ def subscribed(endpoint: str, street: Street | None = None) -> Iterator[zmq.Sock
         yield opened
 
 
+def receive_exactly(opened: socket.socket, count: int) -> bytes:
+    """Receive `count` bytes; raises ConnectionResetError if the peer closes before."""
+    received = b""
+    while len(received) < count:
+        part = opened.recv(count - len(received))
+        if not part:
+            raise ConnectionResetError("the publisher closed the connection")
+        received += part
+    return received
+
+
 @contextmanager
 def connected_plainly(endpoint: str) -> Iterator[socket.socket]:
     """A connection that speaks ZMTP without ZeroMQ, after the handshake."""
     address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((address, int(port)), timeout=DEADLINE_S) as opened:
         opened.sendall(GREETING + zmtp_frame(COMMAND, READY))
-        answer = opened.recv(len(GREETING) + 2, socket.MSG_WAITALL)
-        if len(answer) < len(GREETING) + 2:
-            raise ConnectionResetError("the publisher closed the connection")
-        opened.recv(answer[-1], socket.MSG_WAITALL)
+        answer = receive_exactly(opened, len(GREETING) + 2)
+        receive_exactly(opened, answer[-1])
         # What a closed connection no longer takes in would wait for the kernel's probes.
         opened.settimeout(0.5)
         yield opened

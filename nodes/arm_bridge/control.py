@@ -345,6 +345,7 @@ class ArmControl:
         if self.measured_rad is not None:
             self._restart_idle()
         self.handle(Event.RESET)
+        self.reason = "restarts after a reset"
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
