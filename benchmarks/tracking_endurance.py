@@ -161,7 +161,7 @@ def exposures(
 
 
 def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
-    """Whether nothing comes between the mark and either camera, nor runs into it."""
+    """Return whether nothing comes between the mark and either camera, nor runs into it."""
     clutter = camera.clutter
     blobs: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     things: list[tuple[str, Trajectory, Trajectory, float]] = [

@@ -107,7 +107,7 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 @lru_cache(maxsize=4096)
 def _fits(shape: tuple[int, ...], wanted: tuple[Dimension, ...]) -> bool:
-    """Whether an array's shape is one of those that are wanted."""
+    """Return whether an array's shape is one of those that are wanted."""
     if len(shape) != len(wanted):
         return False
     lengths: dict[str, int] = {}
@@ -128,7 +128,7 @@ def _from_lists(value: list[Any] | tuple[Any, ...], wanted: np.dtype[Any]) -> ND
 
 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
-    """Whether no element is NaN or infinite.
+    """Return whether no element is NaN or infinite.
 
     A sum is NaN or infinite if an element is; of a few elements it is sooner had than numpy's
     answer, above all by a process that has slept.  It may overflow for finite ones, hence the

@@ -484,7 +484,7 @@ class _Writer:
 
 
 class _HostConnection:
-    """One socket of a subscriber: the messages of one host."""
+    """Socket of a subscriber that receives the messages of one host."""
 
     def __init__(
         self,
@@ -514,7 +514,7 @@ class _HostConnection:
 
     @property
     def secured(self) -> bool:
-        """Whether the connection uses keys."""
+        """Return whether the connection uses keys."""
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:

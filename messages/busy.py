@@ -14,7 +14,7 @@ BUSY_REMEDY = (
 
 
 def is_busy(host: HostStatus) -> bool:
-    """Whether a computer has too few free processors for the nodes that run on it."""
+    """Return whether a computer has too few free processors for the nodes that run on it."""
     return host.load_ratio > MAX_LOAD_RATIO if host.cpu is None else host.cpu.busy
 
 

@@ -1,4 +1,4 @@
-"""The methods that nodes can be told to take, and a scene's choice among them.
+"""Define the method families of the nodes, and the choice of methods in a scene.
 
 A method family is a set of interchangeable ways to do one thing (`nodes/methods.py`); here are the
 names that nodes know theirs by.  `flexsheet tune SCENE` writes a scene's `methods`; a node's

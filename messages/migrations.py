@@ -226,7 +226,7 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def fits(recorded: Schema, today: Schema) -> bool:
-    """Whether everything that the recorded schema allows is valid by today's."""
+    """Return whether everything that the recorded schema allows is valid by today's."""
     try:
         return _Comparison(recorded.get("$defs", {}), today.get("$defs", {})).fits(recorded, today)
     except (KeyError, TypeError, AttributeError, RecursionError):

@@ -61,7 +61,7 @@ def public_of(secret: str) -> str:
 
 
 def is_key(text: str) -> bool:
-    """Whether a text is a key in Z85."""
+    """Return whether a text is a key in Z85."""
     try:
         return len(text) == KEY_LENGTH and len(z85.decode(text.encode("ascii"))) == CURVE_KEY_BYTES
     except (ValueError, KeyError, struct.error):

@@ -488,7 +488,7 @@ class TwinFinger(Message):
 
 
 class TwinArms(Message):
-    """The true joints and flanges at the source stamp."""
+    """True joint angles and flange poses of both arms at the source time stamp."""
 
     joints_left_rad: Vector6
     joints_right_rad: Vector6

@@ -32,7 +32,9 @@ class Repeats:
 
 
 class RepeatLimiter:
-    """Pass the 1st, 10th, 100th, ... of equal records; a structlog processor.
+    """Limit repeated log records: pass only the 1st, 10th, 100th, ... of equal records.
+
+    This class is a structlog processor.
 
     A record that continues also passes once in REPORT_PERIOD_S. Records are equal if they differ in
     numbers only. From the second on, a passed record has its `count` since the start of the node.

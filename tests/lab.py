@@ -346,7 +346,7 @@ class Lab:
                 writer.close()
 
     def strokes(self) -> bool:
-        """Whether the true finger is under way."""
+        """Return whether the true finger is under way."""
         finger = self.newest.get("twin/finger")
         return (
             isinstance(finger, TwinFinger)

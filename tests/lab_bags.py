@@ -72,13 +72,13 @@ class Arm:
         return spans if begin is None else [*spans, (begin, int(self.said_ns[-1]))]
 
     def follows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Whether its bridge said so, and not too long ago."""
+        """Return whether its bridge said so, and not too long ago."""
         newest = np.searchsorted(self.said_ns, times_ns, side="right") - 1
         fresh = (newest >= 0) & (times_ns - self.said_ns[newest] <= SILENT_NS)
         return np.asarray(fresh & (self.modes[newest] == "follow"), dtype=np.bool_)
 
     def knows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Whether the truth is on record, just before and just after."""
+        """Return whether the truth is on record, just before and just after."""
         after = np.searchsorted(self.times_ns, times_ns)
         inside = (after > 0) & (after < len(self.times_ns))
         after = after.clip(1, len(self.times_ns) - 1)
@@ -115,7 +115,7 @@ class Arm:
         return float((speeds[steps_s < 2 * SPEED_OVER_S] / SPEED_RAD_PER_S).max(initial=0.0))
 
     def leaves_range(self) -> bool:
-        """Whether a joint was ever where the maker allows none."""
+        """Return whether a joint was ever where the maker allows none."""
         low, high = RANGE_RAD.T
         return bool(((self.joints_rad < low) | (self.joints_rad > high)).any())
 

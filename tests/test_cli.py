@@ -131,7 +131,7 @@ def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def told_of_its_stop(bag: Path) -> bool:
-    """Whether the bag has the listener's stop, and its word on what it took before."""
+    """Return whether the bag has the listener's stop, and its word on what it took before."""
     stopped = False
     for topic, message, header, _ in BagReader(
         bag, {"estop", "status"} & set(BagReader(bag).topics)

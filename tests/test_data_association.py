@@ -93,7 +93,7 @@ def reasons(shown: Sequence[tuple[str, Floats | None]]) -> list[str]:
 
 
 def all_at(shown: Sequence[tuple[str, Floats | None]], place: Place, bench: Bench) -> bool:
-    """Whether the last valid point is where that is now."""
+    """Return whether the last valid point is where that is now."""
     points = [point for reason, point in shown if reason == "ok" and point is not None]
     return bool(np.linalg.norm(points[-1] - place(bench.time_s)) < 1e-3)
 

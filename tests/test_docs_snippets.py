@@ -183,7 +183,7 @@ def program(call: Sequence[str]) -> list[str]:
 def check_call(
     call: Sequence[str], written: set[str], place: str, *, may_name_only: bool = False
 ) -> None:
-    """Whether a call can be made as it stands; or is the name of one at least.
+    """Return whether a call can be made as it stands; or is the name of one at least.
 
     written: files that calls of the page have written.
     """

@@ -145,7 +145,7 @@ def test_a_sticking_finger_that_goes_too_far_is_flagged() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_finger_nowhere_is_an_error(value: float) -> None:
-    """Whether it is the first place or a later one."""
+    """Return whether it is the first place or a later one."""
     with pytest.raises(ValueError, match="not finite"):
         pressed(pad(), (value, 0.0, 0.0))
     with pytest.raises(ValueError, match="not finite"):

@@ -100,7 +100,10 @@ def _lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Hold a row of the table: joints (6,) rad, and images or the board's pose (4, 4)."""
+    """Hold one row of the arm-pose table.
+
+    The row holds the joint angles (6,) in rad, and either images or the board pose (4, 4).
+    """
 
     name: str
     joints_rad: Floats

@@ -48,7 +48,7 @@ def gestures(incomplete: str) -> list[str]:
 
 
 def runs(incomplete: str) -> list[str]:
-    """Complete the directories of running graphs."""
+    """Suggest the directories of running graphs for shell completion."""
     from flexsheet.launch.running.runs import live_runs
 
     return _filter((str(run.directory) for run in live_runs()), incomplete)

@@ -33,7 +33,7 @@ class CommandScheduler:
         return min(max(since_s, 0.5 * self.period_s), 2.0 * self.period_s)
 
     def is_due(self, now_ns: int, sent_ns: int, target_ns: int) -> bool:
-        """Whether a periodic command is sent now; target_ns: arrival of the newest target.
+        """Return whether a periodic command is sent now; target_ns: arrival of the newest target.
 
         None is sent shortly before the next target, which would wait for the arm's answer.
         """
@@ -41,5 +41,5 @@ class CommandScheduler:
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s
 
     def is_due_when_idle(self, now_ns: int, sent_ns: int) -> bool:
-        """Whether an idle arm is sent a command now; no target is awaited."""
+        """Return whether an idle arm is sent a command now; no target is awaited."""
         return not sent_ns or (now_ns - sent_ns) * 1e-9 >= self.idle_period_s

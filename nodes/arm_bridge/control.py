@@ -199,7 +199,7 @@ class ArmControl:
 
     @property
     def ready(self) -> bool:
-        """Whether the arm may move."""
+        """Return whether the arm may move."""
         return self._state in READY_STATES
 
     @property
@@ -211,17 +211,17 @@ class ArmControl:
 
     @property
     def path_blocked(self) -> bool:
-        """Whether the arm rests because no path to the target is clear."""
+        """Return whether the arm rests because no path to the target is clear."""
         return self._blocked is not None and self._state in CHECKING_STATES
 
     @property
     def at_rest(self) -> bool:
-        """Whether the commanded joints are at rest."""
+        """Return whether the commanded joints are at rest."""
         return float(np.abs(self._velocity).max()) <= MAX_REST_RAD_PER_S
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing moves before a person acts; fewer exchanges suffice meanwhile."""
+        """Return whether nothing moves before a person acts; fewer exchanges suffice meanwhile."""
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:

@@ -93,7 +93,7 @@ class Freshness(StrEnum):
 
     @property
     def is_usable(self) -> bool:
-        """Whether the measured joints may be used."""
+        """Return whether the measured joints may be used."""
         return self not in (Freshness.STALLED, Freshness.REVERSED)
 
 

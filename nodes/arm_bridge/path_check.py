@@ -83,7 +83,7 @@ class PathCheckRequest:
     other_rad: Floats
 
     def begins_at(self, own_rad: Floats, other_rad: Floats) -> bool:
-        """Whether both arms still stand where the path begins."""
+        """Return whether both arms still stand where the path begins."""
         moved_rad = max(
             float(np.abs(own_rad - self.own_rad).max()),
             float(np.abs(other_rad - self.other_rad).max()),
@@ -91,7 +91,7 @@ class PathCheckRequest:
         return moved_rad <= MAX_START_MOTION_RAD
 
     def leads_to(self, target: SheetMotion) -> bool:
-        """Whether a target that has moved since is still near the end of this path."""
+        """Return whether a target that has moved since is still near the end of this path."""
         distance_m, angle_rad = measure_distance(self.goal, target)
         stretch = abs(target.stretch_ratio - self.goal.stretch_ratio)
         return distance_m <= NEAR_M and angle_rad <= NEAR_RAD and stretch <= NEAR_STRETCH

@@ -95,7 +95,10 @@ class SceneController:
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene if it is due, and return whether it was. SceneChoiceError."""
+        """Publish the changed scene if it is due; return whether it was published.
+
+        Raises SceneChoiceError.
+        """
         if self._due_s is None or now_s < self._due_s:
             return False
         self._due_s = None

@@ -304,7 +304,7 @@ class Operator:
         self._page.touch.show_lifted(finger)
 
     def _on_new_scene(self) -> None:
-        """Note that a scene was published after the last drawing."""
+        """Record that a scene was published after the last redraw."""
         self._sent_ns = round(1e9 * self._now_s)
         self.controller.scenes.make_picker(self.controller.finger, self._page.show_problem)
 

@@ -190,7 +190,10 @@ class SphereContact:
         finger_radius_m: float,
         penalty_ratio: float = PENALTY_RATIO,
     ) -> None:
-        """shape: the smooth surface that the response's faces approximate, in its frame."""
+        """Set the smooth surface for contact queries.
+
+        shape: the smooth surface that the response's triangles approximate, in its own frame.
+        """
         self._response = response
         self._radius = finger_radius_m
         self._compliance = response.compliance / young_modulus_pa

@@ -75,7 +75,7 @@ class SoftBodySpec:
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
-    """The precomputed response, and the skin.
+    """Precomputed elastic response of a soft body, together with its skin mesh.
 
     triangles (t, 3), outward. bounds (s,): nodes that are not touchable, except those past an end
     of the touchable skin. drag: the tangential response, if specified.

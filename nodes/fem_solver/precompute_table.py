@@ -55,7 +55,7 @@ raise `precompute.Interrupted` to stop the work."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """All that a table depends on."""
+    """All inputs that determine the content of a precomputed table."""
 
     body: SoftBodySpec
     finger_radius_m: float

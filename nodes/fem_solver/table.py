@@ -1,4 +1,6 @@
-"""Answer pushes from the precomputed nonlinear table: neo-Hookean snapshots over nodes and depths.
+"""Compute the response to pushes from a precomputed nonlinear table.
+
+The table stores neo-Hookean solutions (snapshots) for each touchable node at several depths.
 
 A table holds the displacement of all the skin and the force, at some depths, for a push at every
 node of the touchable skin. Between nodes the mesh's own shape functions interpolate; between depths

@@ -242,7 +242,7 @@ class ContactStateMachine:
 
 
 def _is_too_deep(found: Nearest) -> bool:
-    """Whether a new finger is so far inside that it is on no definite side."""
+    """Return whether a new finger is so far inside that it is on no definite side."""
     curvature = tightest_curvature(found.shape_operator)
     return bool(1.0 + found.height_m * curvature < MIN_RADIUS_FRACTION)
 

@@ -138,7 +138,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def in_contact(self) -> bool:
-        """Whether the finger was in contact when it was last seen."""
+        """Return whether the finger was in contact when it was last seen."""
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:

@@ -1,4 +1,7 @@
-"""Write messages to bags, also on a disk that fills up: end the bag, and continue in another."""
+"""Write messages to bags.
+
+If the disk fills up, close the current bag and continue in a new one.
+"""
 
 from __future__ import annotations
 

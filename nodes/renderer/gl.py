@@ -327,7 +327,10 @@ class _MeshBuffers:
 
 
 def _determinant(matrix: Floats) -> float:
-    """Return the determinant of (3, 3), faster than numpy's for any size."""
+    """Return the determinant of a (3, 3) matrix.
+
+    This is faster than numpy.linalg.det, which accepts any size.
+    """
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 

@@ -45,7 +45,9 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """Return (2, 3): left and right eye in the world; twice the point of view when mono.
+    """Return the world positions (2, 3) of the left and right eye.
+
+    In mono mode both are the point of view.
 
     across: (3,) unit direction from left to right; None: along x.
     """

@@ -161,7 +161,7 @@ class ProjectorWindow:
         self._presenter.put(slot)
 
     def poll(self) -> bool:
-        """Handle the window's events; return False once its context is lost.
+        """Handle the events of the window; return False after its graphics context is lost.
 
         Then all must be created again. A closed window stays closed; `note` reports that.
         WindowError gives the reason of the loss.

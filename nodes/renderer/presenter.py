@@ -102,7 +102,7 @@ class Presenter:
             self._shown(superseded.tag, 0)
 
     def redraw(self, framebuffer_px: tuple[int, int]) -> None:
-        """Show the same again: the window was resized or uncovered."""
+        """Show the current image again after the window was resized or uncovered."""
         with self._changed:
             self.framebuffer_px, self._again = framebuffer_px, REDRAW_COUNT
             self._changed.notify()

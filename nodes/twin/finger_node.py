@@ -141,7 +141,10 @@ class TwinFingerNode(Node):
         )
 
     async def _film(self) -> None:
-        """Expose on a fixed grid of times; a frame whose time has passed is counted as missed."""
+        """Simulate the exposures on a fixed time grid.
+
+        A frame whose exposure time has already passed counts as missed.
+        """
         await self.has_scene.wait()
         start_ns = self.clock.now_ns()
         while True:

@@ -115,7 +115,7 @@ class MxtController:
 
     @property
     def waits(self) -> bool:
-        """Whether a packet waits for the next cycle."""
+        """Return whether a packet waits for the next cycle."""
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:

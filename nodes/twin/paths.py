@@ -204,7 +204,7 @@ def _ground_of(scene: Scene) -> Ground:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Whether world points (n, 3) keep that far inside the scene's finger volume."""
+    """Return whether world points (n, 3) keep that far inside the scene's finger volume."""
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())

@@ -28,11 +28,11 @@ class RenderQueue(Generic[J]):
 
     @property
     def is_full(self) -> bool:
-        """Whether no further job may wait."""
+        """Return whether no further job may wait."""
         return len(self._jobs) >= self._max_length
 
     def is_known(self, key: Key, now_ns: int) -> bool:
-        """Whether a job of the key waits, or was the last one and is still recent."""
+        """Return whether a job of the key waits, or was the last one and is still recent."""
         if key in self._jobs:
             return True
         if self._last is None or self._last[0] != key:
