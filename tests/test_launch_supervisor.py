@@ -400,7 +400,7 @@ async def test_the_directory_of_runs_must_be_ours(
     target.mkdir()
     (tmp_path / "link").symlink_to(target)
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path / "link"))
-    with pytest.raises(runs.RunDirectoryError, match="belongs to somebody else"):
+    with pytest.raises(runs.RunDirectoryError, match="belongs to another user"):
         await RunningGraph(plan_of(tmp_path, beacon=beacon())).__aenter__()
 
 
