@@ -1,4 +1,4 @@
-"""Limits of what peers can send to a publisher's tcp ports, enforced beside ZeroMQ.
+"""Close tcp connections to publishers that send more than a subscriber does.
 
 A ZeroMQ publisher stores every subscription that a peer sends, at about 45 times its size, within
 the call that sends the next message.  That call does not return while more subscriptions arrive.

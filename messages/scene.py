@@ -353,7 +353,7 @@ class Scene(Message):
     working_range: WorkingRange
     tolerances: Tolerances
     methods: Methods = Field(
-        default_factory=Methods, description="what nodes take that are told `auto`"
+        default_factory=Methods, description="methods of nodes whose parameter has the value `auto`"
     )
 
 

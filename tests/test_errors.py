@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -15,6 +16,8 @@ from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
 from flexsheet.messages.topics import UnknownTopicError, topic_named
 from flexsheet.messages.types import FingertipReason
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def kinds_of(kind: type[FlexsheetError]) -> list[type[FlexsheetError]]:
@@ -87,3 +90,14 @@ def test_an_entry_of_an_error_has_the_first_paragraph_of_its_class() -> None:
         )
         in entries()
     )
+
+
+@pytest.mark.parametrize("note", NodeNote)
+def test_each_note_is_a_text_that_some_node_or_launcher_writes(note: NodeNote) -> None:
+    sources = [
+        path
+        for layer in ("messages", "nodes", "launch")
+        for path in (ROOT / layer).rglob("*.py")
+        if path.name != "notes.py"
+    ]
+    assert any(note.phrase in path.read_text() for path in sources), note.phrase

@@ -74,6 +74,7 @@ def test_interrupted_at_any_moment_the_command_leaves_nothing(
     if fraction is None:
         wait_for_words(process, "are ready")
     else:
+        # The moment of the interrupt is what varies: there is no condition to wait for.
         time.sleep(fraction * start_up_s)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=DEADLINE_S)

@@ -228,7 +228,7 @@ async def test_an_address_has_a_limited_number_of_connections(
         while await asyncio.to_thread(fourth.recv, 100):
             pass
     assert "has 3 connections already" in street.refused[0]
-    ears[0].subscriber.close()  # type: ignore[attr-defined]
+    ears[0].subscriber.close()  # type: ignore[attr-defined]  # see Street.ear
     successor = street.ear(street.rings["left"])
     await street.speak(publisher, lambda: successor.heard)
 

@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 SHOWN_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Depths that are told, over the deepest push."""
+"""Reported depths, as fractions of the maximum push depth."""
 
 
 def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:

@@ -128,6 +128,9 @@ _STOP = {
 _STOP_WITHOUT_RELAXING = dict.fromkeys(TRACKING | PAUSING_STATES | RELAXING, S.STOPPING) | {
     S.STOPPING_TAUT: S.STOPPING
 }
+_STOP_AND_NEVER_RELAX = (
+    _STOP_WITHOUT_RELAXING | dict.fromkeys(ARMED_AT_REST, S.IDLE) | {S.TAUT: S.IDLE}
+)
 
 TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
     **_row(
@@ -166,7 +169,7 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
     ),
     **_row(
         E.WATCHDOG_TRIPPED,
-        _STOP_WITHOUT_RELAXING | dict.fromkeys(ARMED_AT_REST, S.IDLE) | {S.TAUT: S.IDLE},
+        _STOP_AND_NEVER_RELAX,
         OFFLINE,
         {S.IDLE, S.FAULT, S.ESTOP, S.STOPPING},
     ),
@@ -226,7 +229,7 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
     ),
     **_row(
         E.ISOLATED,
-        _STOP_WITHOUT_RELAXING | dict.fromkeys(ARMED_AT_REST, S.IDLE) | {S.TAUT: S.IDLE},
+        _STOP_AND_NEVER_RELAX,
         OFFLINE,
         {S.IDLE, S.FAULT, S.ESTOP, S.STOPPING},
     ),

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 ComplianceMode = Literal["force_curve", "stiffness"]
 
 EQUAL_RATIO = 0.02
-"""Relative difference below which two curves count as equal: a seventh of what people notice."""
+"""Relative difference below which two curves count as equal: a seventh of the noticeable one."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 """Depths at which curves are compared, over the maximum depth."""
