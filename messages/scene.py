@@ -235,6 +235,9 @@ class SheetSpec(Part):
     height_m: Positive = Field(description="length of a clamped edge")
     thickness_m: Positive
     young_modulus_pa: Positive
+    density_kg_per_m3: Annotated[float, Field(ge=0, le=20000)] = Field(
+        default=0.0, description="density of the rubber; 0 neglects the sheet's weight"
+    )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
     max_edge_force_n: Positive

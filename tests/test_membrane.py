@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
+from flexsheet.nodes.models.sheet.membrane import push_path
+from flexsheet.nodes.models.sheet.rubber import Rubber as ModelRubber
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.twin import membrane
 from flexsheet.nodes.twin.membrane import Rubber, graded_axis, relaxed_energy, relaxed_stress, solve
 
@@ -56,7 +61,7 @@ class Patch:
     [(1.02, (0.35, 1.2, 4.9)), (1.05, (0.68, 1.9, 6.5)), (1.10, (1.1, 2.9, 8.7))],
 )
 def test_push_force_of_a_disc(stretch: float, forces_n: tuple[float, float, float]) -> None:
-    axis = graded_axis(0.24, 24, 0.12)
+    axis = membrane._insert_midpoints(graded_axis(0.24, 12, 0.12))
     mesh = membrane._Mesh(RUBBER, axis, axis, membrane.SLACK_TENSION)
     flat = np.zeros((axis.size**2, 3))
     flat[:, :2] = (mesh.rest.reshape(-1, 2) - 0.12) * [stretch, 1.0]
@@ -176,3 +181,87 @@ def test_graded_axis_is_finest_at_the_finger_and_ends_at_the_clamps() -> None:
         assert cells.min() > 0.0
         assert abs(axis[np.argmin(cells)] - min(focus, 0.24)) < 0.012
     assert np.allclose(np.diff(graded_axis(0.24, 8, None)), 0.03)
+
+
+HEAVY = replace(RUBBER, density_kg_per_m3=1200.0)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "tilt_deg", "tolerance"), [(1.05, 50, 0.08), (1.05, -50, 0.08), (1.02, 10, 0.08)]
+)
+def test_a_tilted_sheet_sags_as_the_parabola_of_its_tension(
+    stretch: float, tilt_deg: float, tolerance: float
+) -> None:
+    pose = transform(rotation_from_vector([np.radians(tilt_deg), 0.0, 0.0]), [0.0, 0.0, 0.0])
+    sheet = solve(HEAVY, *edges(stretch, pose), cells=16)
+    local = sheet.positions @ pose[:3, :3]
+    across = local[..., 0] / (0.24 * stretch) + 0.5
+    parabola = compute_sag_m(
+        ModelRubber(0.24, 0.24, 0.001, 1e6),
+        pose[:3, 2],
+        density_kg_per_m3=1200.0,
+        edge_distance_m=0.24 * stretch,
+        across=across,
+    )
+    rms_sag, rms_error = (
+        float(np.sqrt(np.mean(value**2))) for value in (local[..., 2], local[..., 2] - parabola)
+    )
+    assert rms_error < tolerance * rms_sag
+    assert np.sign(local[8, 8, 2]) == np.sign(tilt_deg)
+
+
+def test_the_clamps_carry_the_weight_of_the_sheet() -> None:
+    sheet = solve(HEAVY, *edges(1.03), cells=16)
+    weight_n = 1200.0 * 0.24 * 0.24 * 0.001 * 9.81
+    assert np.allclose(sheet.left_force_n + sheet.right_force_n, [0.0, -weight_n, 0.0], atol=1e-4)
+
+
+def test_a_thicker_sheet_at_one_clamp_carries_the_mean_thickness() -> None:
+    uneven = solve(replace(RUBBER, thickness_gradient=(0.0, 0.2)), *edges(1.05), cells=16)
+    even = solve(RUBBER, *edges(1.05), cells=16)
+    assert np.isclose(uneven.left_force_n[0], even.left_force_n[0], rtol=0.01)
+    # The thicker half carries more: the tension acts above the middle of the edge.
+    pulled = solve(
+        replace(RUBBER, thickness_gradient=(0.0, 0.2)),
+        *edges(1.05),
+        finger_tip=np.array([0.0, 0.06, -0.01]),
+        cells=16,
+    )
+    below = solve(
+        replace(RUBBER, thickness_gradient=(0.0, 0.2)),
+        *edges(1.05),
+        finger_tip=np.array([0.0, -0.06, -0.01]),
+        cells=16,
+    )
+    assert pulled.finger_force_n[2] > 1.02 * below.finger_force_n[2]
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.3])
+def test_friction_stays_within_coulombs_limit(coefficient: float) -> None:
+    tip = np.array([0.05, 0.03, -0.02])
+    slipping = solve(
+        RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=coefficient, cells=24
+    )
+    sticking = solve(RUBBER, *edges(1.05), finger_tip=tip, cells=24)
+    assert slipping.finger_force_n[2] < sticking.finger_force_n[2]
+    total = slipping.finger_force_n + slipping.left_force_n + slipping.right_force_n
+    assert np.allclose(total, 0.0, atol=1e-3)
+
+
+def test_a_coefficient_that_is_never_reached_changes_nothing() -> None:
+    tip = np.array([0.02, 0.0, -0.01])
+    rough = solve(RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=1e6, cells=16)
+    sticking = solve(RUBBER, *edges(1.05), finger_tip=tip, cells=16)
+    assert np.allclose(rough.finger_force_n, sticking.finger_force_n, atol=0.01)
+
+
+def test_the_elements_agree_with_those_of_the_renderer() -> None:
+    path = push_path(
+        ModelRubber(0.24, 0.24, 0.001, 1e6),
+        stretch_ratio=1.05,
+        depths_m=[0.01, 0.03],
+        finger_radius_m=0.007,
+    )
+    for depth_m, force_n in zip(path.depths_m, path.forces_n, strict=True):
+        sheet = solve(RUBBER, *edges(1.05), finger_tip=np.array([0.0, 0.0, -depth_m]))
+        assert np.isclose(sheet.finger_force_n[2], force_n, rtol=0.02)

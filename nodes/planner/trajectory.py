@@ -15,6 +15,7 @@ from flexsheet.messages.types import Phase, SheetReason
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.contact_state import (
     ContactCommand,
@@ -22,6 +23,7 @@ from flexsheet.nodes.planner.contact_state import (
     ContactStateMachine,
 )
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
+from flexsheet.nodes.planner.sheet_force import make_rubber
 
 Floats = NDArray[np.float64]
 
@@ -81,6 +83,7 @@ class SheetTrajectoryPlanner:
         self._object_from_world = inverse(self._world_from_object)
         self._rotate_twist = np.kron(np.eye(2), self._world_from_object[:3, :3])
         self._settings = settings
+        self._rubber, self._density_kg_per_m3 = make_rubber(sheet), sheet.density_kg_per_m3
         self._edges = EdgeBound(
             EDGE_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s, 0.5 * sheet.height_m
         )
@@ -129,12 +132,29 @@ class SheetTrajectoryPlanner:
             compliance.stretch_ratio,
             0.0,
         )
+        self._normal_offset_m += self._sag_m(target, float(x))
         depth_rate_m_per_s = -float(velocity @ command.contact.normal)
         self._advance(
             offset_along_normal(target, self._normal_offset_m, per_depth * depth_rate_m_per_s),
             step_s,
         )
         return self._make_step(command)
+
+    def _sag_m(self, sheet: SheetMotion, x_m: float) -> float:
+        """Return the deflection of the sheet by its weight along its normal, x_m from its centre.
+
+        The sheet is placed behind its tangent plane by this, so that its surface is in the plane.
+        """
+        distance_m = self._rubber.width_m * sheet.stretch_ratio
+        return float(
+            compute_sag_m(
+                self._rubber,
+                sheet.world_from_sheet[:3, 2],
+                density_kg_per_m3=self._density_kg_per_m3,
+                edge_distance_m=distance_m,
+                across=min(max(x_m / distance_m + 0.5, 0.0), 1.0),
+            )
+        )
 
     @property
     def in_contact(self) -> bool:

@@ -313,7 +313,9 @@ class SceneRenderer:
             self.note = NO_SHAPES_NOTE if wants_shapes else self._range_note(sheet)
             mesh = pyramid_mesh(sheet)
             return mesh if self._lens is None else refine_mesh(mesh)
-        mesh = deflected_mesh(sheet, self.dents)
+        mesh = deflected_mesh(
+            sheet, self.dents, density_kg_per_m3=self.scene.sheet.density_kg_per_m3
+        )
         self.note = mesh.note
         return mesh
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
 from flexsheet.nodes.renderer.sheet import SheetPose
 
@@ -68,34 +69,51 @@ _grid_triangles = cache(triangulate_grid)
 """The same array for the same grid, so that no comparison of content is needed."""
 
 
-def deflected_mesh(sheet: SheetPose, dents: IndentationBasis) -> SheetMesh:
-    """Return the sheet narrowed by its stretch and deflected by its fingertip.
+def deflected_mesh(
+    sheet: SheetPose, dents: IndentationBasis, *, density_kg_per_m3: float = 0.0
+) -> SheetMesh:
+    """Return the sheet narrowed by its stretch, sagging by its weight and pushed by its fingertip.
 
     Edges that are rotated relative to one another rotate the flat sheet evenly between them. The
-    deflection is added to that as to a flat one.
+    deflection is added to that as to a flat one. Sag and indentation are superposed: the finger
+    indents the sheet by its depth below the sagging sheet.
     """
-    stretch = sheet.edge_distance_m / dents.rubber.width_m
+    rubber = dents.rubber
+    stretch = sheet.edge_distance_m / rubber.width_m
     x, y, depth_m = 0.0, 0.0, 0.0
     if sheet.pushed_point is not None:
         x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
         depth_m = max(0.0, -z)
     position = (x, y)
     flat = dents.grid(stretch, position)
-    offsets = dents.offsets(stretch, position, depth_m if depth_m >= MIN_PUSH_M else 0.0)
+    sag_m = partial(
+        compute_sag_m,
+        rubber,
+        sheet.world_from_sheet[:3, 2],
+        density_kg_per_m3=density_kg_per_m3,
+        edge_distance_m=sheet.edge_distance_m,
+    )
+    finger_across = float(np.clip(x / sheet.edge_distance_m + 0.5, 0.0, 1.0))
+    indentation_m = depth_m + float(sag_m(across=finger_across))
+    if sheet.pushed_point is None or indentation_m < MIN_PUSH_M:
+        indentation_m = 0.0
+    offsets = dents.offsets(stretch, position, indentation_m)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
-    up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
+    up = (flat[..., 1] / rubber.height_m + 0.5).ravel()
     left_bottom, right_bottom, right_top, left_top = sheet.corners
     # Ruled between the edges: each point is bilinear in its position across and up.
     edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
     twist = right_top - right_bottom - left_top + left_bottom
-    vertices = offsets.reshape(-1, 3) @ sheet.world_from_sheet[:3, :3].T
+    offsets = offsets.reshape(-1, 3)
+    offsets[:, 2] += sag_m(across=across)
+    vertices = offsets @ sheet.world_from_sheet[:3, :3].T
     vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([edge_vectors, twist])
     vertices += left_bottom
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.invalid_reason(stretch, position, depth_m),
+        dents.invalid_reason(stretch, position, indentation_m),
     )
 
 

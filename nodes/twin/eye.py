@@ -464,7 +464,13 @@ def _sheet_between(
     scene: Scene, left_edge: Floats, right_edge: Floats, finger_tip: Floats | None
 ) -> DeformedSheet:
     sheet = scene.sheet
-    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    rubber = Rubber(
+        sheet.width_m,
+        sheet.height_m,
+        sheet.thickness_m,
+        sheet.young_modulus_pa,
+        sheet.density_kg_per_m3,
+    )
     return solve(
         rubber,
         left_edge,

@@ -7,10 +7,10 @@ would give compression, the energy is therefore that of a tension field (Pipkin,
 relaxed energy is convex in the strain, so that Newton's method with a line search finds its
 minimum.
 
-The elements are bilinear quadrilaterals with 2x2 Gauss points; the mesh is finer around the finger.
-The fingertip is a rigid sphere that is pushed in along the sheet's normal, in steps. Stiff
-penalties keep the sheet out of it, and nodes that it has touched stick to it, as rubber does to
-skin.
+The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points), another kind than the
+renderer's; the mesh is finer around the finger. The sheet has a weight. The fingertip is a rigid
+sphere that is pushed in along the sheet's normal, in steps. Stiff penalties keep the sheet out of
+it. Nodes that it has touched stick to it, unless Coulomb's limit of friction is exceeded.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 CELLS = 32
+"""Intervals between nodes along either side; an element spans two of them."""
 MIN_CELL_FRACTION = 0.008
-"""Cell size under the finger over the sheet's side: 1.9 mm of 240."""
+"""Distance of nodes under the finger over the sheet's side: 1.9 mm of 240."""
 
 SLACK_TENSION = 2e-4
 """Isotropic tension, in shear moduli, that makes slack and wrinkled regions determinate."""
@@ -42,6 +43,12 @@ MAX_STEP_RADII = 0.7
 """Maximum advance of the finger per step, in its radii; a longer one could pass the sheet."""
 
 MAX_ITERATIONS = 80
+MAX_FRICTION_ROUNDS = 12
+"""Maximum number of equilibria per step of the finger while nodes begin to slip."""
+FRICTION_TOLERANCE = 0.01
+"""Accepted change of the friction of slipping nodes between two equilibria, as a fraction."""
+GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
+"""Acceleration in the world frame, whose y axis points up."""
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
@@ -53,12 +60,20 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """Hold the sheet: width_m between the clamps when slack, height_m along them."""
+    """Describe the sheet at rest.
+
+    width_m: between the clamps when slack; height_m: along them.
+    density_kg_per_m3: 0 for a sheet without weight.
+    thickness_gradient: relative change of the thickness from the left to the right clamp, and from
+        the lower to the upper end of the clamps.
+    """
 
     width_m: float
     height_m: float
     thickness_m: float
     young_modulus_pa: float
+    density_kg_per_m3: float = 0.0
+    thickness_gradient: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +117,7 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
     away = np.abs(samples - np.clip(focus_m, 0.0, length_m)) / length_m
 
     def counted(growth: float) -> Floats:
-        density = 1.0 / (length_m * (MIN_CELL_FRACTION + growth * away))
+        density = 1.0 / (length_m * (2.0 * MIN_CELL_FRACTION + growth * away))
         steps = 0.5 * (density[1:] + density[:-1]) * np.diff(samples)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -114,49 +129,69 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
     return np.interp(np.linspace(0.0, count[-1], cells + 1), count, samples)
 
 
+def _quadratic(t: Floats) -> tuple[Floats, Floats]:
+    """Return the shape functions (points, 3) of nodes at 0, 1/2 and 1, and their derivatives."""
+    values = [(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)]
+    slopes = [4 * t - 3, 4 - 8 * t, 4 * t - 1]
+    return np.stack(values, axis=-1), np.stack(slopes, axis=-1)
+
+
 class _Mesh:
-    """Assemble forces and stiffness of one rectangular mesh."""
+    """Assemble forces and stiffness of a rectangular mesh.
+
+    x, y: coordinates of the nodes; element boundaries are at the even ones, and the odd ones are
+    midway between their neighbours.
+    """
 
     def __init__(self, rubber: Rubber, x: Floats, y: Floats, slack_tension: float) -> None:
         self.slack_tension = slack_tension
         columns, rows = len(x), len(y)
         self.shape = (rows, columns)
         self.shear_modulus = rubber.young_modulus_pa / 3.0
-        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-        self.elements = np.column_stack(
-            [corner, corner + 1, corner + columns + 1, corner + columns]
-        )
-        dx, dy = np.tile(np.diff(x), rows - 1), np.repeat(np.diff(y), columns - 1)
-        self.weight = (dx * dy * rubber.thickness_m / 4.0)[:, None]
-        point = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-        s, t = (values.ravel() for values in np.meshgrid(point, point))
-        along_s = np.column_stack([-(1 - t), 1 - t, t, -t])
-        along_t = np.column_stack([-(1 - s), -s, s, 1 - s])
+        number = np.arange(rows * columns).reshape(rows, columns)
+        windows = np.lib.stride_tricks.sliding_window_view(number, (3, 3))[::2, ::2]
+        self.elements = windows.reshape(-1, 9)
+        sides = np.meshgrid(np.diff(x[::2]), np.diff(y[::2]))
+        width, height = (each.ravel() for each in sides)
+        points = 0.5 + 0.5 * np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.6)
+        weights = np.array([5.0, 8.0, 5.0]) / 18.0
+        value, slope = _quadratic(points)
+        # Points and nodes are ordered along y first: (3 x 3 points, 3 x 3 nodes).
+        shape_function = np.einsum("ab,cd->acbd", value, value).reshape(9, 9)
+        along_x = np.einsum("ab,cd->acbd", value, slope).reshape(9, 9)
+        along_y = np.einsum("ab,cd->acbd", slope, value).reshape(9, 9)
         # (elements, Gauss points, nodes, 2): gradient of each shape function in the rest plane.
         self.gradient = np.stack(
-            [along_s / dx[:, None, None], along_t / dy[:, None, None]], axis=-1
+            [along_x / width[:, None, None], along_y / height[:, None, None]], axis=-1
         )
-        self.node_area = np.zeros(rows * columns)
-        np.add.at(self.node_area, self.elements, (dx * dy / 4.0)[:, None])
         x_grid, y_grid = np.meshgrid(x, y)
         self.rest = np.stack([x_grid, y_grid], axis=-1)
+        at_points = shape_function @ self.rest.reshape(-1, 2)[self.elements]
+        fraction = at_points / [rubber.width_m, rubber.height_m] - 0.5
+        thickness = rubber.thickness_m * (1.0 + fraction @ np.array(rubber.thickness_gradient))
+        area = (width * height)[:, None] * np.outer(weights, weights).ravel()
+        self.weight = area * thickness
+        mass = rubber.density_kg_per_m3 * (self.weight @ shape_function)
+        self.load_n = np.zeros((rows * columns, 3))
+        np.add.at(self.load_n, self.elements, mass[..., None] * GRAVITY_M_PER_S2)
+        self.node_area = np.zeros(rows * columns)
+        np.add.at(self.node_area, self.elements, area @ shape_function)
         clamped = np.zeros(self.shape, bool)
         clamped[:, [0, -1]] = True
         self.free = np.nonzero(np.repeat(~clamped.ravel(), 3))[0]
-        number = np.full(rows * columns * 3, -1)
-        number[self.free] = np.arange(len(self.free))
-        dofs = (3 * self.elements[:, :, None] + np.arange(3)).reshape(-1, 12)
-        row = number[np.repeat(dofs, 12, axis=1)].ravel()
-        column = number[np.tile(dofs, (1, 12))].ravel()
-        self._kept = (row >= 0) & (column >= 0)
+        indices = np.full(rows * columns * 3, -1)
+        indices[self.free] = np.arange(len(self.free))
+        self.dofs = (3 * self.elements[:, :, None] + np.arange(3)).reshape(-1, 27)
+        row = indices[np.repeat(self.dofs, 27, axis=1)].ravel()
+        column = indices[np.tile(self.dofs, (1, 27))].ravel()
+        self._is_free = (row >= 0) & (column >= 0)
         # Entries are summed into a fixed sparsity pattern: found once, used in every iteration.
         size = len(self.free)
-        keys = column[self._kept].astype(np.int64) * size + row[self._kept]
+        keys = column[self._is_free].astype(np.int64) * size + row[self._is_free]
         unique, self._slot = np.unique(keys, return_inverse=True)
         self._row_of = unique % size
         self._start_of = np.searchsorted(unique // size, np.arange(size + 1))
-        self._diagonal = np.searchsorted(unique, np.arange(size) * (size + 1))
-        self.number = number
+        self._indices = indices
         self._unique, self._size = unique, size
 
     def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
@@ -168,47 +203,46 @@ class _Mesh:
         return f, c
 
     def energy(self, positions: Floats) -> float:
+        """Return the elastic energy less the work of the weight, J."""
         _, c = self.deformation(positions)
-        return float(
-            np.sum(self.weight * relaxed_energy(c, self.shear_modulus, self.slack_tension))
-        )
+        elastic = np.sum(self.weight * relaxed_energy(c, self.shear_modulus, self.slack_tension))
+        return float(elastic - np.sum(self.load_n * positions))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the energy's gradient (nodes * 3,) and element stiffness (elements, 12, 12)."""
+        """Return the energy's gradient (nodes * 3,) and element stiffness (elements, 27, 27)."""
         f, c = self.deformation(positions)
         stress, tangent = relaxed_stress(c, self.shear_modulus, self.slack_tension)
         g, weight = self.gradient, self.weight
-        b = np.empty((*f.shape[:2], 3, 4, 3))
+        b = np.empty((*f.shape[:2], 3, 9, 3))
         b[..., 0, :, :] = g[..., :, 0, None] * f[..., None, :, 0]
         b[..., 1, :, :] = g[..., :, 1, None] * f[..., None, :, 1]
         b[..., 2, :, :] = (
             g[..., :, 1, None] * f[..., None, :, 0] + g[..., :, 0, None] * f[..., None, :, 1]
         )
         elements, points = f.shape[:2]
-        b = b.reshape(elements, points * 3, 12)
+        b = b.reshape(elements, points * 3, 27)
         weighted = (weight[..., None] * stress).reshape(elements, 1, points * 3)
         force = (weighted @ b)[:, 0]
-        db = (weight[..., None, None] * tangent) @ b.reshape(elements, points, 3, 12)
-        stiffness = b.transpose(0, 2, 1) @ db.reshape(elements, points * 3, 12)
+        db = (weight[..., None, None] * tangent) @ b.reshape(elements, points, 3, 27)
+        stiffness = b.transpose(0, 2, 1) @ db.reshape(elements, points * 3, 27)
         full = np.empty((elements, points, 2, 2))
         full[..., 0, 0], full[..., 1, 1] = stress[..., 0], stress[..., 1]
         full[..., 0, 1] = full[..., 1, 0] = stress[..., 2]
         geometric = np.sum(g @ (weight[..., None, None] * full) @ g.swapaxes(-1, -2), axis=1)
-        blocks = stiffness.reshape(elements, 4, 3, 4, 3)
+        blocks = stiffness.reshape(elements, 9, 3, 9, 3)
         for i in range(3):
             blocks[:, :, i, :, i] += geometric
-        total = np.zeros(len(positions) * 3)
-        dofs = (3 * self.elements[:, :, None] + np.arange(3)).reshape(-1, 12)
-        np.add.at(total, dofs, force)
-        return total, blocks.reshape(elements, 12, 12)
+        total = np.bincount(self.dofs.ravel(), force.ravel(), minlength=positions.size)
+        return total - self.load_n.ravel(), blocks.reshape(elements, 27, 27)
 
     def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
         """Return the sparse stiffness of the free coordinates; contact: (nodes, 3, 3) diagonal
         blocks.
         """
-        values = np.bincount(self._slot, stiffness.ravel()[self._kept], minlength=len(self._unique))
+        free = stiffness.ravel()[self._is_free]
+        values = np.bincount(self._slot, free, minlength=len(self._unique))
         for node in np.nonzero(contact.any(axis=(1, 2)))[0]:
-            dofs = self.number[3 * node : 3 * node + 3]
+            dofs = self._indices[3 * node : 3 * node + 3]
             if dofs[0] >= 0:
                 keys = dofs[None, :] * self._size + dofs[:, None]
                 values[np.searchsorted(self._unique, keys)] += contact[node]
@@ -280,15 +314,25 @@ def relaxed_stress(
 class _Finger:
     """Keep nodes out of a rigid sphere by a penalty; nodes that it has touched stick to it.
 
-    stuck: (nodes,) which nodes stick, each at its position in `anchor` (nodes, 3).
+    stuck: (nodes,) nodes that stick, each at its position in `anchor` (nodes, 3).
+    friction_coefficient: Coulomb's, or None for nodes that never slip.
     """
 
     def __init__(
-        self, centre: Floats, radius_m: float, node_area: Floats, stuck: Bools, anchor: Floats
+        self,
+        centre: Floats,
+        radius_m: float,
+        node_area: Floats,
+        stuck: Bools,
+        anchor: Floats,
+        *,
+        friction_coefficient: float | None,
     ) -> None:
         self._centre, self._radius = centre, radius_m
         self._stiffness = CONTACT_PA_PER_M * node_area
-        self._stuck, self._anchor = stuck, anchor
+        self._stuck, self._anchor = stuck.copy(), anchor
+        self._coefficient = friction_coefficient
+        self._friction_n = np.zeros(anchor.shape)
 
     def _depth(self, positions: Floats) -> tuple[Floats, Floats]:
         offset = positions - self._centre
@@ -301,18 +345,44 @@ class _Finger:
         return self._stuck | (self._depth(positions)[0] > 0.0)
 
     def energy(self, positions: Floats) -> float:
+        """Return the energy of the penalties less the work of the friction, J."""
         depth, _ = self._depth(positions)
         away = np.sum((positions - self._anchor) ** 2, axis=1)
-        return float(0.5 * np.sum(self._stiffness * np.where(self._stuck, away, depth**2)))
+        penalty = 0.5 * np.sum(self._stiffness * np.where(self._stuck, away, depth**2))
+        return float(penalty - np.sum(self._friction_n * (positions - self._anchor)))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return the gradient (nodes, 3), and the definite part of its derivative (nodes, 3, 3)."""
         depth, outward = self._depth(positions)
-        stiff = np.where(depth > 0.0, self._stiffness, 0.0)
-        held = np.where(self._stuck, self._stiffness, 0.0)
-        gradient = held[:, None] * (positions - self._anchor) - (stiff * depth)[:, None] * outward
-        derivative = stiff[:, None, None] * outward[:, :, None] * outward[:, None, :]
-        return gradient, derivative + held[:, None, None] * np.eye(3)
+        pressed = np.where(depth > 0.0, self._stiffness, 0.0)
+        fixed = np.where(self._stuck, self._stiffness, 0.0)
+        gradient = fixed[:, None] * (positions - self._anchor)
+        gradient -= (pressed * depth)[:, None] * outward + self._friction_n
+        derivative = pressed[:, None, None] * outward[:, :, None] * outward[:, None, :]
+        return gradient, derivative + fixed[:, None, None] * np.eye(3)
+
+    def release(self, positions: Floats) -> bool:
+        """Let nodes slip whose friction exceeds Coulomb's limit; return whether forces changed.
+
+        A slipping node keeps the direction of its friction; the size follows its normal force.
+        """
+        if self._coefficient is None:
+            return False
+        before = self._friction_n.copy()
+        depth, outward = self._depth(positions)
+        on_node = -self.forces(positions)[0]
+        normal_n = np.einsum("ni,ni->n", on_node, outward)
+        tangential = on_node - normal_n[:, None] * outward
+        size_n = np.linalg.norm(tangential, axis=1)
+        limit_n = self._coefficient * np.maximum(normal_n, 0.0)
+        slipping = self._friction_n.any(axis=1)
+        begins = self._stuck & (size_n > limit_n)
+        moving = (slipping & (depth > 0.0)) | begins
+        direction = tangential / np.maximum(size_n, 1e-15)[:, None]
+        self._friction_n = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
+        self._stuck = self._stuck & ~begins
+        change = np.linalg.norm(self._friction_n - before)
+        return bool(begins.any() or change > FRICTION_TOLERANCE * np.linalg.norm(before))
 
 
 def solve(
@@ -322,6 +392,7 @@ def solve(
     *,
     finger_tip: Floats | None = None,
     finger_radius_m: float = 0.007,
+    friction_coefficient: float | None = None,
     cells: int = CELLS,
     slack_tension: float = SLACK_TENSION,
 ) -> DeformedSheet:
@@ -331,6 +402,8 @@ def solve(
     finger_tip: the point (3,) of the sphere that is farthest from the user; its centre is
     `finger_radius_m` towards the user. With None, or a tip before or beside the sheet, there is no
     contact.
+    friction_coefficient: between finger and sheet; None if touched nodes stick whatever the force.
+    cells: even number of intervals between nodes along either side.
     slack_tension: in shear moduli. A smaller one is more accurate for small pushes of a sheet that
     is barely taut, but the equilibrium of a slack sheet is then not found.
 
@@ -361,13 +434,13 @@ def solve(
             )
     mesh = _Mesh(
         rubber,
-        graded_axis(rubber.width_m, cells, focus[0]),
-        graded_axis(rubber.height_m, cells, focus[1]),
+        _insert_midpoints(graded_axis(rubber.width_m, cells // 2, focus[0])),
+        _insert_midpoints(graded_axis(rubber.height_m, cells // 2, focus[1])),
         slack_tension,
     )
-    share = mesh.rest[..., 0, None] / rubber.width_m
+    fraction = mesh.rest[..., 0, None] / rubber.width_m
     along = mesh.rest[..., 1, None] - 0.5 * rubber.height_m
-    flat = (1 - share) * (left[:3, 3] + along * left[:3, 1]) + share * (
+    flat = (1 - fraction) * (left[:3, 3] + along * left[:3, 1]) + fraction * (
         right[:3, 3] + along * right[:3, 1]
     )
     positions, iterations = _relax(mesh, flat.reshape(-1, 3), None)
@@ -381,10 +454,27 @@ def solve(
         for step in range(1, steps + 1):
             centre = finger_tip + finger_radius_m * normal - (steps - step) * advance
             positions = positions + np.where(stuck, 1.0, carried)[:, None] * advance
-            finger = _Finger(centre, finger_radius_m, mesh.node_area, stuck, positions)
+            finger = _Finger(
+                centre,
+                finger_radius_m,
+                mesh.node_area,
+                stuck,
+                positions,
+                friction_coefficient=friction_coefficient,
+            )
             positions, count = _relax(mesh, positions, finger)
-            stuck = finger.touching(positions)
             iterations += count
+            rounds = 0
+            while finger.release(positions):
+                rounds += 1
+                if rounds > MAX_FRICTION_ROUNDS:
+                    raise NotConvergedError(
+                        f"membrane: the friction changes after {rounds} equilibria; "
+                        f"friction coefficient {friction_coefficient}"
+                    )
+                positions, count = _relax(mesh, positions, finger)
+                iterations += count
+            stuck = finger.touching(positions)
 
     gradient, _ = mesh.forces(positions)
     at_nodes = gradient.reshape(*mesh.shape, 3)
@@ -397,6 +487,14 @@ def solve(
         right_force_n=-at_nodes[:, -1].sum(axis=0),
         iterations=iterations,
     )
+
+
+def _insert_midpoints(boundaries: Floats) -> Floats:
+    """Return node coordinates (2 n - 1,): element boundaries (n,) and the points midway."""
+    nodes = np.empty(2 * len(boundaries) - 1)
+    nodes[::2] = boundaries
+    nodes[1::2] = 0.5 * (boundaries[1:] + boundaries[:-1])
+    return nodes
 
 
 def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber) -> Floats:
@@ -454,5 +552,5 @@ def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, 
     if residual < 1e-5 * scale:
         return positions, iteration
     raise NotConvergedError(
-        f"membrane: residual {residual:.2e} N after {iteration} steps, wanted {1e-7 * scale:.2e}"
+        f"membrane: residual {residual:.2e} N after {iteration} steps, tolerance {1e-7 * scale:.2e}"
     )

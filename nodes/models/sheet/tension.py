@@ -5,12 +5,22 @@ Planner, arm limiter and force models use these formulas.
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.models.sheet.rubber import Rubber
+
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
 """Edge force over that of simple tension: the first plus the second times height over width.
 
 It grows with the height, since the clamps prevent the sheet from narrowing.  It is within 0.3 % of
 membrane FE for aspect ratios from 0.5 to 1.5 and stretch to 1.12.
 """
+
+GRAVITY_M_PER_S2 = 9.81
+"""Acceleration towards the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
 """Stiffness of a small push over edge force per length: 0.9-1.0 for a fingertip of radius 10 mm."""
@@ -70,3 +80,37 @@ def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
     """Invert `push_stiffness_n_per_m`."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR
+
+
+def compute_sag_m(
+    rubber: Rubber,
+    normal: NDArray[np.float64],
+    *,
+    density_kg_per_m3: float,
+    edge_distance_m: float,
+    across: float | NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the deflection of the unpushed sheet by its weight along its normal, m.
+
+    normal: (3,) unit vector in the world.
+    across: positions between the clamps, from 0 to 1, any shape.
+
+    The sheet is a parabola, z = 4 sag u (1 - u).  Balance of its curvature gives
+    8 N sag / L^2 = load.  The tension N per length grows with the longer arc, whose length is
+    L (1 + 8/3 (sag/L)^2), so that a slack sheet has a finite sag too.
+    """
+    stretch = edge_distance_m / rubber.width_m
+    load_pa = -GRAVITY_M_PER_S2 * density_kg_per_m3 * rubber.thickness_m / stretch * normal[1]
+    u = np.asarray(across, dtype=np.float64)
+    if load_pa == 0.0:
+        return np.zeros(u.shape)
+    clamp_factor = _clamp_factor(rubber.width_m, rubber.height_m)
+    stiffness = clamp_factor * rubber.young_modulus_pa * rubber.thickness_m
+    tension = stiffness * strain_measure(stretch, rubber.mooney_share)
+    # r = sag/L solves  (8/3 stiffness) r^3 + tension r = |load| L / 8, which has one real root.
+    stiffening = 8.0 / 3.0 * stiffness
+    half_q = abs(load_pa) * edge_distance_m / (16.0 * stiffening)
+    third_p = tension / stiffening / 3.0
+    root = np.cbrt(half_q + np.sqrt(half_q**2 + third_p**3))
+    sag_m = math.copysign((root - third_p / root) * edge_distance_m, load_pa)
+    return np.asarray(4.0 * sag_m * u * (1.0 - u))
