@@ -213,7 +213,7 @@ def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[...
     return mark
 
 
-def ports_of(node_class: type[Node]) -> dict[str, Port]:
+def find_ports(node_class: type[Node]) -> dict[str, Port]:
     """Return the declared ports of a node class by name, in the order of declaration.
 
     A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file can connect
@@ -233,22 +233,22 @@ def further_port(topic_name: str) -> str:
     return f"in/{topic_name}"
 
 
-def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
+def find_parameters_type(node_class: type[Node]) -> type[NodeParameters]:
     """Return the declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
-def role_of(node_class: type[Node]) -> NodeRole | None:
+def find_role(node_class: type[Node]) -> NodeRole | None:
     """Return the declared role of a node class; ARM_BRIDGE for one that publishes ArmState."""
     publishes = {
-        port.message for port in ports_of(node_class).values() if port.direction == "output"
+        port.message for port in find_ports(node_class).values() if port.direction == "output"
     }
     if node_class.role is None and ArmState in publishes:
         return NodeRole.ARM_BRIDGE
     return node_class.role
 
 
-def timers_of(node_class: type[Node]) -> list[Timer]:
+def find_timers(node_class: type[Node]) -> list[Timer]:
     """Return the methods of a node class that are marked `@periodic`."""
     return [
         Timer(name, member.__periodic__)
@@ -321,7 +321,7 @@ class Node:
         self._execution_log = ExecutionLog(clock)
         if epoch is None:
             epoch = self.started_ns
-        declared = ports_of(type(self))
+        declared = find_ports(type(self))
         for port in declared.values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:

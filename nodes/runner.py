@@ -30,7 +30,7 @@ from flexsheet.messages.topics import Delivery, Topic, topic_named
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.log_limit import RepeatLimiter
-from flexsheet.nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from flexsheet.nodes.node import Node, PortCounts, Timer, find_parameters_type, find_timers
 from flexsheet.nodes.signals import handle_signals
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -231,11 +231,11 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
-        node.status.publish(status_of(node, "running", process))
+        node.status.publish(make_status(node, "running", process))
         beat()
 
 
-def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
+def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
     """Make the status message of a node.
 
     The state is "degraded" after an error, a rejection or a gap (except on a `latest` topic) since
@@ -272,7 +272,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     log = structlog.get_logger().bind(node=config.name)
     transport = NodeTransport(config, log)
     node = class_(
-        parameters_of(class_).model_validate(config.parameters),
+        find_parameters_type(class_).model_validate(config.parameters),
         name=config.name,
         clock=SystemClock(),
         send=transport.send,
@@ -291,7 +291,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         transport.open_inputs(node)
         tasks = [
             asyncio.create_task(run_timer(node, number, timer))
-            for number, timer in enumerate(timers_of(class_))
+            for number, timer in enumerate(find_timers(class_))
         ]
         heartbeat = Heartbeat(config.ready_fd)
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
@@ -305,7 +305,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
-        node.status.publish(status_of(node, "stopping", process))
+        node.status.publish(make_status(node, "stopping", process))
     finally:
         await end_tasks([*tasks, *node.mailbox_tasks()])
         try:

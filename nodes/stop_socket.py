@@ -70,7 +70,7 @@ class StopSocket:
         except BlockingIOError:
             return
         connection.setblocking(False)
-        _, user = peer_of(connection)
+        _, user = read_peer(connection)
         if user not in (os.getuid(), 0):
             connection.close()
             return
@@ -97,7 +97,7 @@ class StopSocket:
         connection.close()
 
 
-def peer_of(connection: socket.socket) -> tuple[int, int]:
+def read_peer(connection: socket.socket) -> tuple[int, int]:
     """Return process ID and user ID of the peer of a unix socket."""
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
     process, user, _ = _PEER.unpack(packed)
