@@ -170,7 +170,7 @@ class Output(Generic[M]):
         self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
-        """Publish a message and return its header. source_ns: stamp of its source (default: now)."""
+        """Publish a message; source_ns: stamp of its source (default: now)."""
         now_ns = self._clock.now_ns()
         header = Header(
             sequence=self.counts.messages + 1,

@@ -10,7 +10,7 @@ import pytest
 from flexsheet.launch.plans.plan import load_graph
 from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
 from website.finish import NetworkError, finish
-from website.graph import LAB, TWIN, Picture
+from website.graph import LAB, TWIN, GraphDrawing
 from website.pages import generate
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
@@ -71,7 +71,7 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
 
 
 @pytest.mark.parametrize(("picture", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
-def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file: str) -> None:
+def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
         (writer.name, port.topic, node.name)
@@ -79,7 +79,7 @@ def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file
         for port in node.inputs
         for writer in plan.writers.get(port.topic, ())
     }
-    drawn = {(a.writer, topic, a.reader) for a in picture.arrows for topic in a.topics}
+    drawn = {(a.writer, topic, a.reader) for a in drawing.arrows for topic in a.topics}
     assert drawn <= said
     left_out = {
         (writer, topic, reader)

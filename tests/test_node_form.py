@@ -20,9 +20,9 @@ from flexsheet.nodes.node import (
     NodeParameters,
     Output,
     find_parameters_type,
-    periodic,
     find_ports,
     find_timers,
+    periodic,
 )
 from flexsheet.nodes.runner import end_tasks, make_status
 from tests.fingertips import fingertip as even_fingertip
@@ -100,7 +100,7 @@ def test_ports_parameters_and_timers_are_read_from_the_class() -> None:
 
 
 def test_a_port_can_be_connected_to_another_topic_of_its_type_only() -> None:
-    with pytest.raises(TypeError, match="carries Fingertip"):
+    with pytest.raises(TypeError, match="expected a topic of Fingertip"):
         build(topics={"fingertip": "stereo"})
     with pytest.raises(UnknownTopicError, match='did you mean "fingertip"'):
         build(topics={"fingertip": "fingertips"})

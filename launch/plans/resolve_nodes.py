@@ -29,9 +29,9 @@ from flexsheet.nodes.node import (
     Node,
     NodeParameters,
     Port,
-    further_port,
     find_parameters_type,
     find_ports,
+    further_port,
 )
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
