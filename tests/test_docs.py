@@ -70,7 +70,7 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
     assert set(site_pages()) - linked <= {START}
 
 
-@pytest.mark.parametrize(("picture", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
+@pytest.mark.parametrize(("drawing", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
 def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
@@ -84,9 +84,9 @@ def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing,
     left_out = {
         (writer, topic, reader)
         for writer, topic, reader in said - drawn
-        if {writer, reader} <= set(picture.boxes) - {"recorder"} and writer != reader
+        if {writer, reader} <= set(drawing.boxes) - {"recorder"} and writer != reader
     }
-    if picture is TWIN:  # it shows the twin's part only
+    if drawing is TWIN:  # it shows the twin's part only
         left_out = {link for link in left_out if "twin" in link[0] + link[2]}
     assert {topic for _, topic, _ in left_out} <= EVERYBODYS
 
