@@ -1,10 +1,10 @@
-"""Which ways of finding corners and of fitting the rig pay: what docs/calibration.md decides by.
+"""Compare methods of finding corners and of fitting the rig, for docs/calibration.md.
 
-    python -m benchmarks.calibration [--left GLOB --right GLOB --board 9x6 --square-mm 24.23]
+python -m benchmarks.calibration [--left GLOB --right GLOB --board 9x6 --square-mm 24.23]
 
-Prints one line of JSON each: for ways of finding corners, their errors in the twin's pictures of a
-board (rms px, and the error of the board's size as a share of it); and, with pictures given, for
-ways of fitting, the rigid fit on pairs that were left out, a quarter at a time.
+Prints one line of JSON per method. For corner finders: their errors in simulated images of a board
+(rms px, and the relative error of the board's size). With images given, for fitting methods: the
+errors of the rigid fit on left-out pairs, by 4-fold cross-validation.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ SCENE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder
 POSES, SEED = 20, 2
 GROUPS = 4
 WRONG_PX = 1.0
-"""Corners further off were drawn elsewhere; they are counted, not averaged."""
+"""Maximum distance of a corner from its true position; corners beyond it are counted, not averaged.
+"""
 
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
 def by_window(half_px: float | None, smoothing_px: float) -> Finder:
-    """OpenCV's refinement in a fixed window, or (None) in one of 0.4 of the nearest distance."""
+    """Make a finder with OpenCV's refinement in a window; None: 0.4 of the nearest distance."""
 
     def find(image: Image, board: Board) -> Floats | None:
         found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows))
@@ -69,7 +70,7 @@ def by_window(half_px: float | None, smoothing_px: float) -> Finder:
 
 
 def by_sectors(image: Image, board: Board) -> Floats | None:
-    """OpenCV's detector by sectors, which needs no refinement."""
+    """Find corners with OpenCV's sector-based detector, which needs no refinement."""
     size = (board.columns, board.rows)
     found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
     return np.asarray(corners.reshape(-1, 2), dtype=np.float64) if found else None
@@ -89,7 +90,7 @@ FINDERS = {
 }
 
 
-def judge_finders() -> None:
+def compare_finders() -> None:
     board = Board(columns=9, rows=6, square_m=0.025)
     twin = TwinBoard(make_true_camera(load_scene(SCENE).camera), board, seed=SEED)
     pictures = []
@@ -127,7 +128,7 @@ def joint(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> 
 
 
 def robust(loss: str, scale_px: float) -> Fitter:
-    """The joint fit with a loss that grows less than squarely beyond `scale_px`."""
+    """Make a joint fit with a loss that grows less than quadratically beyond `scale_px`."""
 
     def fit(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> StereoRig:
         start = fit_pairs(pairs, points, size)
@@ -159,7 +160,7 @@ def robust(loss: str, scale_px: float) -> Fitter:
 def with_board_shape(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """The joint fit in turn with the height of each corner over the board's plane."""
+    """Fit the rig jointly, alternating with the height of each corner over the board's plane."""
     fit = fit_pairs(pairs, points, size)
     shape = points.copy()
     for _ in range(6):
@@ -185,7 +186,7 @@ FITTERS: dict[str, Fitter] = {
 }
 
 
-def judge_fitters(left: list[Path], right: list[Path], board: Board) -> None:
+def compare_fitters(left: list[Path], right: list[Path], board: Board) -> None:
     found, size = find_pairs(left, right, board)
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     tutorial = [find_plain_corners(*paths, board) for paths in zip(left, right, strict=True)]
@@ -211,13 +212,13 @@ def main() -> None:
     parser.add_argument("--board", default="9x6")
     parser.add_argument("--square-mm", type=float, default=24.23)
     given = parser.parse_args()
-    judge_finders()
+    compare_finders()
     if given.left and given.right:
         columns, rows = (int(part) for part in given.board.split("x"))
         board = Board(columns=columns, rows=rows, square_m=1e-3 * given.square_mm)
         left = [Path(name) for name in sorted(glob.glob(given.left))]
         right = [Path(name) for name in sorted(glob.glob(given.right))]
-        judge_fitters(left, right, board)
+        compare_fitters(left, right, board)
 
 
 if __name__ == "__main__":

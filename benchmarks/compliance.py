@@ -1,15 +1,15 @@
-"""What the sheet presents of objects from soft to stiff, judged by the twin's membrane.
+"""Compare the rendered force of soft to stiff objects with the simulator's membrane.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance [--table] [--depth-mm 50]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance [--table] [--depth-mm 50]
 
-The object is the scene's, of several Young's moduli; its force over depth comes from the soft body.
-For each the planner's compliance chooses stretch and retreat; then the twin's sheet, stretched so
-and pushed in by what the finger is deeper than the sheet has retreated, says which force a finger
-meets.  Beside it the old way: a stretch for the object's stiffness, and no retreat.
+The object is the scene's, with several Young's moduli; its force-depth curve comes from the soft
+body. For each modulus the planner's compliance selects stretch and advance. The simulated sheet
+then gives the force on a finger at each depth. For comparison: a stretch for the object's stiffness
+only, without advance.
 
-Then the same pushes at other places of the sheet, and the range of moduli that the sheet can
-present at all.  Two minutes; --table works with a table of the membrane's finite elements (half a
-minute more) where the closed form is used without it.
+Prints the same at other points of the sheet, and the range of moduli that the sheet can render.
+Takes two minutes. With --table the planner uses a table of the membrane's finite elements instead
+of the closed form, which takes half a minute more.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ PLACES_MODULUS_PA = 3000.0
 
 
 def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
-    """The scene's object's force over depth by its Young's modulus, to which it is proportional."""
+    """Compute the force-depth curve of the scene's object, divided by its Young's modulus."""
     rows, modulus = front_curve(scene), scene.object.material.young_modulus_pa
     return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
 
@@ -61,7 +61,7 @@ def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
 def errors(
     scene: Scene, stretch: float, pushed_m: Floats, wanted_n: Floats, place: SheetPosition = CENTRE
 ) -> Floats:
-    """The twin's force over the wanted, less one, with the sheet pushed in by `pushed_m` (n,)."""
+    """Return the relative force errors (n,) with the sheet pushed in by `pushed_m` (n,)."""
     radius = scene.finger.radius_m
     true = [twin_force(scene.sheet, stretch, float(depth), place, radius) for depth in pushed_m]
     error: Floats = (np.array(true) - wanted_n) / np.maximum(wanted_n, FORCE_JND_FLOOR_N)
@@ -72,12 +72,12 @@ def row(name: str, values: Floats) -> str:
     return f"{name:<28}" + "".join(f"{100 * value:>8.1f}" for value in values)
 
 
-def verdict(error: Floats) -> str:
+def describe_error(error: Floats) -> str:
     worst = float(np.abs(error).max())
     if worst <= TARGET_ERROR_RATIO:
         return f"within {100 * TARGET_ERROR_RATIO:.0f} %"
     if worst <= WEBER_RATIO:
-        return f"within what people notice ({100 * WEBER_RATIO:.0f} %)"
+        return f"below the just noticeable difference ({100 * WEBER_RATIO:.0f} %)"
     return f"noticeable ({100 * worst:.0f} %; {100 * WEBER_RATIO:.0f}-{100 * WEBER_RATIO_BARE:.0f})"
 
 
@@ -95,7 +95,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
         print(
             f"{1e-3 * modulus:g} kPa, {stiffness:.0f} N/m: stretch {shown.stretch_ratio:.3f}, "
             f"advance {shown.centre.advance_per_depth:.2f}, clamps "
-            f"{shown.centre.edge_force_n.max():.1f} N: {verdict(error)}"
+            f"{shown.centre.edge_force_n.max():.1f} N: {describe_error(error)}"
         )
         print("  wanted, N" + " " * 17 + "".join(f"{force:>8.3f}" for force in wanted))
         retreat = 1e3 * shown.normal_offset_m(depths)
@@ -114,11 +114,11 @@ def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
         pushed = shown.indentation_m(depths, place)
         error = errors(scene, shown.stretch_ratio, pushed, curve.force_n(depths), place)
         where = f"  x {1e3 * place[0]:.0f}, y {1e3 * place[1]:.0f} mm"
-        print(row(where, error) + f"   {verdict(error)}")
+        print(row(where, error) + f"   {describe_error(error)}")
 
 
 def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
-    """The softest and the stiffest modulus, by the law itself."""
+    """Print the softest and the stiffest modulus that the force model allows."""
     curve_of = object_curve(scene)
 
     def fits(modulus: float) -> bool:

@@ -1,12 +1,11 @@
-"""What a viewer of the console costs the graph, and what the viewer gets.
+"""Measure the cost of a console viewer for the graph, and the viewer's frame rate.
 
-The demo's graph runs with a console: without a viewer, with one that takes all that the page is
-sent over a websocket without drawing it (as from another computer), and with Chromium on this
-machine, which draws it by software where there is no graphics card.  Each node's rates and losses
-come from its status; pictures a second are windows of updates that reach the viewer, and those that
-Chromium draws.
+The demo's graph runs with a console in three cases: without a viewer, with a websocket client that
+receives all data without rendering, and with Chromium on this machine. Rates and losses of the
+nodes come from their status messages. Frame rates are the rates of update windows that reach the
+viewer, and of frames that Chromium renders.
 
-    python -m benchmarks.console [--seconds 20] [--set node.parameter=value] [--json]
+python -m benchmarks.console [--seconds 20] [--set node.parameter=value] [--json]
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ WINDOW = {"width": 1200, "height": 800}
 SETTLE_S = 5.0
 TOPICS = ("fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "frame")
 PICTURE_BYTES = 10_000
-"""Smaller windows of updates do not hold the sheet, but a table alone."""
+"""Minimum size of an update window that contains the sheet; smaller ones contain only a table."""
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -73,7 +72,7 @@ COUNT_DRAWN = """() => {
 
 
 class Statuses:
-    """The newest status of each node."""
+    """Latest status of each node."""
 
     def __init__(self) -> None:
         self.newest: dict[str, Status] = {}
@@ -82,7 +81,7 @@ class Statuses:
         self.newest[status.node] = status
 
     def lost(self) -> dict[str, int]:
-        """Messages that readers skipped or lost so far, by topic; the console's own left out."""
+        """Return the number of skipped or lost messages by topic, without those of the console."""
         found = dict.fromkeys(TOPICS, 0)
         for status in self.newest.values():
             for port in status.inputs if status.node not in ("console", "recorder") else ():
@@ -100,8 +99,8 @@ class Statuses:
 
 
 @dataclass
-class Got:
-    """What has reached a viewer: pictures and bytes."""
+class ViewerCounts:
+    """Counters of the updates and bytes that reached a viewer."""
 
     pictures: int = 0
     size_bytes: int = 0
@@ -112,7 +111,7 @@ class Got:
 
 
 async def watch(statuses: Statuses, seconds: float) -> dict[str, Any]:
-    """Rates and losses over some seconds, and the console's share of a core at their end."""
+    """Return rates and losses over some seconds, and the console's fraction of a core."""
     written, lost = statuses.written(), statuses.lost()
     await asyncio.sleep(seconds)
     return {
@@ -127,8 +126,8 @@ async def watch(statuses: Statuses, seconds: float) -> dict[str, Any]:
     }
 
 
-async def look(url: str, got: Got) -> None:
-    """Be a viewer that takes everything and draws nothing."""
+async def look(url: str, got: ViewerCounts) -> None:
+    """Receive all data of the page without rendering."""
     protocol = websockets.Subprotocol(f"viser-v{viser.__version__}")
     async with websockets.connect(url, subprotocols=[protocol], max_size=None) as socket:
         await socket.send(msgspec.msgpack.encode(CAMERA))
@@ -137,8 +136,8 @@ async def look(url: str, got: Got) -> None:
 
 
 @asynccontextmanager
-async def browser(url: str, got: Got) -> AsyncIterator[Page]:
-    """Chromium at the page, without a window."""
+async def browser(url: str, got: ViewerCounts) -> AsyncIterator[Page]:
+    """Open the page in headless Chromium."""
     async with async_playwright() as play:
         chromium = await play.chromium.launch(
             executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
@@ -171,7 +170,7 @@ async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
         result["load_before"] = os.getloadavg()[0]
         result["alone"] = await watch(statuses, seconds)
 
-        got = Got()
+        got = ViewerCounts()
         viewer = asyncio.create_task(look(f"ws://{place}", got))
         await asyncio.sleep(SETTLE_S)
         result["websocket"] = await viewed(statuses, seconds, got)
@@ -180,7 +179,7 @@ async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
             await viewer
 
         if CHROMIUM.exists():  # noqa: ASYNC240  # once, and nothing waits
-            got = Got()
+            got = ViewerCounts()
             async with browser(f"http://{place}/", got) as page:
                 await asyncio.sleep(SETTLE_S)
                 before = await page.evaluate("() => window.drawn")
@@ -191,8 +190,8 @@ async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
     return result
 
 
-async def viewed(statuses: Statuses, seconds: float, got: Got) -> dict[str, Any]:
-    """`watch`, and what reached the viewer meanwhile."""
+async def viewed(statuses: Statuses, seconds: float, got: ViewerCounts) -> dict[str, Any]:
+    """Return the result of `watch`, with the data that reached the viewer."""
     got.pictures = got.size_bytes = 0
     found = await watch(statuses, seconds)
     found["pictures_per_s"] = got.pictures / seconds

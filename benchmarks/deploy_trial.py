@@ -1,13 +1,13 @@
-"""docs/deploy.md, followed literally on three computers: `python -m benchmarks.deploy_trial`.
+"""Follow docs/deploy.md on three simulated computers: `python -m benchmarks.deploy_trial`.
 
-Three network namespaces at a switch, each with a file system of its own where it matters (/etc,
-/opt/flexsheet, /var/lib, /run, home, runs), play the computers (root is needed); what the page's
-blocks of `console` say is typed there, in order, into one shell each.  Judged by each command's
-exit code and, from the main computer's bag, by whether both arms followed the stroke.
+The computers are three network namespaces at a switch, with separate directories for /etc,
+/opt/flexsheet, /var/lib, /run, home and runs; this requires root. The commands of the page's
+`console` blocks are typed in order into one shell per computer. The result is the exit code of each
+command and, from the main computer's bag, whether both arms followed the stroke.
 
-What a namespace has not is lent: the packages of this Python (so that `make setup` finds them
-there), `ssh`, `scp`, `sudo`, `nano` and `systemctl` as small programs that do what the page needs
-of them (`benchmarks/standins`).
+A namespace lacks some programs, which are substituted: the packages of this Python (so that `make
+setup` finds them), and `ssh`, `scp`, `sudo`, `nano` and `systemctl` by small programs in
+`benchmarks/standins`.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from tests.lab import ROOT, Network, missing
 PAGE = ROOT / "docs" / "deploy.md"
 HOSTS = ("main", "left", "right")
 ADDRESSES = {"main": "192.0.2.10", "left": "192.0.2.11", "right": "192.0.2.12"}
-"""Others than those of launch/three.yaml, which therefore must be edited."""
+"""Addresses that differ from those of launch/three.yaml, which must therefore be edited."""
 
 PROMPT = re.compile(rf"(each|{'|'.join(HOSTS)})\$ (.*)")
 EXIT_CODE = re.compile(r"# .*exit code (\d+)")
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 READY_S, COMMAND_S = 300.0, 300.0
 FOLLOWED_M, FOLLOWED_SHARE = 0.005, 0.6
-"""One computer that plays three halts them all now and then; the arms then hold, and go on."""
+"""Minimum fraction of the stroke in which both arms follow; one busy computer simulates three."""
 
 MOVED_M = 0.005
-"""The sheet rolls on the cylinder, so that its centre moves by 7 mm in the page's stroke."""
+"""Minimum travel of the sheet's centre, which is 7 mm in the page's stroke."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A line at a prompt of the page: on which computers, what is typed, how it is to end."""
+    """Line at a prompt of the page: its computers, the command and the expected exit code."""
 
     line: int
     hosts: tuple[str, ...]
@@ -63,8 +63,8 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """What came of a step on one computer."""
+class StepResult:
+    """Result of a step on one computer."""
 
     line: int
     host: str
@@ -76,7 +76,10 @@ class Done:
 
 
 def steps(text: str) -> Iterator[Step]:
-    """What a page says at its prompts, in its blocks of console; ValueError for other lines."""
+    """Return the commands in a page's console blocks.
+
+    Raises ValueError for a line without a prompt.
+    """
     inside = False
     for number, line in enumerate(text.splitlines(), start=1):
         if line.startswith("```"):
@@ -91,7 +94,7 @@ def steps(text: str) -> Iterator[Step]:
 
 
 class Computer:
-    """A shell in a network namespace, with files of its own."""
+    """Shell in a network namespace with separate directories."""
 
     def __init__(self, name: str, space: str, folder: Path) -> None:
         self.name, self.folder, self._space = name, folder / name, space
@@ -116,7 +119,7 @@ class Computer:
         environment = {
             "HOME": str(home), "USER": "root", "PATH": path, "LANG": "C.UTF-8",
             "TRIAL": str(self.folder.parent), "OPENBLAS_NUM_THREADS": "1",
-            # Where Python itself is somebody's own, its library is none that others can read.
+            # Other users cannot read the library of a Python in a user's home directory.
             "LD_LIBRARY_PATH": str(self.folder.parent / "python/lib"),
         }  # fmt: skip
         self._shell = await asyncio.create_subprocess_exec(
@@ -129,7 +132,7 @@ class Computer:
         await self.type("set -m")
 
     async def type(self, command: str) -> tuple[int, str]:
-        """Type a command; its exit code and words."""
+        """Run a command; return its exit code and output."""
         assert self._shell.stdin is not None
         assert self._shell.stdout is not None
         self._shell.stdin.write(f"{command}\nprintf '\\001%d\\n' $?\n".encode())
@@ -143,7 +146,7 @@ class Computer:
         raise RuntimeError(f"the shell of {self.name} has ended: {''.join(words)}")
 
     async def follow(self, command: str) -> tuple[int, str]:
-        """Do a line of the page: a launch stays until ^C, and is waited for until it is ready."""
+        """Run a line of the page; wait until a launch, run in the background, is ready."""
         command = re.sub(r"\bNAME\b", self.name, command).replace("URL", "$TRIAL/clone")
         if command == "make setup":
             self._lend_packages()
@@ -165,7 +168,7 @@ class Computer:
         return await self.type(command)
 
     def _lend_packages(self) -> None:
-        """A virtual environment in which what the lock asks for is there already."""
+        """Create a virtual environment that contains the locked packages."""
         trial, venv = self.folder.parent, self.folder / "opt" / ".venv"
         home = trial / "python" / "bin"
         site = venv / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
@@ -193,11 +196,11 @@ class Computer:
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """How the arms followed, while the finger's path ran.
+    """Following of the arms during the finger's path.
 
-    following: share of the planner's words at which both arms said that they follow.  apart_m: how
-    far, at those, the sheet's centre was, as both arms hold it, from where it was wanted, 95 %.
-    travel_m: how far that centre went.
+    following: fraction of the planner's messages at which both arms followed.
+    apart_m: 95 % quantile of the distance between the sheet's centre and its target.
+    travel_m: travel of the sheet's centre.
     """
 
     seconds: float
@@ -216,8 +219,8 @@ class Stroke:
         return found
 
 
-def judge_stroke(bag: Path) -> Stroke:
-    """What both arms did during the path that a command gave to the twin's finger."""
+def evaluate_stroke(bag: Path) -> Stroke:
+    """Evaluate both arms during the path that a command gave to the simulated finger."""
     reader = BagReader(bag, ["scene", "arm_left", "arm_right", "sheet_target", "twin/finger"])
     states: dict[str, list[tuple[int, ArmState]]] = {"left": [], "right": []}
     targets, path, scene = [], [], None
@@ -233,7 +236,7 @@ def judge_stroke(bag: Path) -> Stroke:
                 if message.path_label and not message.path_done and message.path_time_s > 0:
                     path.append(header.source_ns)
     if scene is None or not path or not targets or not all(states.values()):
-        raise ValueError(f"{bag}: no stroke is in it")
+        raise ValueError(f"{bag}: contains no stroke")
     begin, end = path[0], path[-1]
     times = np.array([at for at, _ in targets if begin <= at <= end])
     wanted = np.array([centre for at, centre in targets if begin <= at <= end])
@@ -256,9 +259,9 @@ def judge_stroke(bag: Path) -> Stroke:
     )
 
 
-async def try_page(folder: Path, until: int) -> list[Done]:
-    """Follow the page up to a line of it; ends early where a command ends otherwise than said."""
-    done: list[Done] = []
+async def try_page(folder: Path, until: int) -> list[StepResult]:
+    """Follow the page up to a line of it; stop at an unexpected exit code."""
+    done: list[StepResult] = []
     async with Network(f"fs{os.getpid()}", ADDRESSES) as network:
         computers = {name: Computer(name, network.space(name), folder) for name in HOSTS}
         for computer in computers.values():
@@ -277,11 +280,11 @@ async def try_page(folder: Path, until: int) -> list[Done]:
     return done
 
 
-async def _follow(computer: Computer, step: Step) -> Done:
+async def _follow(computer: Computer, step: Step) -> StepResult:
     began_s = time.monotonic()
     code, words = await computer.follow(step.command)
     took_s = time.monotonic() - began_s
-    one = Done(step.line, computer.name, step.command, code, step.code, took_s, words)
+    one = StepResult(step.line, computer.name, step.command, code, step.code, took_s, words)
     print(f"{step.line:4} {computer.name:>5}$ {step.command[:90]}  [{code}, {took_s:.1f} s]",
           file=sys.stderr, flush=True)  # fmt: skip
     if code != step.code:
@@ -290,7 +293,7 @@ async def _follow(computer: Computer, step: Step) -> Done:
 
 
 def prepare(folder: Path) -> None:
-    """What the computers share: their cupboard of lent things."""
+    """Create the folder of substitutes that the computers share."""
     folder.chmod(0o755)
     for name in ("packages", "python", "clone"):
         (folder / name).mkdir()
@@ -318,7 +321,7 @@ def main() -> int:
         stroke = None
         bags = sorted((folder / "main/opt/runs").glob("*.mcap"))
         if not problems and bags:
-            stroke = judge_stroke(bags[0])
+            stroke = evaluate_stroke(bags[0])
             problems += stroke.problems()
         elif not problems:
             problems.append("no stroke was recorded")

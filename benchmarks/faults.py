@@ -1,11 +1,11 @@
-"""What the arms do when anything of three computers fails: `python -m benchmarks.faults`.
+"""Test the arms under faults of three computers: `python -m benchmarks.faults`.
 
-Network namespaces at a bad switch, each with its own launcher and keys (`tests/lab.py`; needs
-root).  Each trouble is brought about while the arms follow a finger that strokes back and forth;
-judged by what both bridges said, by the arms' true joints, from their own computers' bags, and by
-the main one's bags: where the sheet was wanted, and what is missing in them.
+The computers are network namespaces at a switch with simulated losses, each with its launcher and
+keys (`tests/lab.py`); this requires root. Each fault is injected while the arms follow a finger
+that strokes back and forth. The evaluation uses the published states of both bridges, the arms'
+true joints, and the bags: targets and missing messages.
 
-With --random it draws one fault after another instead: `benchmarks.random_faults`.
+With --random, faults are drawn at random: `benchmarks.random_faults`.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from tests.lab_bags import Arm, Floats, Gap, Times, gaps, held, read_arm, wanted
 
 
 class Span:
-    """When a trouble began, and when it was over; s of the monotonic clock."""
+    """Start and end of a fault, s of the monotonic clock."""
 
     def __init__(self) -> None:
         self.begun_s = self.over_s = time.monotonic()
 
     def begin(self) -> None:
-        """What was looked up before does not count; one that is told no end is over at once."""
+        """Restart the fault's time after a preparation; until `end`, its end is the same."""
         self.begun_s = self.over_s = time.monotonic()
 
     def end(self) -> None:
@@ -48,17 +48,18 @@ SIDES = ("left", "right")
 MAX_LENGTH_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
-"""A bridge that says nothing for so long follows nothing."""
+"""Maximum age of a state of a bridge that follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of one trouble.
+    """Result of one fault.
 
-    stopped_s: until neither arm followed, None: they never stopped.  back_s: the longest that they
-    did not both follow, without the time that the trouble itself lasted; None: they never did
-    again.  during_ns: from its beginning until all was well.  reasons: why an arm did not follow,
-    the three that it said most often.
+    stopped_s: time until neither arm followed; None if they never stopped.
+    back_s: longest time after the fault in which they did not both follow; None if they never did
+        again.
+    during_ns: time from the start of the fault to the recovery.
+    reasons: the three most frequent reasons why an arm did not follow.
     """
 
     trouble: str
@@ -70,10 +71,10 @@ class Result:
     longest_m: float
 
 
-async def tried(lab: Lab, name: str, work: Work) -> Result:
-    """Bring a trouble about, let it end, and see both arms follow again.
+async def run_fault(lab: Lab, name: str, work: Work) -> Result:
+    """Inject a fault, end it, and wait until both arms follow again.
 
-    work: brings it about and ends when it is over and what was killed has been started again.
+    work: injects the fault, and returns when it is over and killed processes are restarted.
     """
     await lab.until(
         lambda: lab.modes() == {"follow"} and lab.strokes(),
@@ -126,9 +127,9 @@ async def tried(lab: Lab, name: str, work: Work) -> Result:
 
 
 def longest_away_s(told: list[tuple[float, set[str]]], span: Span) -> float:
-    """The longest time that not both arms followed, as far as it lies after the trouble was over.
+    """Return the longest time after the fault in which not both arms followed.
 
-    A busy computer makes arms hold for moments of its own, which are shorter.
+    Shorter holds also occur on a busy computer without a fault.
     """
     longest_s = 0.0
     since_s: float | None = None
@@ -142,7 +143,7 @@ def longest_away_s(told: list[tuple[float, set[str]]], span: Span) -> float:
 
 
 async def matrix(lab: Lab, only: str) -> list[Result]:
-    """All troubles, or those whose name has `only` in it."""
+    """Run all faults, or those whose name contains `only`."""
     await lab.start_all()
     lab.stroke()
     results = []
@@ -150,7 +151,7 @@ async def matrix(lab: Lab, only: str) -> list[Result]:
     async def case(name: str, work: Work) -> None:
         if only not in name:
             return
-        result = await tried(lab, name, work)
+        result = await run_fault(lab, name, work)
         print(json.dumps(asdict(result)), file=sys.stderr, flush=True)
         results.append(result)
 
@@ -184,7 +185,7 @@ async def matrix(lab: Lab, only: str) -> list[Result]:
 
 
 async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
-    # Looking for it takes up to 0.1 s on a busy computer, and the arms' time runs from the kill.
+    # Finding the process takes up to 0.1 s on a busy computer; the time counts from the kill.
     pid = lab.pid_of(host, node)
     before = lab.restarts(host, node)
     span.begin()
@@ -193,7 +194,7 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
 
 
 async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
-    """The launcher dies, its nodes with it; somebody (systemd) starts it again."""
+    """Kill the launcher with its nodes, and restart it as systemd does."""
     process = lab.launchers[host]
     span.begin()
     process.kill()
@@ -205,9 +206,9 @@ async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
 
 
 def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
-    """The longest that one writer's messages are missing, for each trouble; None: nothing is.
+    """Return for each fault the longest gap of one writer's messages; None without a gap.
 
-    What is missing belongs to the trouble that it shares most time with.
+    A gap belongs to the fault that it overlaps most.
     """
     worst: list[Gap | None] = [None] * len(results)
     for gap in lost:
@@ -227,7 +228,7 @@ def rows(
     targets: tuple[Times, Floats],
     lost: list[Gap],
 ) -> list[dict[str, Any]]:
-    """What is told of each trouble, with what the bags know; lengths in mm."""
+    """Return the results of each fault with those of the bags, as table values; lengths in mm."""
     found = []
     for one, gap in zip(results, worst_gaps(lost, results), strict=True):
         sheet = held(arms, targets, one.during_ns)
@@ -245,7 +246,7 @@ def rows(
 
 
 def table(cases: list[dict[str, Any]]) -> str:
-    """The rows that docs/limits.md has."""
+    """Return the rows of the table in docs/limits.md."""
     lines = [
         "| trouble | neither follows after | both again | both followed, of the time until then "
         "| sheet off by, p50 / p95 | missing in the bag | faults |",

@@ -1,13 +1,13 @@
-"""One stereo pair to a fingertip: in a region of interest against a search of both whole pictures.
+"""Compare the fingertip detection in a region of interest with that in full images.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip
 
-Twin pictures of a finger before the sheet, its hand and small glints ("lab"), at rest and at 1 m/s,
-640x480.  Both ways see the same pictures in turn; OpenCV is kept to one thread, and the time is the
-processor's of that thread, so that what else the machine does counts little.  Prints median and
-99th percentile of the time of a pair, their ratios, and the errors against the truth, beside the
-Cramer-Rao bound of the same pixels and the mean squared error normalised by what is stated (1: it
-is exact).
+Simulated images, 640x480, of a finger in front of the sheet with its hand and small glints ("lab"),
+at rest and at 1 m/s. Both methods process the same images in turn. OpenCV uses one thread, and the
+times are the processor time of that thread, so that other load has little effect. Prints median and
+99th percentile of the time per pair, their ratios, and the errors. The errors are compared with the
+Cramer-Rao bound of the same pixels and with the reported covariance (normalised mean square: 1 is
+exact).
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cyl
 PAIRS, ROUNDS, BOUNDS = 100, 10, 10
 SPEEDS_M_PER_S = (0.0, 1.0)
 REACH_M = 0.009
-"""How far from its prediction a finger can be one frame later, with 60 m/s^2 at 60 Hz."""
+"""Maximum distance of a finger from its prediction one frame later, at 60 m/s^2 and 60 Hz."""
 
 PREDICTION_M = 0.001
-"""Standard deviation, per axis, of the prediction about the truth."""
+"""Standard deviation of the prediction's error, per axis."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
-    """A pair of pictures, where the fingertip is, and where it is expected."""
+class TestShot:
+    """Image pair with the true and the predicted fingertip."""
 
     left: Image
     right: Image
@@ -58,35 +58,35 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Times (s) of all calls, and of each shot the error (3,) m and its covariance; NaN: none."""
+    """Times (s) of all calls, and the error (3,) m and covariance of each shot; NaN: not found."""
 
     times_s: Floats
     errors_m: Floats
     covariances: Floats
 
 
-def even(tip: Floats, velocity: Floats) -> Callable[[float], Floats]:
-    """The fingertip at a time (s) from mid-exposure."""
+def constant_velocity_path(tip: Floats, velocity: Floats) -> Callable[[float], Floats]:
+    """Return the fingertip's path at constant velocity, by the time (s) from mid-exposure."""
     return lambda offset_s: tip + offset_s * velocity
 
 
-def shots(camera: TwinCamera, speed_m_per_s: float, exposure_s: float) -> list[Shot]:
-    """Fingertips all over the working range, that go all ways."""
+def shots(camera: TwinCamera, speed_m_per_s: float, exposure_s: float) -> list[TestShot]:
+    """Make image pairs of fingertips at random points and velocities in the working range."""
     random = np.random.default_rng(1)
     taken = []
     for _ in range(PAIRS):
         tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
         way = random.standard_normal(3)
         velocity = speed_m_per_s * way / np.linalg.norm(way)
-        left, right = camera.picture(even(tip, velocity), exposure_s=exposure_s)
+        left, right = camera.picture(constant_velocity_path(tip, velocity), exposure_s=exposure_s)
         taken.append(
-            Shot(left, right, tip, velocity, tip + PREDICTION_M * random.standard_normal(3))
+            TestShot(left, right, tip, velocity, tip + PREDICTION_M * random.standard_normal(3))
         )
     return taken
 
 
-def measure(scene: Scene, method: str, taken: list[Shot]) -> tuple[Run, Run]:
-    """The region of interest and the whole picture, in turn on every shot."""
+def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]:
+    """Detect in the region of interest and in the full images, in turn for each shot."""
     geometry = StereoGeometry.of(scene.camera)
     config = DetectorConfig(
         blob_filter=BlobFilter(),
@@ -121,7 +121,7 @@ def measure(scene: Scene, method: str, taken: list[Shot]) -> tuple[Run, Run]:
 
 
 def report(method: str, name: str, run: Run, bound_m: float) -> None:
-    """One line of the table."""
+    """Print one line of the table."""
     found = np.isfinite(run.errors_m[:, 0])
     errors_m = run.errors_m[found]
     rms_m = float(np.sqrt(np.mean(np.sum(errors_m**2, axis=1))))
@@ -151,7 +151,9 @@ def main() -> None:
     for speed_m_per_s in SPEEDS_M_PER_S:
         taken = shots(camera, speed_m_per_s, exposure_s)
         bounds = [
-            fingertip_bound(camera, even(shot.truth, shot.velocity), exposure_s=exposure_s)
+            fingertip_bound(
+                camera, constant_velocity_path(shot.truth, shot.velocity), exposure_s=exposure_s
+            )
             for shot in taken[:BOUNDS]
         ]
         bound_m = float(np.sqrt(np.mean([np.trace(bound.position_m2) for bound in bounds])))

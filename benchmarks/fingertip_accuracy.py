@@ -1,16 +1,16 @@
-"""How exact a fingertip near the sheet is, and how near that is to the best there can be.
+"""Measure the accuracy of a fingertip near the sheet, compared with its Cramer-Rao bound.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip_accuracy [--places 120] [--json]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip_accuracy [--places 120] [--json]
 
-The twin's rig sees a finger that goes slowly, 20 mm/s and a hand's tremor, at places drawn evenly
-over the screen, 60 mm to each side, and from 40 mm behind it to 40 mm before it.  Through the node,
-single pictures (before tracking) and tracked:
+The simulated finger moves at 20 mm/s with tremor. The test positions are uniformly distributed: 60
+mm to each side of the screen's centre, and 40 mm to both sides of its plane. The node's fingertips
+are evaluated from single pairs (before tracking) and tracked:
 
-- with the shipped calibration: all of the error;
-- with the rig's true optics: what pixels leave, beside the Cramer-Rao bound of the same pixels
-  (`benchmarks.fingertip_bound`), each per axis as root mean square over all places.
+- with the shipped calibration, which gives the total error;
+- with the rig's true optics, which give the error from pixels only. It is compared with the
+  Cramer-Rao bound (`benchmarks.fingertip_bound`), as rms per axis over all positions.
 
-Some two minutes.
+Takes two minutes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from benchmarks.fingertip_bound import fingertip_bound
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
     MACHINE,
-    DiscCutouts,
     Frame,
+    ObservedFrame,
     Observer,
     TruePathCase,
     bench_scene,
@@ -50,27 +50,27 @@ Floats = NDArray[np.float64]
 LOW_M, HIGH_M = (-0.06, -0.06, -0.04), (0.06, 0.06, 0.04)
 SPEED_M_PER_S = 0.02
 FRAMES = 14
-"""At each place; the first ones confirm the track."""
+"""Number of frames at each position; the first ones confirm the track."""
 
 SETTLED_FRAMES = 5
 APART_S = 2.0
-"""Between one place and the next: long enough to lose the track."""
+"""Time between two positions, long enough to lose the track."""
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
-    """A finger that is at one place after the other, and passes each slowly."""
+class TestPositions:
+    """Finger that passes several positions slowly, one after the other."""
 
     places: Floats
     ways: Floats
     tremor: SineSum
 
     @staticmethod
-    def drawn(count: int, seed: int) -> Walk:
+    def drawn(count: int, seed: int) -> TestPositions:
         random = np.random.default_rng(seed)
         ways = random.standard_normal((count, 3))
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        return Walk(
+        return TestPositions(
             random.uniform(LOW_M, HIGH_M, (count, 3)), ways, SineSum.drawn(TREMOR_BAND_HZ, random)
         )
 
@@ -88,7 +88,7 @@ class Walk:
 
 
 def exact_calibration(scene: Scene, folder: Path) -> Path:
-    """A calibration file of the rig as it really stands."""
+    """Write a calibration file of the rig's true optics."""
     rig = make_true_camera(scene.camera)
     true = load_calibration(CALIBRATION_FILE).model_copy(
         update={"left": rig.left, "right": rig.right, "right_from_left": rig.right_from_left}
@@ -97,15 +97,15 @@ def exact_calibration(scene: Scene, folder: Path) -> Path:
     return folder / "true.yaml"
 
 
-async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[DiscCutouts]:
+async def follow(scene: Scene, walk: TestPositions, calibration: Path) -> list[ObservedFrame]:
     camera = twin_camera(scene, CLUTTER["lab"])
     frames = [Frame(t, camera) for t in walk.moments(1.0 / scene.camera.rate_hz)]
     observer = await Observer(scene, calibration=calibration).start()
     return await observer.follow(frames, walk.at)
 
 
-def bound_m2(scene: Scene, walk: Walk) -> Floats:
-    """(3,) mean over the places of the least variance per axis."""
+def bound_m2(scene: Scene, walk: TestPositions) -> Floats:
+    """Return the mean over the positions of the minimum variance per axis (3,), m^2."""
     camera = twin_camera(scene, CLUTTER["lab"])
 
     def around(place: int) -> TruePathCase:
@@ -118,8 +118,8 @@ def bound_m2(scene: Scene, walk: Walk) -> Floats:
     return np.asarray(np.mean([np.diag(bound.position_m2) for bound in bounds], axis=0))
 
 
-def single_errors(seen: Sequence[DiscCutouts]) -> Floats:
-    """(n, 3) m of single pictures that have a measured point."""
+def single_errors(seen: Sequence[ObservedFrame]) -> Floats:
+    """Return the errors (n, 3) m of single pairs with a measured point."""
     return np.array(
         [
             one.fingertip.measured_world_m - one.truth
@@ -129,14 +129,14 @@ def single_errors(seen: Sequence[DiscCutouts]) -> Floats:
     )
 
 
-def tracked_errors(seen: Sequence[DiscCutouts]) -> Floats:
-    """(n, 3) m of valid fingertips of settled tracks."""
+def tracked_errors(seen: Sequence[ObservedFrame]) -> Floats:
+    """Return the errors (n, 3) m of valid fingertips of settled tracks."""
     settled = [one for place, one in enumerate(seen) if place % FRAMES >= SETTLED_FRAMES]
     return np.array([one.error_m for one in settled if one.valid])
 
 
 def summary(errors_m: Floats) -> dict[str, Any]:
-    """Sizes in mm; of the whole vector and per axis (root mean squares)."""
+    """Return error quantiles in mm: of the whole vector, and rms per axis."""
     off_mm = 1e3 * np.linalg.norm(errors_m, axis=1)
     return {
         "frames": len(errors_m),
@@ -148,7 +148,7 @@ def summary(errors_m: Floats) -> dict[str, Any]:
 
 
 def measure(places: int, *, seed: int = 1) -> dict[str, Any]:
-    scene, walk = bench_scene(), Walk.drawn(places, seed)
+    scene, walk = bench_scene(), TestPositions.drawn(places, seed)
     shipped = asyncio.run(follow(scene, walk, CALIBRATION_FILE))
     with tempfile.TemporaryDirectory() as folder:
         exact = asyncio.run(follow(scene, walk, exact_calibration(scene, Path(folder))))

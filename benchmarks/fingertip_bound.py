@@ -1,12 +1,11 @@
-"""How well the fingertip can be known at best from the twin's pixels: the Cramer-Rao bound.
+"""Compute the Cramer-Rao bound of the fingertip from simulated pixels.
 
 No unbiased estimate has a smaller covariance than the inverse of the Fisher information (Kay,
-Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, chapter 3).  Each pixel
-about the mark is normal about its noise-free level, with the sensor's noise and that of rounding;
-what the levels tell through their variance is a ten-thousandth of that, and left out.  Only the
-mark moves with the position: the finger under it counts as ground, since no detector knows a
-finger's outline.  What a detector cannot know is estimated along, in each view by itself: the
-levels of mark and ground, the mark's radius, and the blur.
+Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, chapter 3). Each pixel has
+normal noise: the sensor's and that of rounding. The information in the variance, a ten-thousandth
+of that in the mean, is neglected. Only the marker moves with the position; the finger under it is
+ground. Nuisance parameters are estimated in each view: levels of marker and ground, the marker's
+radius, and the blur.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from flexsheet.nodes.twin.rig import pixels_per_slope
 Floats = NDArray[np.float64]
 
 STEP_PX = 0.02
-"""Half the step of the numeric derivatives by place, radius and blur."""
+"""Half the step of the numeric derivatives by position, radius and blur."""
 
 ROUNDING_VARIANCE = 1.0 / 12.0
 FULL_LEVEL = 255.0
@@ -33,15 +32,15 @@ MAX_CONDITION = 1e10
 
 
 class BoundError(ValueError):
-    """There is no bound: the mark is not in both pictures, or its pixels do not tell its place."""
+    """The marker is not in both images, or its position is not observable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Least covariances of any unbiased estimate.
+    """Minimum covariances of any unbiased estimate.
 
     position_m2: (3, 3) of the fingertip in the world, from both views.
-    views_px2: (2, 2) of the mark's place in the left and in the right view alone.
+    views_px2: (2, 2) of the marker's centre in the left and in the right view.
     """
 
     position_m2: Floats
@@ -56,10 +55,10 @@ def fingertip_bound(
     time_s: float = 0.0,
     margin_px: float = 2.0,
 ) -> Bound:
-    """The bound for a mark as `TwinCamera.picture` draws it, at mid-exposure.
+    """Compute the bound for a marker as `TwinCamera.picture` renders it, at mid-exposure.
 
-    margin_px: width of the ground around the mark and its blur that counts.  Raises BoundError
-    where the mark is outside a picture, or so hidden or saturated that its place cannot be told.
+    margin_px: width of the ground around the marker and its blur that is used. Raises BoundError if
+        the marker is outside an image, or too occluded or saturated.
     """
 
     def drawn(changed: TwinCamera) -> tuple[Floats, Floats]:
@@ -112,12 +111,12 @@ def fingertip_bound(
                 *(each[view][window].ravel() for each in (by_level, by_radius, by_blur)),
             ]
         )
-        # A move of a pixel is one of the mark across its ray.
+        # A shift of a pixel is a shift of the marker perpendicular to its ray.
         world_from_pixel = np.linalg.pinv(_pixel_from_world(eye, position(0.0) + offset_m))
         alone = np.concatenate([world_from_pixel.T @ placed, others])
         place_px2 = _covariance((alone * weight) @ alone.T, eye.side)[:2, :2]
         if np.sqrt(np.trace(place_px2)) > window[0].stop - window[0].start:
-            raise BoundError(f"{eye.side} view: the mark cannot be told from its ground")
+            raise BoundError(f"{eye.side} view: the marker has no contrast with its ground")
         views_px2.append(place_px2)
         both = np.zeros((len(total), len(weight)))
         both[:3] = placed
@@ -127,10 +126,11 @@ def fingertip_bound(
 
 
 def pixel_information(sensor: Sensor, levels: Floats) -> Floats:
-    """What each pixel tells of its level: the inverse of its variance while it is not full.
+    """Return the information of each pixel about its level: the inverse variance unless saturated.
 
-    A full pixel only says that its level is above `FULL_LEVEL`: the information of a normal variate
-    cut at z deviations above its mean is Phi(z) - z phi(z) + phi(z)^2 / Phi(-z) of the uncut one's.
+    A saturated pixel only shows that its level is above `FULL_LEVEL`. The information of a normal
+    variate censored z deviations above its mean is Phi(z) - z phi(z) + phi(z)^2 / Phi(-z), relative
+    to the uncensored one.
     """
     variance = levels / sensor.photons_per_level + sensor.read_noise**2 + ROUNDING_VARIANCE
     z = (FULL_LEVEL - levels) / np.sqrt(variance)
@@ -142,13 +142,13 @@ def pixel_information(sensor: Sensor, levels: Floats) -> Floats:
 def _about_the_mark(
     camera: TwinCamera, eye: Eye, position: Position, exposure_s: float, margin_px: float
 ) -> Window:
-    """The part of a picture that the mark lights during the exposure, and the margin round it."""
+    """Return the part of an image that the marker lights during the exposure, with the margin."""
     pixels, reach_px = [], 0.0
     for share in (-0.5, 0.0, 0.5):
         tip = position(share * exposure_s) + camera.marker_offset_m
         pixel, depth = eye.see(tip)
         if depth <= 0:
-            raise BoundError(f"the mark is behind the {eye.side} camera")
+            raise BoundError(f"the marker is behind the {eye.side} camera")
         pixels.append((float(pixel[0]), float(pixel[1])))
         x, y, z = (eye.camera_from_world[:3, :3] @ tip + eye.camera_from_world[:3, 3]).tolist()
         radius_px = pixels_per_slope(eye.lens, x / z, y / z) * camera.marker_radius_m / z
@@ -156,12 +156,12 @@ def _about_the_mark(
         reach_px = max(reach_px, radius_px + 3.0 * spread_px + margin_px)
     window = eye.window(pixels, reach_px)
     if window is None:
-        raise BoundError(f"the mark is outside the {eye.side} picture")
+        raise BoundError(f"the marker is outside the {eye.side} image")
     return window
 
 
 def _pixel_from_world(eye: Eye, point: Floats) -> Floats:
-    """d(pixel)/d(world) (2, 3) at a world point."""
+    """Return d(pixel)/d(world) (2, 3) at a world point."""
     step_m = 1e-6
     columns = [
         (eye.see(point + step_m * axis)[0] - eye.see(point - step_m * axis)[0]) / (2.0 * step_m)
@@ -171,11 +171,11 @@ def _pixel_from_world(eye: Eye, point: Floats) -> Floats:
 
 
 def _covariance(information: Floats, views: str) -> Floats:
-    """The inverse of an information matrix, its diagonal first scaled to one."""
+    """Invert an information matrix, after scaling its diagonal to one."""
     scale = np.sqrt(np.diag(information))
     if not (scale > 0).all():
-        raise BoundError(f"{views} view: no pixel tells the mark's place, size or level")
+        raise BoundError(f"{views} view: no pixel depends on the marker's position, size or level")
     scaled = information / np.outer(scale, scale)
     if np.linalg.cond(scaled) > MAX_CONDITION:
-        raise BoundError(f"{views} view: the pixels do not tell the mark's place from its looks")
+        raise BoundError(f"{views} view: the marker's position is not observable")
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))

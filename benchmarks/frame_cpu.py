@@ -1,13 +1,13 @@
-"""Measure the processor time of a frame beside OpenGL, from the soft body to the image.
+"""Measure the processor time of a frame without OpenGL, from the soft body to the image.
 
-    python -m benchmarks.frame_cpu [--scene FILE] [--triangles 20000] [--frames 300]
+python -m benchmarks.frame_cpu [--scene FILE] [--triangles 20000] [--frames 300]
 
-Draws a stereo frame of a pushed sheet repeatedly, each with a new soft body, by the renderer's own
-steps. Calls into OpenGL are timed apart from the rest. `GL calls` are their own time: they return
-early on a graphics card, perhaps not on a software driver. `GL finish` is the wait for the image.
-Both are wall time. All else is the CPU side, in processor time of the drawing thread, so that other
-load on the machine counts little. For that measurement the image is small: a software driver that
-fills many pixels evicts the caches, which a graphics card does not do.
+Renders stereo frames of a pushed sheet, each with a new soft body, by the renderer's code. OpenGL
+calls are timed separately, as wall time. `GL calls` is the time of the calls, which return early on
+a graphics card, but possibly not with a software driver. `GL finish` is the wait for the image. All
+other times are processor times of the rendering thread, so that other load has little effect. The
+image is small, because a software driver that fills many pixels evicts the caches, unlike a
+graphics card.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ GL_TYPES: tuple[type, ...] = (
 
 
 class Clock:
-    """Seconds of one frame by name; a call set `apart` pauses the span around it."""
+    """Times of one frame by name, s; a call in `apart` pauses the enclosing span."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -88,7 +88,7 @@ class Clock:
 
 @contextmanager
 def gl_apart(clock: Clock) -> Iterator[None]:
-    """Time every method of moderngl's objects with `clock` inside the context."""
+    """Time every method of moderngl's objects with `clock` in the context."""
     kept: list[tuple[type, str, Any]] = []
     for kind in GL_TYPES:
         for name, method in list(vars(kind).items()):
@@ -105,20 +105,20 @@ def gl_apart(clock: Clock) -> Iterator[None]:
             setattr(kind, name, method)
 
 
-def shrunk(scene: Scene, share: float) -> Scene:
-    """Return the scene with a projector of fewer pixels."""
+def with_fewer_pixels(scene: Scene, fraction: float) -> Scene:
+    """Return the scene with fewer projector pixels."""
     projector, lens = scene.projector, scene.projector.lens
-    sizes = {name: share * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    sizes = {name: fraction * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
     changes = {
         "lens": lens.model_copy(update=sizes),
-        "width_px": round(share * projector.width_px),
-        "height_px": round(share * projector.height_px),
+        "width_px": round(fraction * projector.width_px),
+        "height_px": round(fraction * projector.height_px),
     }
     return scene.model_copy(update={"projector": projector.model_copy(update=changes)})
 
 
-def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
-    """Return a scene renderer whose surface has about this many triangles."""
+def make_scene_renderer(scene: Scene, triangles: int) -> SceneRenderer:
+    """Make a scene renderer whose surface has about this many triangles."""
     spacing_m = 0.0025
     for _ in range(4):
         stage = SceneRenderer(
@@ -134,8 +134,8 @@ def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
     return stage
 
 
-def skin_of(scene: Scene) -> Skin:
-    """Return the solver's skin, as fine as the demo's."""
+def compute_skin(scene: Scene) -> Skin:
+    """Compute the solver's skin with the demo's spacing."""
     mesh = mesh_scene(scene, SKIN_SPACING_M)
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
@@ -146,7 +146,7 @@ def skin_of(scene: Scene) -> Skin:
 
 
 def bodies(skin: Skin) -> Iterator[SoftBody]:
-    """Yield soft bodies that a finger pushes at several points, 15 mm deep."""
+    """Yield soft bodies pushed 15 mm deep at several points."""
     points = skin.vertices_world_m.astype(np.float64)
     for number in range(10**6):
         place = 0.02 * np.array([np.sin(0.1 * number), np.cos(0.1 * number)])
@@ -181,14 +181,14 @@ def measure(
     scene: Scene, *, triangles: int, frames: int
 ) -> tuple[SceneRenderer, list[dict[str, float]]]:
     """Return the seconds of each frame by name."""
-    stage, skin = stage_of(scene, triangles), skin_of(scene)
+    stage, skin = make_scene_renderer(scene, triangles), compute_skin(scene)
     stage.set_skin(skin)
     shown = Display(correction="two_pass", stereo="side_by_side")
     edges = edge_poses(np.eye(4), STRETCH * scene.sheet.width_m)
     rows = []
     clock = Clock()
     shape = clock.apart(stage.sheet_mesh, "sheet's shape", time.thread_time)
-    setattr(stage, "sheet_mesh", shape)  # noqa: B010  (mypy takes no assignment to a method)
+    setattr(stage, "sheet_mesh", shape)  # noqa: B010  (mypy rejects an assignment to a method)
     with gl_apart(clock):
         for number, body in zip(range(frames + 20), bodies(skin), strict=False):
             clock.spent = defaultdict(float)
@@ -211,7 +211,9 @@ def main() -> None:
     parser.add_argument("--frames", default=300, type=int)
     options = parser.parse_args()
     scene = load_scene(options.scene)
-    stage, rows = measure(shrunk(scene, SMALL), triangles=options.triangles, frames=options.frames)
+    stage, rows = measure(
+        with_fewer_pixels(scene, SMALL), triangles=options.triangles, frames=options.frames
+    )
     _, full = measure(scene, triangles=options.triangles, frames=options.frames // 5)
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name[:2] != "GL"]
     skin = stage._follower.vertices if stage._follower else 0

@@ -1,11 +1,11 @@
-"""Looks for bytes from outside that do what they must not: `make fuzz`, or
+"""Fuzz the parsers of external data: `make fuzz`, or
 
-    python -m benchmarks.fuzz [TARGET ...] [--seconds 300] [--corpus FOLDER]
+python -m benchmarks.fuzz [TARGET ...] [--seconds 300] [--corpus FOLDER]
 
-Each target (`benchmarks.fuzz_targets`) runs in a process of its own for so long, guided by what the
-inputs reach in our code and in the readers below it (atheris: the extra `fuzz`); inputs begin with
-valid examples and are changed by what knows their structure.  What is found lies in the corpus'
-folder as `TARGET/crash-...`; `python -m benchmarks.fuzz TARGET --again FILE` runs it once more.
+Each target (`benchmarks.fuzz_targets`) runs in a separate process, guided by the coverage of this
+code and of the libraries below it (atheris: the extra `fuzz`). The inputs start from valid
+examples, and mutators preserve part of their structure. Findings are in the corpus folder as
+`TARGET/crash-...`; `python -m benchmarks.fuzz TARGET --again FILE` repeats one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 MEMORY_MIB = 2048
 MAX_S = 20
 FOUND = ("crash", "oom", "timeout")
-"""How atheris names the files of what it finds."""
+"""Name prefixes of the files in which atheris stores findings."""
 
 MAX_BYTES = 1 << 20
 TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
@@ -42,11 +42,11 @@ MODULES = {
     "modbus": ("flexsheet.nodes.arm_bridge.modbus", "flexsheet.nodes.twin.arms", "pymodbus"),
     "mxt": ("flexsheet.nodes.arm_bridge.mxt", "flexsheet.nodes.twin.mxt_controller"),
 }
-"""Whose branches are to be reached, by the target."""
+"""Modules to instrument for coverage, by target."""
 
 
-def hunt(name: str, corpus: Path, seconds: float) -> None:
-    """Run one target in this process; atheris ends it."""
+def fuzz(name: str, corpus: Path, seconds: float) -> None:
+    """Run one target in this process until atheris ends it."""
     import atheris
 
     with atheris.instrument_imports(include=list(MODULES[name])):
@@ -88,12 +88,12 @@ def hunt(name: str, corpus: Path, seconds: float) -> None:
 
 
 def findings_in(folder: Path) -> set[str]:
-    """The files of a target's folder that hold what was found, in this run or an earlier one."""
+    """Return the files with findings in a target's folder, from this run or an earlier one."""
     return {str(one) for kind in FOUND for one in folder.glob(f"{kind}-*")}
 
 
-def hunted(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
-    """One target in a process of its own, and what its end says."""
+def fuzz_in_process(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
+    """Run one target in a separate process, and return its last output."""
     folder = corpus / name
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
@@ -135,11 +135,11 @@ def main() -> int:
     corpus = given.corpus.resolve()
     if given.here:
         (name,) = given.targets
-        hunt(name, corpus / name, given.seconds)
+        fuzz(name, corpus / name, given.seconds)
         return 0
     bad = False
     for name in given.targets or TARGETS:
-        result = hunted(name, corpus, given.seconds)
+        result = fuzz_in_process(name, corpus, given.seconds)
         print(json.dumps(result), flush=True)
         bad |= bool(result["found"]) or result["exit_code"] != 0
     return 1 if bad else 0

@@ -1,10 +1,10 @@
-"""What reads bytes from outside, and what it may do with them: targets for `benchmarks.fuzz`.
+"""Define fuzzing targets for `benchmarks.fuzz`: the parsers of external data.
 
-A target takes any bytes and ends in one of two ways: it understood them, or it raised the error
-that it declares.  Anything else is a finding: another exception, memory that grows beyond its
-bound, and whatever would execute something (`Watch` looks on).  Each has valid examples to begin
-with, and a way of changing them that knows their structure, so that what comes out gets past the
-first check.  `tests/test_fuzz_*.py` run the same targets with hypothesis.
+A target accepts any bytes: it decodes them, or raises the declared error. Anything else is a
+finding: another exception, memory beyond the bound, or the execution of a program or code
+(`ExecutionMonitor`). Each target has valid examples as seeds, and a mutator that preserves part of
+the structure, so that inputs pass the first checks. `tests/test_fuzz_*.py` run the same targets
+with hypothesis.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController
 LAUNCH = Path(flexsheet.launch.__file__).parent
 AT_REST_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 MEMORY_BYTES = 256 << 20
-"""What one input may take beside what is there before."""
+"""Maximum additional memory for one input."""
 
 FORBIDDEN = frozenset(
     {"os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "pickle.find_class", "os.fork"}
 )
-"""Python's audit events of executing something."""
+"""Python's audit events of an execution."""
 
 Mutate = Callable[[bytes, random.Random], bytes]
 
@@ -78,11 +78,11 @@ _log = logging.getLogger("flexsheet.fuzz")
 
 
 class Finding(AssertionError):
-    """An input did what no input may."""
+    """An input had a forbidden effect."""
 
 
-class Watch:
-    """Raises Finding when something is executed while `on`; one for the process, for good."""
+class ExecutionMonitor:
+    """Permanent monitor that raises Finding if something is executed while `on`."""
 
     on = False
     _hooked = False
@@ -106,22 +106,22 @@ class Watch:
 
 
 @contextmanager
-def bounded_memory(most_bytes: int = MEMORY_BYTES) -> Iterator[None]:
-    """Raises Finding when the process has meanwhile had so much more in memory than ever before."""
-    before = _most_ever()
+def bounded_memory(max_bytes: int = MEMORY_BYTES) -> Iterator[None]:
+    """Raise Finding if the process's peak memory grows by more than `max_bytes`."""
+    before = _peak_bytes()
     yield
-    taken = _most_ever() - before
-    if taken > most_bytes:
-        raise Finding(f"{taken >> 20} MiB were taken")
+    taken = _peak_bytes() - before
+    if taken > max_bytes:
+        raise Finding(f"{taken >> 20} MiB were allocated")
 
 
-def _most_ever() -> int:
+def _peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
 @dataclass(frozen=True)
 class Target:
-    """run: True when the bytes were understood, False when refused in the declared way."""
+    """Fuzzing target; run: returns whether the bytes were decoded, False for the declared error."""
 
     name: str
     about: str
@@ -130,25 +130,25 @@ class Target:
     mutate: Mutate
 
     def check(self, data: bytes) -> bool:
-        """`run` under watch; raises Finding, or what the target let through."""
-        with Watch.looks(), bounded_memory():
+        """Execute `run` with the monitor; raises Finding and the target's undeclared exceptions."""
+        with ExecutionMonitor.looks(), bounded_memory():
             return self.run(data)
 
 
 def refuse_long(error: Exception, most: int) -> None:
-    """A refusal says why, and can be read."""
+    """Raise Finding unless the error text has a reasonable length."""
     if not 0 < len(str(error)) <= most:
         raise Finding(f"a refusal of {len(str(error))} characters")
 
 
-# Changes that any bytes can suffer, and those of trees.
+# Mutations of bytes and trees.
 
 ODD_INTEGERS = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 ODD_LONGS = (0, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 
 
 def mutate_bytes(data: bytes, chance: random.Random) -> bytes:
-    """Flip, set, cut, insert, repeat, move, or put a number there that means much or nothing."""
+    """Apply one random mutation: flip, set, cut, insert, repeat or move bytes."""
     place = chance.randrange(len(data) + 1)
     end = min(len(data), place + 1 + int(chance.expovariate(1 / 8)))
     before, piece, after = data[:place], data[place:end], data[end:]
@@ -179,15 +179,15 @@ def mutate_bytes(data: bytes, chance: random.Random) -> bytes:
 
 
 def nested(depth: int) -> Any:
-    """Lists in lists."""
+    """Return nested lists."""
     value: Any = []
     for _ in range(depth):
         value = [value]
     return value
 
 
-def odd_value(chance: random.Random) -> Any:
-    """Something that hardly belongs where it is put."""
+def make_odd_value(chance: random.Random) -> Any:
+    """Return a random value of an unusual type or size."""
     values: tuple[Any, ...] = (
         None, True, 0, -1, 1 << 63, -(1 << 63), (1 << 64) - 1, 0.0, -0.0, 1e308, 5e-324, "", "x",
         float("nan"), float("inf"), "\0", "é" * 300, "../../etc/passwd", [], {}, [[]], {"": None},
@@ -197,7 +197,7 @@ def odd_value(chance: random.Random) -> Any:
 
 
 def mutate_tree(tree: Any, chance: random.Random, odd: Callable[[random.Random], Any]) -> Any:
-    """A tree of dicts and lists with one of its values changed, dropped, doubled or moved."""
+    """Return a tree of dicts and lists with one value changed, deleted, duplicated or moved."""
     if isinstance(tree, dict) and tree and chance.random() < 0.9:
         return _mutate_dict(tree, chance, odd)
     if isinstance(tree, list | tuple) and tree and chance.random() < 0.9:
@@ -238,10 +238,10 @@ def _mutate_dict(
 
 
 def example(kind: Any) -> Any:
-    """A valid value of a message's field, or of a whole message, by its type."""
+    """Return a strategy for valid values of a message's field, or of a message, by its type."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         fields = kind.model_fields.items()
-        # As they stand in the class, since pydantic keeps constraints apart from the type.
+        # The annotations of the class contain the constraints, which pydantic stores separately.
         return kind.model_validate({name: _example_of(one) for name, one in fields})
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
@@ -277,7 +277,7 @@ def scene() -> Message:
 
 
 def wire_seeds() -> list[bytes]:
-    """A message of each topic: the topic's number, then its frames as in a bag."""
+    """Return a message of each topic: the topic's number, then its frames as in a bag."""
     found = []
     for number, topic in enumerate(TOPICS.values()):
         message = scene() if topic.name == "scene" else example(topic.message)
@@ -289,16 +289,16 @@ def wire_seeds() -> list[bytes]:
 
 @cache
 def listener(name: str) -> Subscriber:
-    """A subscriber that is connected to nobody and handed frames by hand."""
+    """Return a subscriber without a connection, to which frames are passed directly."""
 
     def heard(message: Message, header: Header) -> None:
-        """Nothing is done with it."""
+        """Do nothing with a message."""
 
     return Subscriber(TOPICS[name], [], heard, PortCounts(), on_problem=_log.debug, plan="plan")
 
 
 def wire_frames(data: bytes) -> tuple[str, list[Any]]:
-    """The topic and the frames that some bytes stand for."""
+    """Decode bytes to a topic and frames."""
     name = NAMES[data[0] % len(NAMES)] if data else NAMES[0]
     try:
         return name, split_frames(data[1:])
@@ -307,7 +307,7 @@ def wire_frames(data: bytes) -> tuple[str, list[Any]]:
 
 
 def run_wire(data: bytes) -> bool:
-    """What is taken can be sent again, and says the same then."""
+    """Decode a message, and check that it can be encoded again without a change."""
     name, frames = wire_frames(data)
     topic = TOPICS[name]
     subscriber = listener(name)
@@ -329,7 +329,7 @@ def mutate_wire(data: bytes, chance: random.Random) -> bytes:
     frames = [bytes(one) for one in wire_frames(data)[1]]
     kind = chance.randrange(10)
     if kind < 6:
-        with suppress(Exception):  # what is no msgpack any more is changed as bytes, below
+        with suppress(Exception):  # data that is not valid msgpack is mutated as bytes, below
             tree = msgpack.unpackb(frames[0], use_list=False, strict_map_key=False)
             changed = mutate_tree(tree, chance, odd_on_the_wire)
             frames[0] = msgpack.packb(changed)
@@ -350,14 +350,16 @@ def mutate_wire(data: bytes, chance: random.Random) -> bytes:
 
 
 def odd_on_the_wire(chance: random.Random) -> Any:
-    """Also arrays where none belong, of shapes that are none, and bytes."""
+    """Return a random value, also an array with an invalid shape, or bytes."""
     axes = chance.randrange(4)
     shape = [chance.choice((0, 1, 2, 3, 4, 6, 0xFFFF, 0xFFFFFFFF)) for _ in range(axes)]
     head = struct.pack(f"<BBxx{axes}I", chance.randrange(13), axes, *shape)
     head += bytes(-len(head) % 8)
     body = chance.randbytes(chance.choice((0, 8, 24, 128)))
     array = msgpack.ExtType(chance.choice((1, 1, 2, 3)), head + body)
-    return chance.choice((odd_value(chance), array, array, b"", chance.randbytes(9), {b"k": 1}))
+    return chance.choice(
+        (make_odd_value(chance), array, array, b"", chance.randbytes(9), {b"k": 1})
+    )
 
 
 # Bags.
@@ -369,7 +371,7 @@ Record = tuple[int, bytes]
 
 @cache
 def bag_seeds() -> list[bytes]:
-    """Small bags: with chunks compressed or not, an attachment, metadata, and a cut one."""
+    """Return small bags: compressed or not, with an attachment, metadata, and a truncated one."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for compress in (True, False):
@@ -385,7 +387,7 @@ def bag_seeds() -> list[bytes]:
 
 
 def run_bag(data: bytes) -> bool:
-    """Looked into, read through, and recovered."""
+    """Read the summary and all messages of a bag, and recover it."""
     with tempfile.TemporaryDirectory(dir=_scratch()) as folder:
         path, saved = Path(folder) / "a.mcap", Path(folder) / "b.mcap"
         path.write_bytes(data)
@@ -408,12 +410,12 @@ def run_bag(data: bytes) -> bool:
 
 @cache
 def _scratch() -> str | None:
-    """A folder that costs no disk, where there is one."""
+    """Return a folder in memory if available, else on disk."""
     return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 
 
-def records_of(data: bytes) -> list[Record]:
-    """(opcode, body) as far as they go."""
+def read_records(data: bytes) -> list[Record]:
+    """Return the records (opcode, body) up to the first damaged one."""
     found, offset = [], 0
     while offset + 9 <= len(data):
         opcode, length = struct.unpack_from("<BQ", data, offset)
@@ -422,7 +424,7 @@ def records_of(data: bytes) -> list[Record]:
     return found
 
 
-def joined(records: Sequence[Record]) -> bytes:
+def join_records(records: Sequence[Record]) -> bytes:
     return b"".join(struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records)
 
 
@@ -430,11 +432,11 @@ def mutate_bag(data: bytes, chance: random.Random) -> bytes:
     """Mutate its records, those within a chunk (with a correct check sum), or the bytes."""
     if chance.random() < 0.2 or not data.startswith(MAGIC):
         return mutate_bytes(data, chance)
-    records = records_of(data[len(MAGIC) :])
+    records = read_records(data[len(MAGIC) :])
     if not records:
         return mutate_bytes(data, chance)
     changed = mutate_records(records, chance)
-    return MAGIC + joined(changed) + MAGIC
+    return MAGIC + join_records(changed) + MAGIC
 
 
 def mutate_records(records: Sequence[Record], chance: random.Random) -> list[Record]:
@@ -453,7 +455,7 @@ def mutate_records(records: Sequence[Record], chance: random.Random) -> list[Rec
             return [*rest[:other], (opcode, body), *rest[other:]]
         case _:
             if opcode == CHUNK:
-                with suppress(Exception):  # one that is damaged already is changed as bytes
+                with suppress(Exception):  # a damaged one is mutated as bytes
                     return [*records[:place], (opcode, _mutate_chunk(body, chance)),
                             *records[place + 1 :]]  # fmt: skip
             changed = _mutate_text_or_bytes(body, chance)
@@ -463,7 +465,7 @@ def mutate_records(records: Sequence[Record], chance: random.Random) -> list[Rec
 
 
 def _mutate_text_or_bytes(body: bytes, chance: random.Random) -> bytes:
-    """A JSON Schema within a record is changed as one: its length stands before it."""
+    """Mutate the JSON Schema within a record, which is preceded by its length, or the bytes."""
     start = body.find(b"{")
     if start < 4 or chance.random() < 0.5:
         return mutate_bytes(body, chance)
@@ -483,17 +485,17 @@ def odd_in_a_schema(chance: random.Random) -> Any:
     reference = {"$ref": chance.choice(ways)}
     definitions = {"A": {"$ref": "#/$defs/B"}, "B": {"$ref": "#/$defs/A"}}
     loop = {"$defs": definitions, "properties": {"a": reference}, "anyOf": [reference, reference]}
-    return chance.choice((odd_value(chance), reference, {"anyOf": [reference] * 3}, loop))
+    return chance.choice((make_odd_value(chance), reference, {"anyOf": [reference] * 3}, loop))
 
 
 def _mutate_chunk(body: bytes, chance: random.Random) -> bytes:
-    """One of its records is changed; size and check sum are made right, or the claim is not."""
+    """Mutate one of the records of a chunk; correct size and check sum, or leave them wrong."""
     start, end, size, _ = struct.unpack_from("<QQQI", body)
     name_length = struct.unpack_from("<I", body, 28)[0]
     name = body[32 : 32 + name_length]
     packed = body[40 + name_length :]
     plain = zstandard.decompress(packed, 1 << 24) if name == b"zstd" else packed
-    plain = joined(mutate_records(records_of(plain), chance))
+    plain = join_records(mutate_records(read_records(plain), chance))
     if chance.random() < 0.05:
         plain = bytes(1 << 20)
     size = chance.choice(ODD_LONGS) if chance.random() < 0.1 else len(plain)
@@ -506,7 +508,7 @@ def _mutate_chunk(body: bytes, chance: random.Random) -> bytes:
 
 
 def import_nodes() -> None:
-    """Ahead of any watch: some libraries start processes when they are imported."""
+    """Import the nodes before any monitor is on, since some libraries start processes on import."""
     for name in NODES:
         node_class(name)
 
@@ -524,7 +526,7 @@ YAML_TOKENS = (
 )  # fmt: skip
 
 BOMB = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]\n" for n in range(12))
-"""Nine aliases of nine aliases of nine ..."""
+"""Nested aliases: nine of nine of nine ..."""
 
 
 def mutate_yaml(data: bytes, chance: random.Random) -> bytes:
@@ -532,10 +534,10 @@ def mutate_yaml(data: bytes, chance: random.Random) -> bytes:
     text = data.decode(errors="replace")
     kind = chance.randrange(10)
     if kind < 6:
-        with suppress(Exception):  # what is no YAML any more is changed as text
+        with suppress(Exception):  # data that is not valid YAML is mutated as text
             tree = YAML(typ="safe", pure=True).load(text)
             if isinstance(tree, dict):
-                return to_yaml(mutate_tree(tree, chance, odd_value))
+                return to_yaml(mutate_tree(tree, chance, make_odd_value))
     place = chance.randrange(len(text) + 1)
     if kind < 8:
         return (text[:place] + chance.choice(YAML_TOKENS) + text[place:]).encode()
@@ -569,14 +571,14 @@ clocks: {max_offset_uncertainty_s: 0.01}
 
 
 def launch_seeds() -> list[bytes]:
-    """A small launch file over two hosts, and those that come along."""
+    """Return a small launch file for two hosts, and the shipped ones."""
     names = ("demo.yaml", "three.yaml", "replay.yaml", "lab.yaml")
     return [SMALL_LAUNCH.encode(), *((LAUNCH / name).read_bytes() for name in names)]
 
 
 @cache
 def launch_folder() -> Path:
-    """Scenes and calibrations where launch files look for them; for the life of the process."""
+    """Create a folder with scenes and calibrations for launch files, until the process ends."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir=_scratch()))
     for name in ("scenes", "calibrations"):
         shutil.copytree(LAUNCH / name, folder / name)
@@ -584,14 +586,14 @@ def launch_folder() -> Path:
 
 
 def remove_launch_folder() -> None:
-    """At the end of whoever ran targets of YAML."""
+    """Delete the folder of launch files."""
     if launch_folder.cache_info().currsize:
         shutil.rmtree(launch_folder())
         launch_folder.cache_clear()
 
 
 def run_launch(data: bytes) -> bool:
-    """The plan; the last line may be a setting, as of `--set`."""
+    """Load a launch file as a plan; the last line may be a setting for `--set`."""
     path = launch_folder() / "fuzz.yaml"
     text, mark, setting = data.partition(b"\n#--set ")
     path.write_bytes(text)
@@ -614,7 +616,7 @@ def mutate_launch(data: bytes, chance: random.Random) -> bytes:
 
 
 def scene_seeds() -> list[bytes]:
-    # Those with meshes take too long to be read thousands of times; the meshes have their target.
+    # Scenes with meshes load too slowly; meshes have a separate target.
     files = sorted((LAUNCH / "scenes").glob("*.yaml"))
     texts = [file.read_bytes() for file in files]
     return [text for text in texts if b"mesh_file" not in text and b"texture" not in text]
@@ -633,7 +635,7 @@ def run_scene(data: bytes) -> bool:
 
 
 def mesh_seeds() -> list[bytes]:
-    """A tetrahedron, and a triangle as text and in bytes."""
+    """Return a tetrahedron, and a triangle in text and binary form."""
     return list(MESH_SEEDS)
 
 
@@ -646,7 +648,7 @@ MESH_SEEDS = (
 
 
 def run_mesh(data: bytes) -> bool:
-    """The same bytes as an STL and as an OBJ file."""
+    """Load the same bytes as an STL and as an OBJ file."""
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     taken = False
     for suffix in (".obj", ".stl"):
@@ -670,14 +672,14 @@ def mutate_mesh(data: bytes, chance: random.Random) -> bytes:
 # Modbus TCP.
 
 TID, CRC_RIGHT, ACCEPTED_RIGHT, SPLIT, CLOSE = 1, 2, 4, 8, 16
-"""What an answer's first byte says: its transaction is that of the request; the status block's
-check sum, and the number it accepts, are right; it comes in two pieces; the connection ends."""
+"""Meaning of the bits of an answer's first byte: use the request's transaction; correct the check
+sum of the status block and its accepted number; split the answer; close the connection."""
 
 _REGISTERS = 26
 
 
 class FakeArm:
-    """A Modbus TCP server on loopback that answers every request with given bytes."""
+    """Modbus TCP server on loopback that answers every request with given bytes."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
@@ -690,14 +692,14 @@ class FakeArm:
         self.port = int(self._server.sockets[0].getsockname()[1])
 
     def _note(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Nothing that an arm sends may be raised into the loop."""
+        """Ignore exceptions in the event loop."""
         self.failures.append(f"{context}")
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with suppress(ConnectionError):
             while request := await reader.read(1024):
                 flags, answer = self.answer[0] if self.answer else 0, self.answer[1:]
-                answer = made_right(answer, flags, request)
+                answer = correct_answer(answer, flags, request)
                 middle = len(answer) // 2 if flags & SPLIT else len(answer)
                 for piece in (answer[:middle], answer[middle:]):
                     writer.write(piece)
@@ -708,7 +710,7 @@ class FakeArm:
         writer.close()
 
     def ask(self, answer: bytes) -> bool:
-        """One exchange with a link of its own."""
+        """Exchange one request with a new link."""
         return self.loop.run_until_complete(self._ask(answer))
 
     async def _ask(self, answer: bytes) -> bool:
@@ -732,8 +734,8 @@ class FakeArm:
         self.loop.close()
 
 
-def made_right(answer: bytes, flags: int, request: bytes) -> bytes:
-    """An answer with what its flags say taken from the request, or made right."""
+def correct_answer(answer: bytes, flags: int, request: bytes) -> bytes:
+    """Correct the parts of an answer that its flags name, from the request."""
     block = 9
     if flags & TID and len(answer) >= 2:
         answer = request[:2] + answer[2:]
@@ -752,14 +754,14 @@ def fake_arm() -> FakeArm:
 
 
 def close_fake_arm() -> None:
-    """At the end of whoever ran the target of Modbus."""
+    """Close the server of the Modbus target."""
     if fake_arm.cache_info().currsize:
         fake_arm().close()
         fake_arm.cache_clear()
 
 
 def modbus_seeds() -> list[bytes]:
-    """A right answer, an exception, and requests as the twin's controller is sent them."""
+    """Return a valid answer, an exception, and requests to the simulated controller."""
     controller = Controller(AT_REST_RAD, servo_lag_s=0.02, noise_rad=0.0, watchdog_s=1.0)
     registers = controller.status_registers()
     body = struct.pack(f">{len(registers)}H", *registers)
@@ -790,7 +792,7 @@ def in_range(joints_rad: np.ndarray[Any, Any]) -> bool:
     return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
 
 
-# The maker's real-time protocol.
+# The manufacturer's real-time protocol.
 
 
 def mxt_seeds() -> list[bytes]:
@@ -826,7 +828,7 @@ def run_mxt(data: bytes) -> bool:
 
 
 def mutate_mxt(data: bytes, chance: random.Random) -> bytes:
-    """Numbers of a packet, or of its bytes; whole packets twice or in another order."""
+    """Mutate numbers of a packet or its bytes; duplicate or reorder packets."""
     if len(data) >= PACKET_BYTES and chance.random() < 0.5:
         place = chance.randrange(len(data) // PACKET_BYTES) * PACKET_BYTES
         odd = chance.choice((float("nan"), float("inf"), -1e30, 0.0, 3.0, 1e-40))
@@ -846,6 +848,6 @@ TARGETS = {
         Target("scene", "scene files", scene_seeds, run_scene, mutate_yaml),
         Target("mesh", "STL and OBJ files of a scene", mesh_seeds, run_mesh, mutate_mesh),
         Target("modbus", "answers and registers of an arm", modbus_seeds, run_modbus, mutate_bytes),
-        Target("mxt", "packets of the maker's controller", mxt_seeds, run_mxt, mutate_mxt),
+        Target("mxt", "packets of the manufacturer's controller", mxt_seeds, run_mxt, mutate_mxt),
     )
 }

@@ -1,13 +1,13 @@
-"""What the graph costs while nothing happens: CPU time of each process, in % of one core.
+"""Measure the CPU time of each process of an idle graph, in % of one core.
 
-    python -m benchmarks.idle [--seconds 30] [--case waiting standing watching] [--json FILE]
+python -m benchmarks.idle [--seconds 30] [--case waiting standing watching] [--json FILE]
 
-The nodes of `launch/demo.yaml` without twin_finger and twin_eye.  twin_arms plays the arms'
-controllers, which a lab has outside its computers, and is not in the sum.
+The graph has the nodes of `launch/demo.yaml` without twin_finger and twin_eye. The sum excludes
+twin_arms, which simulates the arms' controllers.
 
-waiting    nobody has said that the arms may move; the camera gives no pictures
-standing   the arms are ready, hear from their bridges in every cycle, and stand
-watching   the same, and the camera gives 60 pairs a second, from files, without a finger in them
+waiting: the arms are not enabled; the camera delivers no images.
+standing: the arms are enabled and hold their positions, with an exchange in each cycle.
+watching: as standing, and the camera delivers 60 pairs per second from files, without a finger.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LEFT_OUT = ("twin_finger", "twin_eye")
 OUTSIDE = "twin_arms"
 LAUNCHER = "launcher"
 SETTLING_S = 5.0
-PICTURES, RATE_HZ, SIZE_PX = 8, 60.0, (480, 640)
+IMAGES, RATE_HZ, SIZE_PX = 8, 60.0, (480, 640)
 
 
 def free_ports(count: int) -> list[int]:
@@ -54,16 +54,16 @@ def free_ports(count: int) -> list[int]:
             one.close()
 
 
-def no_pictures(folder: Path) -> dict[str, Any]:
-    """The camera's entry in the launch file."""
+def camera_without_images(folder: Path) -> dict[str, Any]:
+    """Make the camera's entry in the launch file without images."""
     return {"type": "camera", "parameters": {"source": "twin"}, "topics": {"twin__stereo": None}}
 
 
-def empty_pictures(folder: Path) -> dict[str, Any]:
-    """The same, with files of a dim background and its noise."""
+def camera_with_background(folder: Path) -> dict[str, Any]:
+    """Make the camera's entry with files of a dim, noisy background."""
     random = np.random.default_rng(0)
     for side in ("left", "right"):
-        for number in range(PICTURES):
+        for number in range(IMAGES):
             picture = random.normal(40.0, 2.0, SIZE_PX).astype(np.uint8)
             cv2.imwrite(str(folder / f"{side}{number}.bmp"), picture)
     source = {
@@ -82,21 +82,21 @@ def empty_pictures(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """camera: its entry in the launch file, given a folder for pictures."""
+    """Case; camera: makes the camera's entry in the launch file, given a folder for images."""
 
     camera: Callable[[Path], dict[str, Any]]
     arming: str
 
 
 CASES = {
-    "waiting": Case(no_pictures, "manual"),
-    "standing": Case(no_pictures, "auto"),
-    "watching": Case(empty_pictures, "auto"),
+    "waiting": Case(camera_without_images, "manual"),
+    "standing": Case(camera_without_images, "auto"),
+    "watching": Case(camera_with_background, "auto"),
 }
 
 
 def launch_file(folder: Path, case: Case) -> Path:
-    """The demo's graph without what plays finger and eye."""
+    """Write the demo's launch file without the simulators of finger and eye."""
     yaml = YAML()
     values = yaml.load(DEMO_FILE)
     values["scene"] = str((DEMO_FILE.parent / values["scene"]).resolve())
@@ -121,7 +121,7 @@ def cpu_s(pids: dict[str, int]) -> dict[str, float]:
 
 
 async def measure(case: str, seconds: float) -> dict[str, Any]:
-    """CPU time over wall time, per process and of the graph's own processes together."""
+    """Return the CPU time over wall time, per process and in total without the simulators."""
     with tempfile.TemporaryDirectory() as folder:
         plan = load_graph(launch_file(Path(folder), CASES[case]))
         async with RunningGraph(plan) as graph:

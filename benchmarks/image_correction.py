@@ -1,14 +1,15 @@
 """Measure the renderer's images against the simulator, without the graph.
 
-    python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
+python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
 
-sizes: figures 11 and 13 of the paper, the error of each size as the eye sees it on the true sheet
-(mm). The tilted sheet either rolls on the cylinder (its plane tangent, the touched line fixed on
-it) or rotates about its own centre. Positive tilts rotate the sheet's front upwards, as a finger
-does that strokes up. The others give the errors at all points that the eye sees (mean, 95 %,
-maximum, mm) and the fraction of the object that it sees. They vary the tilt to 80 degrees, the
-depth to 70 mm, the position of the push on upright and tilted sheets, and the stretch. frames: the
-time of a stereo frame over the floor's, both measured alternately. Without a name: all.
+sizes: figures 11 and 13 of the paper; error of each size as the eye sees it on the true sheet (mm).
+    The tilted sheet either rolls on the cylinder (tangent, with a fixed contact line) or rotates
+    about its centre. A positive tilt rotates the sheet's front upwards, as in a stroke upwards.
+tilts, depths, places, stretches: errors at all points that the eye sees (mean, 95 %, maximum, mm),
+    and the visible fraction of the object. They vary the tilt up to 80 degrees, the depth up to 70
+    mm, the contact point on upright and tilted sheets, and the stretch.
+frames: time of a stereo frame relative to that without correction, both measured alternately.
+Without a name, all are measured.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ Image = NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
-"""Corrections for a flat sheet; four triangles are then one plane."""
+"""Corrections for a flat sheet, for which four triangles are one plane."""
 ROUNDS = 40
 
 
-class Bench:
-    """The renderer, the true sheet and the eye of one scene."""
+class CorrectionBench:
+    """Renderer, true sheet and eye of one scene."""
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
@@ -86,8 +87,7 @@ class Bench:
     def pushed(
         self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Floats, Floats | None]:
-        """Return world_from_sheet that touches the cylinder with that point, and the fingertip
-        there."""
+        """Return world_from_sheet in contact with the cylinder at that point, and the fingertip."""
         pose = roll_sheet(self.scene, -np.radians(tilt_deg), place_m)
         touched = pose[:3, 3] + pose[:3, :3] @ [*place_m, 0.0]
         return pose, touched - depth_m * pose[:3, 2] if depth_m else None
@@ -99,8 +99,7 @@ class Bench:
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
-        """Return the error of each size (m) against the expected image; the drawn object is not
-        deformed."""
+        """Return the error of each size (m) against the expected image of the undeformed object."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
         projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
@@ -115,8 +114,7 @@ class Bench:
         return error_map(x, y, METRES_PER_PX)
 
     def cell(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> str:
-        """Return mean / 95 % / maximum of the errors, mm, and the visible fraction of the
-        object."""
+        """Format mean / 95 % / maximum of the errors, mm, and the object's visible fraction."""
         sizes = 1e3 * self.errors(method, predicted, truth).sizes_m
         if len(sizes) == 0:
             return "dark"
@@ -139,7 +137,7 @@ def with_mean(errors: Floats) -> list[str]:
     return [f"{error:.3f}" for error in (*errors, errors.mean())]
 
 
-def print_sizes(bench: Bench) -> None:
+def print_sizes(bench: CorrectionBench) -> None:
     heading("sheet", "tilt, °", "method", "height", "upside", "downside", "mean")
     for name in ("rolls", "turns"):
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
@@ -163,7 +161,7 @@ def print_sizes(bench: Bench) -> None:
             row(depth_mm, correction, *with_mean(errors))
 
 
-def print_tilts(bench: Bench) -> None:
+def print_tilts(bench: CorrectionBench) -> None:
     heading("tilt, °", *TILT_CORRECTIONS)
     for degrees in (*range(-80, -50, 5), *range(-50, 60, 25), *range(55, 85, 5)):
         situation = bench.situation(roll_sheet(bench.scene, -np.radians(degrees)), None)
@@ -174,7 +172,7 @@ def print_tilts(bench: Bench) -> None:
         )
 
 
-def print_depths(bench: Bench) -> None:
+def print_depths(bench: CorrectionBench) -> None:
     methods = ("none", "four_triangles", "two_pass_triangles", "two_pass")
     heading("push, mm", *methods)
     for depth_mm in (1, 2, 3.5, 5, 10, 20, 30, 40, 50, 60, 70):
@@ -196,7 +194,7 @@ PLACES_MM = (
 )
 
 
-def print_places(bench: Bench) -> None:
+def print_places(bench: CorrectionBench) -> None:
     tilts = (0, -30, 30)
     heading("pushed 30 mm at, mm", *(f"tilted {tilt:+d}°" for tilt in tilts))
     for place in PLACES_MM:
@@ -208,7 +206,7 @@ def print_places(bench: Bench) -> None:
         row(f"{place[0]}, {place[1]}", *cells)
 
 
-def print_stretches(bench: Bench) -> None:
+def print_stretches(bench: CorrectionBench) -> None:
     heading("stretch", "pushed 30 mm", "note")
     for stretch in (0.98, 1.0, 1.01, 1.03, 1.05, 1.08, 1.09, 1.12):
         pose, tip = bench.pushed(0.03)
@@ -258,7 +256,7 @@ def print_frames(scene: Scene) -> None:
     context.release()
 
 
-TABLES: dict[str, Callable[[Bench], None]] = {
+TABLES: dict[str, Callable[[CorrectionBench], None]] = {
     "sizes": print_sizes,
     "tilts": print_tilts,
     "depths": print_depths,
@@ -278,7 +276,7 @@ def main() -> None:
     if "frames" in wanted:
         print_frames(scene)
     if set(wanted) & set(TABLES):
-        bench = Bench(scene, stretch=options.stretch)
+        bench = CorrectionBench(scene, stretch=options.stretch)
         for name in wanted:
             if name in TABLES:
                 TABLES[name](bench)

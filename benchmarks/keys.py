@@ -1,10 +1,11 @@
-"""What keys cost: a message between processes by tcp, with CURVE and without, in turns.
+"""Measure the cost of encryption: a message between processes by tcp, with CURVE and without.
 
-    python -m benchmarks.keys [--rounds N] [--seconds S] [--json FILE]
+python -m benchmarks.keys [--rounds N] [--seconds S] [--json FILE]
 
-As `benchmarks.messaging`: one process publishes, one per design receives; the latency is one way,
-from before the message is constructed to its handler.  What counts is the ratio within a round.
-Also: what a subscriber's own checks (writer, plan, order) cost a message within one process.
+As in `benchmarks.messaging`, one process publishes, and one per design receives. The latency is one
+way, from before the message is constructed to its handler. The result is the ratio within a round.
+Also measured: the cost of a subscriber's checks (writer, plan, order) per message within one
+process.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ DESIGNS = (
 
 
 class Loop:
-    """A loop in a thread, for the gatekeeper: the benchmark's sender sleeps between messages."""
+    """Event loop in a thread for the ZAP authenticator, since the sender blocks its own."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
@@ -84,8 +85,8 @@ class Loop:
 
 
 @contextmanager
-def ring_of_two(folder: Path) -> Iterator[KeyRing]:
-    """Keys of two hosts; the other's ring is what children read."""
+def create_two_rings(folder: Path) -> Iterator[KeyRing]:
+    """Create the keys of two hosts; child processes read the other's ring."""
     public = {}
     for host in ("main", "left"):
         public[host], secret = new_key_pair()
@@ -103,7 +104,7 @@ def ring_of_two(folder: Path) -> Iterator[KeyRing]:
 
 
 async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publisher:
-    """Open a publisher on this loop that another thread sends with: the loop stops reading it."""
+    """Open a publisher on this loop, from which another thread sends; the loop stops reading it."""
     publisher = Publisher(topic, bind, keys=keys)
     await asyncio.sleep(0)
     asyncio.get_running_loop().remove_reader(publisher._socket.fileno())
@@ -111,7 +112,7 @@ async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publi
 
 
 def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict[str, Any]]:
-    """Per payload: p50 and p99 of both designs, and the medians of their ratios per round."""
+    """Return p50 and p99 of both designs per payload, and the medians of their ratios per round."""
 
     async def open_publisher(topic: Topic, endpoint: str) -> Publisher:
         return await open_for_thread(topic, [endpoint], keys)
@@ -160,7 +161,7 @@ def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict
 
 
 def cost_of_checks() -> dict[str, float]:
-    """Microseconds per message: reading a header, and reading it with all that is checked."""
+    """Return microseconds per message to read a header, without and with all checks."""
     payload = PAYLOADS[0]
     plan, writers = "0123456789abcdef", frozenset({"bench"})
     header = Header(1, 2, 3, "bench", "bench", 1, plan)
@@ -193,7 +194,7 @@ def main() -> None:
     load = os.getloadavg()[0]
     loop = Loop()
     try:
-        with tempfile.TemporaryDirectory() as folder, ring_of_two(Path(folder)) as keys:
+        with tempfile.TemporaryDirectory() as folder, create_two_rings(Path(folder)) as keys:
             rows = measure(options.rounds, options.seconds, keys, loop)
     finally:
         loop.close()

@@ -9,11 +9,11 @@ searched for.  They pass the limiter and then the simulated joint servos.
 The others are sheet targets for the controls of two bridges that hold a sheet: jumps, invalid
 numbers, late targets, frozen and lagging arms, e-stops and resets.  Measurements are frozen,
 lagging, offset, swapped, replayed or stale; a second master commands an arm; faults are combined.
-Every path check reports a clear path.  Commands are sent as unevenly as bridges send them.
+Every path check reports a clear path.  Commands are sent with the jitter of bridges.
 
-The kinematics of this file judge the commands and each millisecond of the simulated joints.
-Counted apart are commands that exceed the acceleration because range or tool speed need it, frozen
-arms that catch up by themselves, and arms that a second master moves.
+The kinematics of this file check the commands, and each millisecond of the simulated joints.
+Counted separately are commands that exceed the acceleration to keep range or tool speed, frozen
+arms that catch up, and arms that a second master moves.
 
 Prints the violations (there should be none), the worst ratio to each limit, and the time of a
 pass.  Takes some minutes on one core.
@@ -69,14 +69,14 @@ Random = np.random.Generator
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PERIOD_S = 1.0 / 140.0
 JITTER_S = 0.0015
-"""Largest jitter of the delivery of commands."""
+"""Maximum jitter of the delivery of commands."""
 SERVO_LAG_S = 0.025
 LANES = 96
-"""Arms that are simulated side by side."""
+"""Number of arms that are simulated in parallel."""
 SIDES: tuple[Side, Side] = ("left", "right")
 PAIRS = 32
 LIFE = 400
-"""Commands after which an arm restarts at another position."""
+"""Number of commands after which an arm restarts at another position."""
 SHEET_FRACTION = 0.2
 THAW_S = 0.4
 """Time in which a frozen arm catches up: sixteen lags of its servos."""
@@ -88,15 +88,15 @@ HISTORY = 150
 FALSE_CHANCE, FALSE_CHANCE_MOVING, SECOND_CHANCE = 0.0005, 0.01, 0.0005
 """Probabilities per arm and cycle of a false measurement, and of a second master."""
 MAX_UNCHANGED_CYCLES = 7
-"""Cycles after which unchanged counters are stalled."""
+"""Number of cycles after which unchanged counters count as stalled."""
 HUNTS = 80
 """Number of sequences that hypothesis tries."""
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 @dataclass
-class Under:
-    """Count cycles and cycles with motion under one adversary, and the largest tool speed."""
+class AdversaryCounts:
+    """Counts of cycles and moving cycles under one adversary, and the maximum tool speed."""
 
     cycles: int = 0
     moved: int = 0
@@ -105,16 +105,16 @@ class Under:
 
 @dataclass
 class Tally:
-    """Count violations by name, the worst ratio to each limit, and the times of a pass."""
+    """Counts of violations by name, maximum ratio to each limit, and times of a pass."""
 
     commands: int = 0
     violations: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     excused: int = 0
     worst: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     pass_ns: list[int] = field(default_factory=list)
-    under: dict[str, Under] = field(default_factory=lambda: defaultdict(Under))
+    under: dict[str, AdversaryCounts] = field(default_factory=lambda: defaultdict(AdversaryCounts))
 
-    def judge(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
+    def check_ratio(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
         """Count ratios to a limit above 1; those that are `allowed` are counted apart."""
         shares = np.atleast_1d(np.asarray(share, dtype=np.float64))
         if shares.size == 0:
@@ -162,8 +162,8 @@ def find_tool_points(scene: Scene) -> Floats:
     return np.vstack([edge, np.zeros(3)])
 
 
-class Judged:
-    """Simulate the joint servos of n arms, and judge each millisecond."""
+class CheckedServos:
+    """Simulated joint servos of n arms, checked in each millisecond."""
 
     def __init__(self, joints_rad: Floats, scene: Scene, tally: Tally) -> None:
         self.servo = Servo(joints_rad.copy(), SERVO_LAG_S)
@@ -171,7 +171,7 @@ class Judged:
         self._tool, self._fastest = find_tool_points(scene), scene.arms.max_tool_speed_m_per_s
         self._tally = tally
         self.speed_share = np.zeros(len(joints_rad))
-        """Largest ratio to the tool speed of each arm in the last `advance`."""
+        """Maximum ratio to the tool speed of each arm in the last `advance`."""
 
     def advance(
         self,
@@ -179,12 +179,12 @@ class Judged:
         duration_s: float,
         moving: Floats,
         *,
-        thawing: Flags | bool = False,
+        catching_up: Flags | bool = False,
     ) -> None:
         """Advance all arms by `duration_s`.
 
         moving (n,): 1 for an arm that obeys, 0 for one that decelerates, -1 for a frozen one.
-        thawing (n,): it was frozen, and catches up as fast as it can.
+        catching_up (n,): it was frozen, and catches up as fast as it can.
         """
         steps = int(np.ceil(duration_s / 1e-3))
         step_s = duration_s / steps
@@ -198,13 +198,15 @@ class Judged:
             after = points_on_tool(servo.joints_rad, self._tool)
             below = (RANGE_RAD[:, 0] - servo.joints_rad).max(axis=1)
             above = (servo.joints_rad - RANGE_RAD[:, 1]).max(axis=1)
-            tally.judge("simulated position", 1.0 + np.maximum(below, above))
+            tally.check_ratio("simulated position", 1.0 + np.maximum(below, above))
             change = np.abs(servo.velocity_rad_per_s - velocity) / step_s
-            tally.judge("simulated speed", (np.abs(servo.velocity_rad_per_s) / SPEED_RAD_PER_S))
+            tally.check_ratio(
+                "simulated speed", (np.abs(servo.velocity_rad_per_s) / SPEED_RAD_PER_S)
+            )
             share = (change / ACCELERATION_RAD_PER_S2).max(axis=1)
-            tally.judge("simulated acceleration", share[moving >= 0])
+            tally.check_ratio("simulated acceleration", share[moving >= 0])
             speed = np.linalg.norm(after - before, axis=2).max(axis=1) / step_s
-            tally.judge("simulated tool speed", speed / self._fastest, allowed=thawing)
+            tally.check_ratio("simulated tool speed", speed / self._fastest, allowed=catching_up)
             self.speed_share = np.maximum(self.speed_share, speed / self._fastest)
 
     def _hold_back(self, joints: Floats, velocity: Floats, moving: Floats, step_s: float) -> None:
@@ -221,7 +223,7 @@ class Judged:
 
 @dataclass
 class Lane:
-    """Hold one arm under one adversary, with the limiter's last input and output."""
+    """One arm under one adversary, with the limiter's last input and output."""
 
     joints_rad: Floats
     velocity: Floats
@@ -243,7 +245,9 @@ def _anywhere(random: Random, limits: JointLimits, beyond: float = 0.0) -> Float
     return limits.min_rad + random.uniform(-beyond, 1.0 + beyond, 6) * width
 
 
-def leaps(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
+def random_goals(
+    random: Random, limits: JointLimits, lane: Lane
+) -> Iterator[tuple[Floats, Floats]]:
     """Yield goals anywhere, in range or beyond, each for some cycles."""
     while True:
         goal = _anywhere(random, limits, 0.5)
@@ -251,7 +255,9 @@ def leaps(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
             yield goal, STILL
 
 
-def nonsense(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
+def invalid_goals(
+    random: Random, limits: JointLimits, lane: Lane
+) -> Iterator[tuple[Floats, Floats]]:
     """Yield invalid and huge numbers among valid goals."""
     odd = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-300, 0.0])
     while True:
@@ -280,7 +286,9 @@ def edges(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
             yield end + random.choice([0.0, 1e-12, -1e-12, 1e-3, -1e-3, 1.0, -1.0], 6), STILL
 
 
-def liars(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
+def false_velocities(
+    random: Random, limits: JointLimits, lane: Lane
+) -> Iterator[tuple[Floats, Floats]]:
     """Yield goals with false velocities."""
     while True:
         goal = lane.joints_rad + random.normal(0.0, 0.3, 6)
@@ -329,11 +337,15 @@ def walks(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
         yield goal, speed
 
 
-ADVERSARIES = (leaps, nonsense, extremes, edges, liars, spins, pushes, walks)
+ADVERSARIES = (random_goals, invalid_goals, extremes, edges, false_velocities, spins, pushes, walks)
 
 
 def joint_goals(
-    commands: int, random: Random, scene: Scene, hunted: Sequence[Sequence[Floats]], tally: Tally
+    commands: int,
+    random: Random,
+    scene: Scene,
+    found_sequences: Sequence[Sequence[Floats]],
+    tally: Tally,
 ) -> None:
     """Pass this number of joint goals through the limiter to simulated arms."""
     geometry = ArmGeometry(scene, "left")
@@ -343,10 +355,10 @@ def joint_goals(
         """Yield a variation of a sequence that hypothesis found."""
         while True:
             shift = random.normal(0.0, random.choice([0.0, 0.02]), 6)
-            for goal in hunted[int(random.integers(len(hunted)))]:
+            for goal in found_sequences[int(random.integers(len(found_sequences)))]:
                 yield goal + shift, STILL
 
-    adversaries: tuple[Adversary, ...] = (*ADVERSARIES, replay) if hunted else ADVERSARIES
+    adversaries: tuple[Adversary, ...] = (*ADVERSARIES, replay) if found_sequences else ADVERSARIES
 
     def lane_at(number: int) -> Lane:
         lane = Lane(_anywhere(random, limits), np.zeros(6), iter(()))
@@ -357,7 +369,7 @@ def joint_goals(
     while tally.commands + LANES <= commands or begun == 0:
         lanes = [lane_at(begun + number) for number in range(LANES)]
         begun += LANES
-        arms = Judged(np.array([lane.joints_rad for lane in lanes]), scene, tally)
+        arms = CheckedServos(np.array([lane.joints_rad for lane in lanes]), scene, tally)
         delay_s = 0.0
         for _ in range(min(LIFE, max(1, (commands - tally.commands) // LANES))):
             step_s = PERIOD_S * float(random.choice([0.5, 1.0, 2.0, random.uniform(0.5, 2.0)]))
@@ -383,7 +395,7 @@ def joint_goals(
                 lane.joints_rad = lane.joints_rad + lane.velocity * step_s
             now = np.array([lane.joints_rad for lane in lanes])
             new = np.array([lane.velocity for lane in lanes])
-            judge_commands(
+            check_commands(
                 tally,
                 geometry,
                 tool=find_tool_points(scene),
@@ -395,7 +407,7 @@ def joint_goals(
             tally.commands += LANES
 
 
-def judge_commands(
+def check_commands(
     tally: Tally,
     geometry: ArmGeometry,
     *,
@@ -409,8 +421,8 @@ def judge_commands(
     limits, fastest = geometry.joint_limits, geometry.max_tool_speed
     old, new = velocities
     beyond = np.maximum(limits.min_rad - now, now - limits.max_rad).max(axis=1)
-    tally.judge("commanded position", 1.0 + beyond)
-    tally.judge("commanded speed", np.abs(new) / limits.speed_rad_per_s)
+    tally.check_ratio("commanded position", 1.0 + beyond)
+    tally.check_ratio("commanded speed", np.abs(new) / limits.speed_rad_per_s)
     here = points_on_tool(held, tool)
 
     def tool_share(velocity: Floats) -> Floats:
@@ -418,8 +430,8 @@ def judge_commands(
         furthest: Floats = np.linalg.norm(gone, axis=2).max(axis=1)
         return furthest / (min(step_s, MAX_TRAVEL_STEP_S) * fastest)
 
-    tally.judge("commanded tool speed", tool_share(new))
-    # Excused where the full deceleration does not keep tool speed or range.
+    tally.check_ratio("commanded tool speed", tool_share(new))
+    # Allowed if the full deceleration would exceed tool speed or range.
     most = limits.acceleration_rad_per_s2 * step_s
     slowest = np.sign(old) * np.maximum(np.abs(old) - most, 0.0)
     stopping_s = (np.abs(old) / limits.acceleration_rad_per_s2).max(axis=1, keepdims=True)
@@ -430,10 +442,10 @@ def judge_commands(
         axis=1
     )
     share = (np.abs(new - old) / most).max(axis=1)
-    tally.judge("commanded acceleration", share, allowed=forced)
+    tally.check_ratio("commanded acceleration", share, allowed=forced)
 
 
-def hunt(scene: Scene) -> list[list[Floats]]:
+def search_sequences(scene: Scene) -> list[list[Floats]]:
     """Search for sequences of goals near the limits with hypothesis; return the worst ones."""
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
@@ -454,7 +466,7 @@ def hunt(scene: Scene) -> list[list[Floats]]:
     def search(start: tuple[float, ...], legs: list[tuple[tuple[float, ...], int]]) -> None:
         tally = Tally()
         joints, velocity = limits.min_rad + np.array(start) * width, np.zeros(6)
-        arm = Judged(joints[None, :], scene, tally)
+        arm = CheckedServos(joints[None, :], scene, tally)
         goals = [
             limits.min_rad + np.array(leg) * width for leg, count in legs for _ in range(count)
         ]
@@ -486,7 +498,7 @@ History = deque[Floats]
 
 @dataclass
 class FalseMeasurement:
-    """Falsify an arm's measurement for some cycles; the kinds are applied one after another."""
+    """False measurement of an arm for some cycles; the kinds are applied one after another."""
 
     kinds: tuple[str, ...]
     cycles: int
@@ -570,9 +582,10 @@ FALSE_KINDS: dict[str, Callable[..., tuple[Floats, Freshness]]] = {
 
 @dataclass
 class SecondMaster:
-    """Command the same arm from another client for some cycles, at up to half the tool speed.
+    """Other client that commands the same arm for some cycles, at up to half the tool speed.
 
-    refuses: the controller rejects the bridge's commands; otherwise it obeys both in turn.
+    refuses: whether the controller rejects the bridge's commands; otherwise it executes both in
+        turn.
     """
 
     joints_rad: Floats
@@ -600,7 +613,7 @@ class SecondMaster:
 
 @dataclass
 class Bridge:
-    """Hold one bridge's control, and the remaining cycles of its arm's faults."""
+    """Control of one bridge, and the remaining cycles of its arm's faults."""
 
     geometry: ArmGeometry
     control: ArmControl
@@ -611,7 +624,7 @@ class Bridge:
 
     @property
     def adversary(self) -> str:
-        """Name this arm's present adversary."""
+        """Return the name of this arm's current adversary."""
         if self.second is not None:
             return "second master"
         if self.lie is not None:
@@ -690,7 +703,7 @@ def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
         for number in range(int(random.integers(1, 60))):
             moved = transform(pose[:3, :3], pose[:3, 3] + twist[:3] * number * PERIOD_S)
             motion = SheetMotion(moved, twist, float(stretch), float(rate))
-            # Invalid poses stay as they are; transform() would correct their last row.
+            # Invalid poses are not passed to transform(), which would correct their last row.
             yield Goal(
                 motion if np.isfinite(pose).all() else replace(motion, world_from_sheet=pose),
                 late_s,
@@ -716,7 +729,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
         for _ in range(PAIRS)
         for geometry in geometries
     ]
-    arms = Judged(np.array(starts * PAIRS), scene, tally)
+    arms = CheckedServos(np.array(starts * PAIRS), scene, tally)
     history: History = deque([arms.servo.joints_rad], maxlen=HISTORY)
     for bridge, joints in zip(bridges, starts * PAIRS, strict=True):
         bridge.control.on_measurement(joints, ())
@@ -728,10 +741,10 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
     goals = [sheet_goals(random, scene) for _ in range(PAIRS)]
     for cycle in range(cycles):
         step_s = PERIOD_S * float(random.uniform(0.5, 2.0))
-        arms.advance(wanted, step_s, moving, thawing=thaw_s > 0.0)
+        arms.advance(wanted, step_s, moving, catching_up=thaw_s > 0.0)
         noise = NOISE_RAD * random.standard_normal(arms.servo.joints_rad.shape)
         history.append(arms.servo.joints_rad + noise)
-        note_adversaries(tally, bridges, arms.speed_share, moving=moving, thawing=thaw_s > 0.0)
+        note_adversaries(tally, bridges, arms.speed_share, moving=moving, catching_up=thaw_s > 0.0)
         thaw_s = thaw_s - step_s
         pair_goals = [next(goal) for goal in goals]
         for number, bridge in enumerate(bridges):
@@ -745,7 +758,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
                 tally.pass_ns.append(time.thread_time_ns() - began_ns)
             if control.pending_check is not None:
                 control.on_path_result(control.pending_check, None)
-            judge_bridge(
+            check_bridge(
                 tally,
                 bridge.geometry,
                 command,
@@ -768,14 +781,14 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
 
 
 def note_adversaries(
-    tally: Tally, bridges: list[Bridge], speed_share: Floats, *, moving: Floats, thawing: Flags
+    tally: Tally, bridges: list[Bridge], speed_share: Floats, *, moving: Floats, catching_up: Flags
 ) -> None:
-    """Record the arms' tool speeds (n,) by adversary; thawing arms are excluded."""
+    """Record the arms' tool speeds (n,) by adversary; catching_up arms are excluded."""
     for number, bridge in enumerate(bridges):
         under = tally.under[bridge.adversary]
         under.cycles += 1
         under.moved += bool(moving[number] > 0.0)
-        if not thawing[number]:
+        if not catching_up[number]:
             under.tool_speed_share = max(under.tool_speed_share, float(speed_share[number]))
 
 
@@ -788,7 +801,7 @@ def second_master(random: Random, geometry: ArmGeometry, joints_rad: Floats) -> 
     )
 
 
-def judge_bridge(
+def check_bridge(
     tally: Tally,
     geometry: ArmGeometry,
     command: Command,
@@ -800,12 +813,12 @@ def judge_bridge(
     if command.mode != "move":
         return
     joints, limits = command.joints_rad, geometry.joint_limits
-    tally.judge("finite", 0.0 if np.isfinite(joints).all() else 2.0)
+    tally.check_ratio("finite", 0.0 if np.isfinite(joints).all() else 2.0)
     beyond = np.maximum(limits.min_rad - joints, joints - limits.max_rad).max()
-    tally.judge("commanded position", 1.0 + float(beyond))
+    tally.check_ratio("commanded position", 1.0 + float(beyond))
     if before is not None:
         furthest = step_s * limits.speed_rad_per_s
-        tally.judge("commanded speed", float((np.abs(joints - before) / furthest).max()))
+        tally.check_ratio("commanded speed", float((np.abs(joints - before) / furthest).max()))
 
 
 def stroke_passes(scene: Scene) -> list[int]:
@@ -835,7 +848,7 @@ def stroke_passes(scene: Scene) -> list[int]:
 
 
 def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) -> dict[str, Any]:
-    """Return the counts for people and programs."""
+    """Return the counts as a dictionary for output."""
     names = sorted(set(tally.worst) | set(sheets.worst))
     return {
         "commands": tally.commands + sheets.commands,
@@ -861,12 +874,12 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
 
 
 def percentiles_us(times_ns: Sequence[int]) -> dict[str, float]:
-    """Return p50 and p99 of the processor's time, in microseconds."""
+    """Return p50 and p99 of the processor time, us."""
     p50, p99 = np.percentile(times_ns, [50.0, 99.0]) * 1e-3 if len(times_ns) else (0.0, 0.0)
     return {"p50": round(float(p50), 1), "p99": round(float(p99), 1)}
 
 
-def run(commands: int, seed: int, *, hunting: bool = True) -> dict[str, Any]:
+def run(commands: int, seed: int, *, searching: bool = True) -> dict[str, Any]:
     """Run the whole benchmark."""
     began_s = time.perf_counter()
     scene, random = load_scene(SCENE_FILE), np.random.default_rng(seed)
@@ -874,9 +887,9 @@ def run(commands: int, seed: int, *, hunting: bool = True) -> dict[str, Any]:
     for joints, turn, place in zip(check, *flange_poses(check), strict=True):
         assert np.allclose(forward(joints), transform(turn, place), atol=1e-12)
     joints_tally, sheets_tally = Tally(), Tally()
-    hunted = hunt(scene) if hunting else []
+    found_sequences = search_sequences(scene) if searching else []
     sheets = int(SHEET_FRACTION * commands)
-    joint_goals(commands - sheets, random, scene, hunted, joints_tally)
+    joint_goals(commands - sheets, random, scene, found_sequences, joints_tally)
     sheet_targets(commands - joints_tally.commands, random, scene, sheets_tally)
     seconds = time.perf_counter() - began_s
     return report(joints_tally, sheets_tally, stroke_passes(scene), seconds)

@@ -1,13 +1,12 @@
-"""How long a message takes from one process to another, by the way that it is received.
+"""Measure the time of a message from one process to another, by the method of receiving.
 
-    python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--json FILE] [--markdown FILE]
+python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--json FILE] [--markdown FILE]
 
-One process publishes at a steady rate, one process per design receives; the latency is the true one
-way on the clock that both share.  It begins before a typed message is constructed and ends in the
-handler that is given the validated message; raw designs carry as many bytes in as many frames and
-look at none of them.  The designs take turns in random order in every round, and what counts is the
-ratio to blocking ZeroMQ within the round: microseconds of a shared machine move by a factor of two
-while one looks on.
+One process publishes at a constant rate, and one process per design receives. The latency is the
+one-way time on the shared clock, from before a typed message is constructed to the handler of the
+validated message. Raw designs transfer as many bytes in as many frames without decoding. The
+designs run in random order in every round. The result is the ratio to blocking ZeroMQ within the
+round, because absolute times on a shared machine vary by a factor of two.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ EPOCH = 1
 
 
 class Line(Protocol):
-    """The sending end of a design; `endpoint` is what its receiver is told."""
+    """Sending end of a design; `endpoint` is passed to its receiver."""
 
     endpoint: str
 
@@ -69,9 +68,9 @@ class Payload:
 
 @dataclass(frozen=True)
 class Design:
-    """A way to receive.  `typed` ones hand over validated messages, the others bytes.
+    """Method of receiving; `typed` designs return validated messages, others bytes.
 
-    open: makes its sending end; None: a publisher of `flexsheet.messages.bus`.
+    open: opens its sending end; None: a publisher of `flexsheet.messages.bus`.
     """
 
     name: str
@@ -98,7 +97,7 @@ def subscriber_socket(context: Any, endpoint: str) -> Any:
 
 
 def raw_stamp(frames: Sequence[Any]) -> tuple[int, int]:
-    """Sequence and stamp, which a raw message begins with."""
+    """Return the sequence and stamp at the start of a raw message."""
     head = bytes(memoryview(frames[0])[:16])
     return int.from_bytes(head[:8], "little"), int.from_bytes(head[8:], "little")
 
@@ -240,11 +239,11 @@ def receive_rounds(
     results: Connection,
     prepare: Callable[[], None] | None,
 ) -> None:
-    """A child's work: measure, answer, send the latencies of a round, as each stamp asks."""
+    """Receive in a child process: measure, answer, and send the latencies of each round."""
     if prepare is not None:
         prepare()
     latencies: list[int] = []
-    # As nodes do once they are set up: what exists by now is never looked through for garbage.
+    # As nodes do after `setup`: existing objects are excluded from garbage collection.
     gc.collect()
     gc.freeze()
 
@@ -263,19 +262,19 @@ def receive_rounds(
     design.receive(topic, endpoint, arrived)
 
 
-# A stamp's two lowest bits say what the message is for; four nanoseconds do not matter.
+# A stamp's two lowest bits contain the message's kind, an error of up to 4 ns.
 MEASURE, WARM_UP, END_ROUND, END = range(4)
 PATIENCE_S = 30.0
 ANSWER_S = 8.0
 CLOSING_S = 5.0
 
 
-def header_of(sequence: int, stamp_ns: int) -> Header:
+def make_header(sequence: int, stamp_ns: int) -> Header:
     return Header(sequence, stamp_ns, stamp_ns, "bench", "bench", EPOCH)
 
 
 class BusLine:
-    """A publisher of `messages.bus`; of designs that are not typed it sends as many bytes."""
+    """Publisher of `messages.bus`; for raw designs it sends as many bytes."""
 
     def __init__(
         self,
@@ -285,7 +284,7 @@ class BusLine:
         open_publisher: Callable[[Topic, list[str]], Publisher] = Publisher,
     ) -> None:
         self._design, self._payload = design, payload
-        self._raw = [bytearray(frame) for frame in encode(payload.make(0), header_of(0, 0))]
+        self._raw = [bytearray(frame) for frame in encode(payload.make(0), make_header(0, 0))]
         self._publisher = open_publisher(payload.topic, [endpoint])
         self.endpoint = self._publisher.endpoints[0]
 
@@ -295,12 +294,12 @@ class BusLine:
             raw[:16] = sequence.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little")
             self._publisher._send([bytes(raw), *self._raw[1:]])
         elif self._design.inline_bytes is None:
-            self._publisher.send(self._payload.make(sequence), header_of(sequence, stamp_ns))
+            self._publisher.send(self._payload.make(sequence), make_header(sequence, stamp_ns))
         else:
             message = self._payload.make(sequence)
             inline_bytes = self._design.inline_bytes
             self._publisher._send(
-                encode(message, header_of(sequence, stamp_ns), inline_bytes=inline_bytes)
+                encode(message, make_header(sequence, stamp_ns), inline_bytes=inline_bytes)
             )
 
     def close(self) -> None:
@@ -308,9 +307,9 @@ class BusLine:
 
 
 class Sender:
-    """The parent's end of one design: its line and the child that listens to it.
+    """Parent's end of one design: its line and the receiving child process.
 
-    prepare: what the child does before anything else.
+    prepare: function that the child calls first.
     """
 
     def __init__(
@@ -337,7 +336,7 @@ class Sender:
             raise
 
     def _warm_up(self) -> None:
-        """Send until the child has heard enough."""
+        """Send until the child has received enough messages."""
         patience_ends = time.monotonic() + PATIENCE_S
         while not self.results.poll(0.01):
             if not self._child.is_alive() or time.monotonic() > patience_ends:
@@ -352,7 +351,7 @@ class Sender:
         self._line.send(self.sequence, (time.monotonic_ns() & ~3) | kind)
 
     def round(self, count: int) -> list[int]:
-        """Latencies in ns of `count` messages at the payload's rate, of those that arrive."""
+        """Send `count` messages at the payload's rate; return the latencies, ns."""
         period_s = 1.0 / self.payload.rate_hz
         next_s = time.monotonic()
         for _ in range(count):
@@ -360,7 +359,7 @@ class Sender:
             time.sleep(max(0.0, next_s - time.monotonic()))
             self.send(MEASURE)
         patience_ends = time.monotonic() + ANSWER_S
-        # Asked again and again, for some transports lose messages; later answers are empty lists,
+        # Repeated because some transports lose messages; later answers are empty lists,
         # and those to warm-up may come late.
         while time.monotonic() < patience_ends:
             time.sleep(0.05)
@@ -380,7 +379,7 @@ class Sender:
 
 
 def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sender]:
-    """Makes the senders of this machine's own transports, "ipc" or "tcp"."""
+    """Return a function that opens senders for the transport "ipc" or "tcp"."""
 
     def open_sender(design: Design, payload: Payload, number: int) -> Sender:
         place = f"ipc://{folder}/{payload.topic.name}-{number}"
@@ -391,7 +390,7 @@ def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sen
 
 
 def percentile_us(latencies_ns: Sequence[int], percent: float) -> float:
-    """NaN where nothing arrived."""
+    """Return a percentile in us; NaN without messages."""
     if not latencies_ns:
         return float("nan")
     return float(np.percentile(np.asarray(latencies_ns), percent)) * 1e-3
@@ -406,9 +405,9 @@ def measure(
     open_sender: Callable[[Design, Payload, int], Sender],
     step: Callable[[], object],
 ) -> list[dict[str, Any]]:
-    """One row per design: p50 and p99 and their ratios to the floor's, medians over the rounds.
+    """Return one row per design: p50, p99, and their ratios to the floor, medians over rounds.
 
-    open_sender: is given the design's place among all, too.
+    open_sender: its third argument is the design's index.
     """
     count = round(seconds * payload.rate_hz)
     senders: list[Sender] = []
@@ -417,7 +416,7 @@ def measure(
     try:
         for number, design in enumerate(designs):
             senders.append(open_sender(design, payload, number))
-        # The sender too is as a node that is set up.
+        # The sender does the same.
         gc.collect()
         gc.freeze()
         for _ in range(rounds):
@@ -458,7 +457,7 @@ def measure(
 
 
 def codec_costs() -> list[dict[str, Any]]:
-    """Microseconds within one process, the best of several repetitions."""
+    """Return microseconds within one process, the minimum of several repetitions."""
 
     def best_us(action: Callable[..., object], *arguments: Any, **named: Any) -> float:
         call = partial(action, *arguments, **named)
@@ -468,7 +467,7 @@ def codec_costs() -> list[dict[str, Any]]:
     for payload in PAYLOADS:
         message = payload.make(0)
         for inline_bytes in (INLINE_BYTES, 0):
-            frames = encode(message, header_of(1, 2), inline_bytes=inline_bytes)
+            frames = encode(message, make_header(1, 2), inline_bytes=inline_bytes)
             rows.append(
                 {
                     "payload": payload.name,
@@ -477,7 +476,7 @@ def codec_costs() -> list[dict[str, Any]]:
                     "bytes": size_of(frames),
                     "construct_us": best_us(payload.make, 0),
                     "encode_us": best_us(
-                        encode, message, header_of(1, 2), inline_bytes=inline_bytes
+                        encode, message, make_header(1, 2), inline_bytes=inline_bytes
                     ),
                     "decode_us": best_us(decode, frames, payload.topic),
                 }
@@ -520,7 +519,7 @@ def codec_cells(row: dict[str, Any]) -> tuple[str, ...]:
 def tables(
     report: dict[str, Any],
 ) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
-    """Title, headings and rows of each table."""
+    """Return title, headings and rows of each table."""
     for payload in PAYLOADS:
         rows = [latency_cells(row) for row in report["latency"] if row["payload"] == payload.name]
         title = f"{payload.name} at {payload.rate_hz:.0f} Hz, one way, {report['transport']}"
@@ -538,8 +537,8 @@ def print_tables(report: dict[str, Any], console: Console) -> None:
         console.print(table)
 
 
-def reached(report: dict[str, Any]) -> str:
-    """The ratios of what nodes use, in words."""
+def format_ratios(report: dict[str, Any]) -> str:
+    """Format the ratios of the design that nodes use."""
     return "; ".join(
         f"{row['payload']} {row['p50_ratio']:.2f} at p50, {row['p99_ratio']:.2f} at p99"
         for row in report["latency"]
@@ -548,7 +547,7 @@ def reached(report: dict[str, Any]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The page docs/messaging.md."""
+    """Return the page docs/messaging.md."""
     lines = [
         "# How long a message takes",
         "",
@@ -564,7 +563,7 @@ def markdown(report: dict[str, Any]) -> str:
         "and p99 is then mostly its doing.",
         "",
         "To reach (a typed, validated message against raw blocking ZeroMQ): fingertip 1.50 at p50, "
-        f"1.30 at p99; stereo pair 1.20.  Reached in this run: {reached(report)}.",
+        f"1.30 at p99; stereo pair 1.20.  Reached in this run: {format_ratios(report)}.",
     ]
     for title, heads, rows in tables(report):
         lines += ["", f"## {title}", ""]

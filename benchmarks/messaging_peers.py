@@ -1,19 +1,18 @@
-"""How long a message takes by flexsheet and by other messaging libraries, in the same run.
+"""Measure the time of a message by flexsheet and by other messaging libraries, in the same run.
 
-    make bench-peers
-    python -m benchmarks.messaging_peers [--quick] [--over ipc tcp veth] [--json FILE]
-        [--markdown FILE]
+make bench-peers
+python -m benchmarks.messaging_peers [--quick] [--over ipc tcp veth] [--json FILE]
+    [--markdown FILE]
 
-As `benchmarks.messaging`: one process publishes at a steady rate, one process per library receives;
-the latency is one way, from before a typed message is made to the handler that has it.  All take
-turns in random order in every round, and what counts is the ratio to blocking ZeroMQ within the
-round.  zenoh and dora carry as many bytes, untyped; Cyclone DDS and LCM carry types of their own
-with the same fields, which nobody validates.  dora's nodes find one another by a daemon, which is
-there on their own computer; between two it is not asked.
+As in `benchmarks.messaging`, one process publishes at a constant rate, and one process per library
+receives; results are ratios to blocking ZeroMQ within a round. zenoh and dora transfer as many
+untyped bytes. Cyclone DDS and LCM transfer their own types with the same fields, without
+validation. dora's nodes use a daemon on the same computer, so that dora is not measured between two
+networks.
 
-As root, everything happens in a network of its own, where loopback has the multicast that LCM
-needs, and a second one is reached by a pair of virtual Ethernet devices ("veth").  There flexsheet
-encrypts and the others do not: nothing of it leaves a computer without keys.
+As root, the benchmark runs in a new network namespace, in which loopback has the multicast that LCM
+needs. A second namespace is connected by a pair of virtual Ethernet devices ("veth"). There
+flexsheet encrypts its messages, which it requires between computers; the others do not.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ OVER = {
 
 @dataclass(frozen=True)
 class Peer:
-    """A library that is asked: its package, a place for each transport, and over which it is."""
+    """Messaging library: its package, its address for each transport, and its transports."""
 
     package: str
     design: Design
@@ -111,7 +110,7 @@ PEERS = (
 
 
 class KeyedLine(BusLine):
-    """A publisher with keys, which needs a loop that turns."""
+    """Publisher with keys, which needs a running event loop."""
 
     def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: keys.Loop) -> None:
         super().__init__(
@@ -141,13 +140,13 @@ def _libc(call: str, *arguments: int) -> None:
 
 
 def enter_network(pid: int) -> None:
-    """Go into the network of that process, before any socket is opened."""
+    """Enter the network namespace of that process, before any socket is opened."""
     with open(f"/proc/{pid}/ns/net") as space:
         _libc("setns", space.fileno(), CLONE_NEWNET)
 
 
 def leave_for_own_network() -> None:
-    """Into a new network with loopback alone, multicast on it; raises OSError without the right."""
+    """Enter a new network namespace with loopback multicast; raises OSError without permission."""
     _libc("unshare", CLONE_NEWNET)
     _ip("link", "set", "lo", "up", "multicast", "on")
     _ip("route", "add", "224.0.0.0/4", "dev", "lo")
@@ -155,7 +154,7 @@ def leave_for_own_network() -> None:
 
 @contextmanager
 def second_network() -> Iterator[int]:
-    """A network beside ours, a virtual cable between them; yields a process that lives there."""
+    """Create a network namespace connected by a virtual cable; yield a process in it."""
     holder = subprocess.Popen(
         ["unshare", "--net", "sh", "-c", "echo here; exec cat"],
         stdin=subprocess.PIPE,
@@ -170,7 +169,7 @@ def second_network() -> Iterator[int]:
         for command, address in zip(((), there), ADDRESSES, strict=True):
             _ip("addr", "add", f"{address}/24", "dev", DEVICE, through=command)
             _ip("link", "set", DEVICE, "up", through=command)
-        # LCM's multicast goes by the cable, on both sides.
+        # LCM's multicast uses the cable on both sides.
         _ip("route", "replace", "224.0.0.0/4", "dev", DEVICE)
         _ip("route", "add", "224.0.0.0/4", "dev", DEVICE, through=there)
         yield holder.pid
@@ -193,7 +192,7 @@ def installed(package: str) -> str | None:
 def measure_over(
     over: str, found: Sequence[Peer], options: argparse.Namespace, step: Callable[[], object]
 ) -> list[dict[str, Any]]:
-    """The rows of one way to be connected."""
+    """Return the rows of one transport."""
     ours = OURS_KEYED if over == "veth" else OURS
     asked = [one for one in found if over in one.over]
     places = {one.design.name: one.place for one in asked}
@@ -239,7 +238,7 @@ HEADS = ("library", "", "p50 µs", "p99 µs", "p50 ratio", "(min-max)", "p99 rat
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The page docs/messaging-peers.md."""
+    """Return the page docs/messaging-peers.md."""
     lines = [
         "# How long a message takes by other libraries",
         "",

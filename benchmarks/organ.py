@@ -1,8 +1,8 @@
-"""A made-up organ as a mesh: two lobes, a wedge from one to the other, a shallow furrow between.
+"""Generate the mesh of a synthetic organ: two lobes, a wedge between them, and a shallow groove.
 
-    python -m benchmarks.organ launch/scenes/organ.obj
+python -m benchmarks.organ launch/scenes/organ.obj
 
-Lengths in the file are millimetres; its front is towards +z.  Nothing of it is anybody's.
+Lengths in the file are millimetres; the front is towards +z.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ Indices = NDArray[np.int64]
 SUBDIVISIONS = 3
 HALF_MM = (62.0, 42.0, 30.0)
 TAPER_Y, TAPER_Z = 0.2, 0.25
-"""How much smaller than at its middle the organ is at its thin end."""
+"""Relative decrease of the organ's size from its middle to its thin end."""
 FURROW_AT, FURROW_WIDTH, FURROW_MM = 0.2, 0.3, 4.0
 
 
 def organ_mesh() -> tuple[Floats, Indices]:
-    """Vertices (v, 3) in mm and triangles (t, 3), counter-clockwise seen from outside."""
-    # Late: only who makes the file needs it.
+    """Return vertices (v, 3) in mm and triangles (t, 3), counter-clockwise seen from outside."""
+    # Imported late: only the generator needs it.
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS, radius=1.0)
@@ -43,7 +43,7 @@ def organ_mesh() -> tuple[Floats, Indices]:
 
 
 def obj_text(vertices: Floats, triangles: Indices) -> str:
-    """The mesh as a Wavefront OBJ file, to a hundredth of a unit."""
+    """Format the mesh as a Wavefront OBJ file, with a resolution of 0.01 units."""
     lines = ["# made by python -m benchmarks.organ; millimetres"]
     lines += [f"v {x:.2f} {y:.2f} {z:.2f}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]

@@ -1,12 +1,12 @@
-"""How other messaging libraries carry the messages of `benchmarks.messaging`.
+"""Transfer the messages of `benchmarks.messaging` by other messaging libraries.
 
-Each has a line, the sending end, and a function that receives, in the way its own manual begins
-with.  All are told where the other is: nothing is looked for beyond the interface that is named.
+Each library has a line, the sending end, and a receiving function, as recommended in its manual.
+Addresses are given explicitly, and discovery is limited to the given interface.
 
-zenoh and dora carry bytes, Cyclone DDS and LCM messages of their own types, with the same fields.
-LCM's are written as its generator writes them.  DDS's pictures are arrays of octets, their size
-part of the type, which its Python binding copies at once; a sequence it packs number by number, for
-25 ms.
+zenoh and dora transfer bytes, Cyclone DDS and LCM messages of their own types with the same fields.
+LCM's types are written as its generator writes them. DDS's images are arrays of octets whose size
+is part of the type. Its Python binding copies these at once, while it encodes a sequence element by
+element, which takes 25 ms.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import zmq
 
-from benchmarks.messaging import EPOCH, Payload, header_of
+from benchmarks.messaging import EPOCH, Payload, make_header
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Fingertip, StereoPair
 from flexsheet.messages.wire import encode
@@ -40,14 +40,14 @@ DORA_STARTS_S, DORA_ENDS_S = 20.0, 5.0
 
 def raw_bytes(payload: Payload) -> bytearray:
     """Make one block as long as our message; it begins with sequence and stamp."""
-    return bytearray(b"".join(encode(payload.make(0), header_of(0, 0))))
+    return bytearray(b"".join(encode(payload.make(0), make_header(0, 0))))
 
 
 class ZmqLine:
-    """Plain ZeroMQ: the floor, where a publisher of `flexsheet.messages.bus` would ask for keys."""
+    """ZeroMQ without flexsheet: the reference where `flexsheet.messages.bus` would require keys."""
 
     def __init__(self, payload: Payload, place: str) -> None:
-        self._frames = [bytearray(one) for one in encode(payload.make(0), header_of(0, 0))]
+        self._frames = [bytearray(one) for one in encode(payload.make(0), make_header(0, 0))]
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
         self._socket.bind(place)
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -111,11 +111,11 @@ nodes:
   - {id: sender, path: dynamic, outputs: [message]}
   - {id: receiver, path: dynamic, inputs: {message: {source: sender/message, queue_size: 1000}}}
 """
-"""Its nodes are our processes: dynamic ones, which come to the daemon by themselves."""
+"""Dataflow of dynamic nodes, which are this benchmark's processes."""
 
 
 def dora_node(name: str) -> Any:
-    """A node of the dataflow; until its daemon knows of that it is asked again."""
+    """Return a node of the dataflow; retry until its daemon is ready."""
     from dora import Node
 
     patience_ends = time.monotonic() + DORA_STARTS_S
@@ -129,7 +129,7 @@ def dora_node(name: str) -> Any:
 
 
 class DoraLine:
-    """A dataflow under a daemon of its own, which `dora run` starts; place: a folder for it."""
+    """Dataflow under a daemon that `dora run` starts; place: a folder for it."""
 
     def __init__(self, payload: Payload, place: str) -> None:
         self.endpoint = "receiver"
@@ -146,7 +146,7 @@ class DoraLine:
     def send(self, sequence: int, stamp_ns: int) -> None:
         import pyarrow
 
-        # It waits until the receiver has come to the daemon too.
+        # It waits until the receiver is connected to the daemon.
         self._node = self._node or dora_node("sender")
         STAMPS.pack_into(self._raw, 0, sequence, stamp_ns)
         self._node.send_output("message", pyarrow.array(self._octets))
@@ -171,7 +171,7 @@ def receive_dora(topic: Topic, endpoint: str, arrived: Arrived) -> None:
 
 @cache
 def dds_types() -> dict[type, type]:
-    """Our message types' likes, as DDS knows them."""
+    """Return DDS types with the fields of the message types."""
     from cyclonedds.idl import make_idl_struct
     from cyclonedds.idl.types import array, float64, int64, sequence, uint8, uint32, uint64
 
@@ -209,7 +209,7 @@ def dds_types() -> dict[type, type]:
 
 
 def dds_participant(endpoint: str) -> tuple[Any, Any]:
-    """A domain on one interface, which nothing leaves by multicast, and a participant in it.
+    """Create a DDS domain on one interface without multicast, and a participant in it.
 
     endpoint: number of the domain, name of the interface, and the address of each end.
     """
@@ -333,7 +333,7 @@ class LcmHeader:
 
 @dataclass(slots=True)
 class LcmFingertip:
-    """The fields of `Fingertip`."""
+    """LCM type with the fields of `Fingertip`."""
 
     header: LcmHeader
     valid: bool
@@ -388,7 +388,7 @@ class LcmFingertip:
 
 @dataclass(slots=True)
 class LcmStereoPair:
-    """The fields of `StereoPair`; pictures are byte[rows * columns]."""
+    """LCM type with the fields of `StereoPair`; images are byte[rows * columns]."""
 
     header: LcmHeader
     device: str

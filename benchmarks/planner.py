@@ -1,12 +1,12 @@
-"""How long one step of the planner takes, for every shape, and how fast a finger it follows.
+"""Measure the time of one step of the planner for every shape, and the maximum finger speed.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [MESH METRES_PER_UNIT]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [MESH METRES_PER_UNIT]
 
-A finger hovers, touches, strokes while it pushes, lifts, and goes on behind the object, where the
-sheet holds.  Each step of `SheetTrajectoryPlanner.follow_finger` is timed, the best of some repeats
-of the same path (what else the machine does is no part of it), by phase; beside it the share of a
-tenth of the arms' 7.1 ms cycle.  Then, for strokes of rising speed along the object's tightest
-bends, the fastest at which the sheet's normal stays within half a degree.  Under three minutes.
+A finger hovers, touches, strokes while it pushes, lifts, and moves behind the object, where the
+sheet stops. Each step of `SheetTrajectoryPlanner.follow_finger` is timed by phase, as the minimum
+over several repeats of the path. The table also contains the fraction of a tenth of the arms' 7.1
+ms cycle. The second table contains the maximum stroke speed along the object's smallest radius of
+curvature at which the sheet's normal stays within half a degree. Takes under three minutes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FRONT = np.array([0.0, 0.0, 1.0])
 
 
 def geometries() -> dict[str, Mapping[str, Any]]:
-    """By name; the mesh is of an ellipsoid unless one is given."""
+    """Return geometries by name; the mesh is that of an ellipsoid unless a file is given."""
     named: dict[str, Mapping[str, Any]] = {
         "cylinder": {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12},
         "sphere": {"shape": "sphere", "radius_m": 0.05},
@@ -75,7 +75,7 @@ def geometries() -> dict[str, Mapping[str, Any]]:
     return named
 
 
-def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlanner:
+def make_planner(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlanner:
     """Make the planner's model from its own parameters, the object in the world frame."""
     here = Pose(position_m=np.zeros(3), rpy_rad=np.zeros(3))
     body = scene.object.model_validate(
@@ -87,7 +87,7 @@ def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlan
 
 
 def make_compliance(scene: Scene) -> ComplianceController:
-    """For an object that answers with 60 N/m, and 30 % more for each 10 mm."""
+    """Make the compliance for an object of 60 N/m that stiffens by 30 % per 10 mm."""
     depths = np.linspace(0.0, scene.working_range.push_depth_m, 20)
     told = SoftBody(
         mesh_id="benchmark",
@@ -105,14 +105,16 @@ def make_compliance(scene: Scene) -> ComplianceController:
 
 
 def copy_planner(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
-    """The same plan with nothing done yet: a mesh's takes a second to make."""
+    """Copy a plan in its initial state, since making one for a mesh takes a second."""
     other = copy.copy(plan)
     other._contact_state = copy.copy(plan._contact_state)  # it changes by assignment only
     return other
 
 
-def straightest(shape: Shape, heading: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:
-    """Points and normals (n, 3) along a straightest way from the front."""
+def sample_geodesic(
+    shape: Shape, heading: Floats, step_m: float, steps: int
+) -> tuple[Floats, Floats]:
+    """Return points and normals (n, 3) along a geodesic from the front."""
     found = shape.closest(10.0 * FRONT)
     way = [(found.point, found.normal)]
     for _ in range(steps):
@@ -124,9 +126,9 @@ def straightest(shape: Shape, heading: Floats, step_m: float, steps: int) -> tup
     return points, normals
 
 
-def session(shape: Shape) -> Floats:
-    """Fingers (n, 3): hover, touch, stroke to and fro while pushing, lift, go behind."""
-    points, normals = straightest(shape, np.array([0.5, 0.8, 0.1]), 3e-4, 60)
+def make_session(shape: Shape) -> Floats:
+    """Return finger positions (n, 3): hover, touch, push and stroke, lift, go behind."""
+    points, normals = sample_geodesic(shape, np.array([0.5, 0.8, 0.1]), 3e-4, 60)
     down = np.linspace(0.04, -0.001, 80)[:, None]
     there = np.concatenate([points, points[::-1]])
     out = np.concatenate([normals, normals[::-1]])
@@ -141,7 +143,7 @@ def session(shape: Shape) -> Floats:
 def follow(
     plan: SheetTrajectoryPlanner, fingers: Floats, compliance: ComplianceController
 ) -> Iterator[tuple[float, PlannedStep]]:
-    """Each step's time (s) and outcome."""
+    """Return the time (s) and the outcome of each step."""
     velocities = np.gradient(fingers, STEP_S, axis=0)
     for finger, velocity in zip(fingers, velocities, strict=True):
         start = time.perf_counter()
@@ -152,7 +154,7 @@ def follow(
 def time_steps(
     name: str, plan: SheetTrajectoryPlanner, shape: Shape, compliance: ComplianceController
 ) -> None:
-    fingers = session(shape)
+    fingers = make_session(shape)
     times = np.full(len(fingers), np.inf)
     for _ in range(REPEATS):
         steps = list(follow(copy_planner(plan), fingers, compliance))
@@ -173,9 +175,9 @@ def normal_error_deg(
     speed: float,
     compliance: ComplianceController,
 ) -> float:
-    """The largest along a stroke of `WAY_M` at that speed, sped up and slowed over its ends."""
+    """Return the maximum error along a stroke of `WAY_M` with that peak speed."""
     step_m = 2e-4
-    points, normals = straightest(shape, heading, step_m, round(WAY_M / step_m))
+    points, normals = sample_geodesic(shape, heading, step_m, round(WAY_M / step_m))
     count = max(8, round(1.875 * WAY_M / speed / STEP_S))
     share = np.linspace(0.0, 1.0, count)
     smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
@@ -202,7 +204,7 @@ def main() -> None:
     scene = load_scene(SCENE_FILE)
     compliance = make_compliance(scene)
     shapes = {
-        name: (plan_about(scene, geometry), make_shape(geometry))
+        name: (make_planner(scene, geometry), make_shape(geometry))
         for name, geometry in geometries().items()
     }
     print("One step, p50 / p99 in ms\n")

@@ -1,17 +1,17 @@
-"""One random fault after another between three computers: `python -m benchmarks.faults --random`.
+"""Inject random faults between three computers: `python -m benchmarks.faults --random`.
 
-    python -m benchmarks.faults --random [--minutes 60] [--every 10] [--seed 1]
+python -m benchmarks.faults --random [--minutes 60] [--every 10] [--seed 1]
 
-The laboratory is that of `benchmarks.faults`: network namespaces, keys, a launcher for each host,
-and a finger that strokes all the while.  The faults are drawn from a seed.  Afterwards the bags
-and the simulated joints are evaluated.  A violation is
+The setup is that of `benchmarks.faults`: network namespaces, keys, a launcher per host, and a
+finger that strokes continuously. Faults are drawn from a seed. Afterwards the bags and the
+simulated joints are evaluated. Violations are:
 
-- a joint beyond its speed or range, a sheet longer than its limit, or an arm that moves under an
-  e-stop;
-- arms that do not both follow again within a minute after a fault;
-- a process, a socket file or a run's directory too many, or a process whose descriptors or memory
-  grow;
-- messages that are missing in the bag of the main host outside of the time of a fault.
+- a joint beyond its speed or range, a sheet longer than its limit, or an arm that moves during an
+  e-stop
+- arms that do not both follow within a minute after a fault
+- a remaining process, socket file or directory of a run, or a process whose descriptors or memory
+  grow
+- messages that are missing in the bag of the main host outside of the time of a fault
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.faults import MAX_LENGTH_M, Result, Span, kill, kill_launcher, tried
+from benchmarks.faults import MAX_LENGTH_M, Result, Span, kill, kill_launcher, run_fault
 from flexsheet.launch.running.runs import MAX_FINISHED_RUNS, RUN_VARIABLE
 from flexsheet.launch.running.tools import READER_RECONNECT_S
 from flexsheet.messages.bag import FLUSH_PERIOD_S
@@ -45,23 +45,23 @@ from tests.lab_bags import Arm, Gap, bags, gaps, read_arm
 
 PUBLISH_PERIOD_S = 1.0
 MARGIN_NS = round(1e9 * (FLUSH_PERIOD_S + PUBLISH_PERIOD_S + READER_RECONNECT_S + 0.5))
-"""What may be missing before and after a fault: what was not yet on the disk or is sent before a
-reader has connected again, up to the next of the topics that are published once a second."""
+"""Allowed gap before and after a fault: data not yet written, and messages sent before a reader is
+connected again."""
 
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
-"""Joints follow their commands with a lag, also the last one of a stop."""
+"""Time in which joints follow a command with their lag."""
 
 MAX_MORE_DESCRIPTORS = 10
 MAX_MORE_BYTES = 20 << 20
 MIN_LIFE_S = 600.0
-"""A process that lives shorter says nothing about leaks; its first quarter is its warm-up."""
+"""Minimum lifetime of a process for the detection of leaks; its first quarter is the warm-up."""
 
 RESET_TRIES = 10
 
 
 class FaultKind(StrEnum):
-    """What can go wrong."""
+    """Kind of a fault."""
 
     NODE_KILLED = "node killed"
     NODE_SUSPENDED = "node suspended"
@@ -75,7 +75,7 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault that was drawn: of which host, of which node (None: of none), and for how long."""
+    """Random fault: its host, its node (or None) and its duration."""
 
     kind: FaultKind
     host: str
@@ -89,7 +89,7 @@ class Fault:
 
 
 def draw_fault(rng: random.Random, nodes: dict[str, list[str]]) -> Fault:
-    """The next fault; nodes: names by host."""
+    """Draw a fault; nodes: names by host."""
     kind = rng.choice(list(FaultKind))
     host = "main" if kind is FaultKind.DISK_FULL else rng.choice(HOSTS)
     of_a_node = kind in (FaultKind.NODE_KILLED, FaultKind.NODE_SUSPENDED)
@@ -97,8 +97,8 @@ def draw_fault(rng: random.Random, nodes: dict[str, list[str]]) -> Fault:
     return Fault(kind, host, node, round(rng.uniform(0.2, 4.0), 1))
 
 
-async def bring_about(lab: Lab, fault: Fault, span: Span) -> None:
-    """Cause the fault, end it, and return when what was killed runs again."""
+async def inject(lab: Lab, fault: Fault, span: Span) -> None:
+    """Cause a fault and end it; return when the killed processes run again."""
     match fault.kind:
         case FaultKind.NODE_KILLED:
             assert fault.node is not None
@@ -137,7 +137,7 @@ async def spoil_cable(lab: Lab, fault: Fault, span: Span, **how: Any) -> None:
 
 
 async def stop_and_reset(lab: Lab, host: str, span: Span) -> None:
-    """Both arms stop by a command on any host; a reset on the main host lets them go on."""
+    """Stop both arms by a command on any host, and reset the stop on the main host."""
     span.begin()
     code, said = await lab.run(host, "arms", "stop", "--reason", f"drawn on {host}")
     assert code == 0, said
@@ -151,7 +151,7 @@ async def stop_and_reset(lab: Lab, host: str, span: Span) -> None:
 
 
 async def refuse_writing(lab: Lab, seconds: float, span: Span) -> None:
-    """The system refuses each byte that the main recorder writes, as a full disk does."""
+    """Make each write of the main recorder fail, as with a full disk."""
     process = lab.pid_of("main", "recorder")
     before = len(bags(lab.folder, "main"))
     _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
@@ -168,7 +168,7 @@ async def refuse_writing(lab: Lab, seconds: float, span: Span) -> None:
 
 @dataclass(slots=True)
 class Sample:
-    """What one process held at a time."""
+    """Descriptors and memory of one process at one time."""
 
     at_s: float
     descriptors: int
@@ -176,8 +176,8 @@ class Sample:
 
 
 @dataclass
-class Watch:
-    """What the laboratory's processes hold, and what dead ones have left."""
+class ProcessMonitor:
+    """Samples of all processes, and remains of ended ones."""
 
     lab: Lab
     samples: dict[tuple[int, float, str], list[Sample]] = field(
@@ -185,8 +185,8 @@ class Watch:
     )
     violations: list[str] = field(default_factory=list)
 
-    def look(self) -> None:
-        """Sample all processes, and note what should not be there."""
+    def sample(self) -> None:
+        """Sample all processes, and record remains of ended ones."""
         launchers = {process.pid for process in self.lab.launchers.values()}
         root = str(self.lab.folder)
         for process in psutil.process_iter():
@@ -199,15 +199,15 @@ class Watch:
                 key = (process.pid, process.create_time(), Path(command[-1]).name)
                 sample = Sample(time.monotonic(), process.num_fds(), process.memory_full_info().uss)
             except psutil.Error:
-                # It has ended meanwhile.
+                # The process has ended in the meantime.
                 continue
             self.samples[key].append(sample)
         for host in HOSTS:
-            self._look_at_runs(host, launchers)
+            self._check_runs(host, launchers)
 
-    def _look_at_runs(self, host: str, launchers: set[int]) -> None:
+    def _check_runs(self, host: str, launchers: set[int]) -> None:
         directories = [one for one in (self.lab.folder / host / "r").iterdir() if one.is_dir()]
-        # The sweep of a start leaves so many finished ones, beside which that start is.
+        # A start keeps this number of finished runs, in addition to its own.
         if len(directories) > MAX_FINISHED_RUNS + 1:
             self.violations.append(f"{len(directories)} directories of runs on {host}")
         for directory in directories:
@@ -218,7 +218,7 @@ class Watch:
                 self.violations.append(f"sockets of a dead run on {host}: {', '.join(left)}")
 
     def leaks(self) -> list[str]:
-        """Processes whose descriptors or own memory have grown since their first quarter."""
+        """Return the processes with growing descriptors or private memory."""
         found = []
         for (process, _, name), samples in self.samples.items():
             begun_s, ended_s = samples[0].at_s, samples[-1].at_s
@@ -235,7 +235,7 @@ class Watch:
 
 
 def missing_outside_faults(lost: list[Gap], results: list[Result]) -> list[Gap]:
-    """Gaps of the main host's bag that do not lie within the time of a fault."""
+    """Return the gaps of the main host's bag outside the times of faults."""
     spans = [(one.during_ns[0] - MARGIN_NS, one.during_ns[1] + MARGIN_NS) for one in results]
     return [
         gap
@@ -245,7 +245,7 @@ def missing_outside_faults(lost: list[Gap], results: list[Result]) -> list[Gap]:
 
 
 def moves_under_estop(arm: Arm) -> float:
-    """The largest rotation of a joint, rad, while the bridge reported an e-stop."""
+    """Return the maximum rotation of a joint, rad, while the bridge reported an e-stop."""
     spans = [(begin + STOPPED_NS, end) for begin, end in arm.spans("estop")]
     return max((arm.turned_rad(span) for span in spans if span[1] > span[0]), default=0.0)
 
@@ -263,14 +263,14 @@ async def restore(lab: Lab) -> None:
 
 
 async def run_random(given: argparse.Namespace) -> int:
-    """Draw faults for `given.minutes`; print a report; 1 where there are violations."""
+    """Draw faults for `given.minutes` and print a report; return 1 if there are violations."""
     rng = random.Random(given.seed)
     load = os.getloadavg()
     results: list[Result] = []
     counts: dict[str, int] = defaultdict(int)
     async with Lab(without=LIGHT) as lab:
-        watch = Watch(lab)
-        # The arms' own records are what the evaluation reads.
+        watch = ProcessMonitor(lab)
+        # The evaluation reads the arms' records.
         spared = {f"record_{side}" for side in ("left", "right")}
         nodes = {
             host: [one.name for one in lab.plan().nodes_on(host) if one.name not in spared]
@@ -288,8 +288,8 @@ async def run_random(given: argparse.Namespace) -> int:
             print(json.dumps(asdict(fault) | asdict(result)), file=sys.stderr, flush=True)
             if result.back_s is None:
                 await restore(lab)
-            watch.look()
-            # What was seen once is not needed any more; an hour of it would fill the memory.
+            watch.sample()
+            # Delete evaluated data; an hour of it would fill the memory.
             lab.seen.clear()
             await asyncio.sleep(max(0.0, next_s - time.monotonic()))
         for process in lab.launchers.values():
@@ -308,20 +308,20 @@ async def run_random(given: argparse.Namespace) -> int:
 
 
 async def attempt(lab: Lab, fault: Fault) -> Result:
-    """Bring the fault about and see both arms follow again."""
-    work: Callable[[Span], Awaitable[Any]] = partial(bring_about, lab, fault)
+    """Inject the fault, and wait until both arms follow again."""
+    work: Callable[[Span], Awaitable[Any]] = partial(inject, lab, fault)
     begun_ns = time.monotonic_ns()
     try:
-        return await tried(lab, fault.name, work)
+        return await run_fault(lab, fault.name, work)
     except AssertionError as error:
-        # They did not even follow before it: what was before this fault has left them stuck.
+        # They did not follow before this fault: a previous fault left them stuck.
         print(f"{fault.name}: {str(error)[:600]}", file=sys.stderr)
         during = (begun_ns, time.monotonic_ns())
         return Result(fault.name, None, None, during, (), {}, 0.0)
 
 
-def evaluate(lab: Lab, results: list[Result], watch: Watch) -> dict[str, Any]:
-    """What the bags, the simulated joints and the processes say."""
+def evaluate(lab: Lab, results: list[Result], watch: ProcessMonitor) -> dict[str, Any]:
+    """Evaluate the bags, the simulated joints and the processes."""
     scene = lab.plan().scene_message()
     assert scene is not None
     violations = [f"stuck after: {one.trouble}" for one in results if one.back_s is None]
@@ -359,7 +359,7 @@ def evaluate(lab: Lab, results: list[Result], watch: Watch) -> dict[str, Any]:
 
 
 def percentiles(values: list[float]) -> dict[str, float] | None:
-    """Median, 95 % and the largest; None of nothing."""
+    """Return median, 95 % and maximum; None without values."""
     if not values:
         return None
     p50, p95 = np.percentile(values, (50.0, 95.0))
@@ -367,6 +367,6 @@ def percentiles(values: list[float]) -> dict[str, float] | None:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report for people."""
+    """Format the report as text."""
     lines = [f"{name}: {value}" for name, value in report.items() if name != "violations"]
     return "\n".join([*lines, "violations:", *(report["violations"] or ["none"])])

@@ -1,10 +1,10 @@
-"""How the graph takes the loss of a node: kills the triangulator in the middle of a stroke.
+"""Measure the recovery of the graph after the triangulator is killed during a stroke.
 
-    python -m benchmarks.recovery [--rounds 3]
+python -m benchmarks.recovery [--rounds 3]
 
-Starts `launch/demo.yaml`, kills with SIGKILL, and reads the bag: how long no fingertip came, and
-how long after the last one the arms held, stopped, and followed again.  Prints one line of JSON a
-round.
+Starts `launch/demo.yaml` and kills the node with SIGKILL. From the bag it prints one line of JSON
+per round: the time without fingertips, and the times after the last one at which the arms held,
+stopped, and followed again.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ KILLED = "triangulator"
 AGAIN_S = 3.0
 
 
-async def kill_in_a_stroke(bag: Path) -> int:
-    """Run the graph, kill the node in mid stroke, wait until it is back; when it was killed, ns."""
+async def kill_during_stroke(bag: Path) -> int:
+    """Kill the node during a stroke, and wait until it is restarted; return the time, ns."""
     plan = load_graph(DEMO_FILE, record=bag)
     scene = plan.scene_message()
     assert scene is not None
@@ -42,21 +42,21 @@ async def kill_in_a_stroke(bag: Path) -> int:
             await driver.wait_until_up()
             driver.move_finger(stroke.stroke_path(scene, STROKE_S))
 
-            def half_way() -> bool:
+            def is_half_way() -> bool:
                 finger = driver.newest("twin/finger")
                 return isinstance(finger, TwinFinger) and finger.path_time_s > STROKE_S / 2
 
-            await driver.wait_for(half_way, "the middle of the stroke", 3 * STROKE_S)
+            await driver.wait_for(is_half_way, "the middle of the stroke", 3 * STROKE_S)
             killed_ns = SystemClock().now_ns()
             graph.kill(KILLED, signal.SIGKILL)
             await graph.wait_ready_again(KILLED, 1)
-            # Long enough for the arms to have gone back to following, and to be recorded.
+            # Long enough that the arms follow again and are recorded.
             await asyncio.sleep(AGAIN_S)
     return killed_ns
 
 
-def measured(bag: Path, killed_ns: int) -> dict[str, Any]:
-    """Times in ms, from the bag's own stamps."""
+def compute_times(bag: Path, killed_ns: int) -> dict[str, Any]:
+    """Return the times in ms, from the stamps of the bag."""
     tips: list[int] = []
     arms: dict[str, list[tuple[int, str]]] = {"left": [], "right": []}
     for topic, message, header, _ in BagReader(bag, topics=["fingertip", "arm_left", "arm_right"]):
@@ -84,8 +84,8 @@ def main() -> None:
     for _ in range(rounds):
         with tempfile.TemporaryDirectory() as folder:
             bag = Path(folder) / "recovery.mcap"
-            killed_ns = asyncio.run(kill_in_a_stroke(bag))
-            print(json.dumps(measured(bag, killed_ns)), flush=True)
+            killed_ns = asyncio.run(kill_during_stroke(bag))
+            print(json.dumps(compute_times(bag, killed_ns)), flush=True)
 
 
 if __name__ == "__main__":

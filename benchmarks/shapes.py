@@ -1,11 +1,12 @@
-"""How quick shapes answer, and how smooth a mesh is to roll on.
+"""Measure the query time of shapes, and the smoothness of a mesh for rolling.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.shapes [MESH METRES_PER_UNIT]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.shapes [MESH METRES_PER_UNIT]
 
-Prints the time of a single query for every shape, without and with the previous point; then for a
-mesh (an ellipsoid's by default), for several lengths of smoothing: how far it leaves the mesh, the
-share of its area that is an edge, and the largest second derivative of the normal along straightest
-ways, beside that of facets and of blended vertex normals.  Under two minutes.
+Prints the time of a query for every shape, without and with the previous point. For a mesh
+(default: an ellipsoid's) with several smoothing lengths, it prints the distance to the mesh, the
+fraction of the area that is an edge, and the maximum second derivative of the normal along
+geodesics. The latter is compared with facets and with interpolated vertex normals. Takes under two
+minutes.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ SOLIDS = (
 )
 QUERIES, REPEATS = 200, 5
 MOVED_M = 3e-4
-"""Between two pictures at 60 Hz a finger at 20 mm/s goes that far."""
+"""Motion of a finger at 20 mm/s between two images at 60 Hz."""
 EDGES = (1.25, 1.75, 2.5, 3.5)
 STEPS_M = (4e-4, 1e-4)
 WAYS, WAY_M = 8, 0.06
 
 
 def microseconds(ask: Callable[[int], object]) -> str:
-    """Median and 99th percentile over queries, each the best of some repeats."""
+    """Format median and 99th percentile over queries, each the minimum of several repeats."""
     best = np.empty(QUERIES)
     for i in range(QUERIES):
         took = []
@@ -57,18 +58,18 @@ def microseconds(ask: Callable[[int], object]) -> str:
 
 
 def time_queries(name: str, shape: Shape) -> None:
-    """Queries within 10 mm of the surface, to both sides."""
+    """Time queries within 10 mm of the surface, on both sides."""
     rng = np.random.default_rng(0)
     base = shape.closest(rng.uniform(-0.05, 0.05, (QUERIES, 3)))
     near = base.point + rng.uniform(-0.01, 0.01, (QUERIES, 1)) * base.normal
     before = shape.closest(near + MOVED_M / np.sqrt(3.0)).point
     first = microseconds(lambda i: shape.closest(near[i]))
-    going_on = microseconds(lambda i: shape.closest(near[i], previous=before[i]))
-    print(f"{name:12}  first {first}   next {going_on}", flush=True)
+    following = microseconds(lambda i: shape.closest(near[i], previous=before[i]))
+    print(f"{name:12}  first {first}   next {following}", flush=True)
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float) -> tuple[Floats, Floats, Bools]:
-    """Points, normals and edge flags along a straightest way."""
+    """Return points, normals and edge flags along a geodesic."""
     here = shape.closest(start)
     point, normal = here.point, here.normal
     heading = np.cross(normal, [0.36, 0.48, 0.8])
@@ -88,7 +89,7 @@ def second_derivative(normals: Floats, edges: Bools, step_m: float) -> float:
     return float((np.linalg.norm(np.diff(normals, 2, axis=0), axis=1) / step_m**2)[off].max())
 
 
-def judge_mesh(vertices: Floats, triangles: Indices) -> None:
+def evaluate_mesh(vertices: Floats, triangles: Indices) -> None:
     edge_m = default_smoothing_m(vertices, triangles) / 1.75
     facets = Facets(vertices, triangles)
     flat, rough = triangle_normals(vertices, triangles), vertex_normals(vertices, triangles)
@@ -137,9 +138,9 @@ def main() -> None:
     if len(sys.argv) == 3:
         mesh = read_mesh(Path(sys.argv[1]), float(sys.argv[2]), None)
         print(mesh.origin)
-        judge_mesh(mesh.vertices_m, mesh.triangles.astype(np.int64))
+        evaluate_mesh(mesh.vertices_m, mesh.triangles.astype(np.int64))
     else:
-        judge_mesh(*ellipsoid_mesh(4))
+        evaluate_mesh(*ellipsoid_mesh(4))
 
 
 if __name__ == "__main__":

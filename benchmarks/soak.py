@@ -1,25 +1,24 @@
-"""Does anything grow, leak or drift while the whole graph is used for long?
+"""Detect growth, leaks and drift during long use of the whole graph.
 
-    python -m benchmarks.soak [--minutes 60] [--busy 0] [--set NODE.PARAMETER=VALUE]
-                              [--output FOLDER]
+python -m benchmarks.soak [--minutes 60] [--busy 0] [--set NODE.PARAMETER=VALUE]
+                          [--output FOLDER]
 
-Starts `launch/demo.yaml`, strokes and pushes all the while, and records what is logged.  With
-`--busy N`, N other processes compute without a pause meanwhile, each in a session of its own as
-another program of the user would be.  Reports
+Starts `launch/demo.yaml`, strokes and pushes continuously, and records the logged topics. With
+`--busy N`, N other processes compute continuously, each in a separate session as a user's programs
+would. Reports
 
-- per process: how fast its memory grows (its own, what it shares with none; and what it has
-  resident; the median of the slopes between all pairs of samples, after a warm-up), descriptors,
-  threads, processor time, restarts and hangs;
-- per topic and reader: messages, those superseded or overflown, lost on the way, refused;
-- per window of five minutes: exposure to arm command, to fingertip and to frame, how much of the
-  time the arms followed, how often they ended to follow and in which mode, how much of the
-  cameras' pictures gave a fingertip;
-- lines of log per node;
-- findings: what of that grew or went wrong.
+- per process: growth of its private and its resident memory (median of the slopes between all pairs
+  of samples, after a warm-up), descriptors, threads, processor time, restarts and hangs
+- per topic and reader: numbers of messages, of superseded or overflown, lost and rejected ones
+- per window of five minutes: latency from exposure to arm command, fingertip and frame; fraction of
+  the time in which the arms followed; number of interruptions by mode; fraction of images with a
+  fingertip
+- lines of log per node
+- findings: growth and errors
 
-Each window is a bag of its own, by the topic `recording`: it is read when it is complete and then
-removed, the newest excepted, so that the disk holds two windows at most.  Ctrl-C ends it in order,
-with a report of what there is.
+Each window is a separate bag, requested by the topic `recording`. It is evaluated when it is
+complete and then removed, except for the newest one, so that the disk contains two windows at most.
+Ctrl-C ends the run with a report of the data up to then.
 """
 
 from __future__ import annotations
@@ -77,16 +76,16 @@ WARM_UP_SHARE = 0.25
 """Warm-up, as a fraction of a run that is shorter than four warm-ups."""
 
 MIN_FIT_S = 900.0
-"""Over less time than that, caches that fill look like leaks."""
+"""Minimum duration for slopes; caches that fill in less time look like leaks."""
 
 READER_NICE = 15
 
 GROWTH_B_PER_H = 2 << 20
-"""Surely more than this is a finding: 0.3 GB in a week."""
+"""Minimum certain growth of a finding: 0.3 GB in a week."""
 
 MIN_GROWTH_B = 1 << 20
 DRIFT_RATIO = 1.2
-"""Largest ratio of the last third's median latency to the first third's."""
+"""Maximum ratio of the last third's median latency to the first third's."""
 
 MIN_DRIFT_MS = 1.0
 LAUNCHER = "launcher"
@@ -95,10 +94,10 @@ MIB = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a process takes at one time.
+    """Resources of a process at one time.
 
-    uss: memory that it shares with none; a proportional share would fall as others load the same
-    libraries, and hide a leak.
+    uss: private memory. A proportional share would hide a leak, since it falls when others load the
+        same libraries.
     """
 
     time_s: float
@@ -112,7 +111,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class MachineSample:
-    """What all processors have done, and our processes of it; and how much the logs hold."""
+    """Processor time of the machine and of the graph's processes, and the size of the logs."""
 
     time_s: float
     busy_s: float
@@ -122,7 +121,7 @@ class MachineSample:
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """How fast something grows, by the hour: the estimate and its 95 % interval."""
+    """Growth per hour: the estimate and its 95 % interval."""
 
     per_h: float
     low_per_h: float
@@ -131,7 +130,7 @@ class Slope:
 
 @dataclass
 class PortTotal:
-    """What a reader's counters came to, over all starts of its process."""
+    """Sum of a reader's counters over all starts of its process."""
 
     messages: int = 0
     dropped: int = 0
@@ -140,8 +139,8 @@ class PortTotal:
 
 
 @dataclass
-class Heard:
-    """What the nodes' status messages said since the graph was up."""
+class StatusTotals:
+    """Totals from the nodes' status messages since the start of the graph."""
 
     ports: dict[tuple[str, str], PortTotal] = field(default_factory=lambda: defaultdict(PortTotal))
     errors: Counter[str] = field(default_factory=Counter)
@@ -150,7 +149,7 @@ class Heard:
     _before: dict[str, Status] = field(default_factory=dict)
 
     def take(self, status: Status, header: Header) -> None:
-        """Add what has happened since the node's last status; a new process begins from 0."""
+        """Add the changes since the node's last status; counters of a new process start at 0."""
         before = self._before.get(status.node)
         self._before[status.node] = status
         if before is None:
@@ -173,7 +172,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """What one bag says; delays in ms from the middle of the exposure, percentiles 50 and 99."""
+    """Results of one bag; latencies in ms from mid-exposure, percentiles 50 and 99."""
 
     begin_ns: int
     seconds: float
@@ -190,7 +189,7 @@ class Window:
 
 
 def read_window(bag: Path) -> Window:
-    """The figures of a window's bag."""
+    """Compute the results of a window's bag."""
     first: dict[tuple[str, int], float] = {}
     valid: Counter[bool] = Counter()
     modes: Counter[str] = Counter()
@@ -249,7 +248,7 @@ def read_window(bag: Path) -> Window:
 
 
 def paths(scene: Scene) -> Iterator[FingerPath]:
-    """Strokes and pushes, for ever; each label once."""
+    """Yield strokes and pushes endlessly, each with a unique label."""
     for number in count(1):
         for name in ("stroke-10", "stroke-push", "tap", "circle"):
             path = gesture_path(name, scene)
@@ -260,10 +259,10 @@ def paths(scene: Scene) -> Iterator[FingerPath]:
 
 
 class Soak:
-    """One run of the graph: its samples, its windows, and what the nodes said.
+    """One run of the graph: its samples, its windows, and the nodes' totals.
 
-    seconds: of stroking and pushing.  window_s: of each bag.  folder: for bags and report.
-    busy: number of other processes that compute meanwhile.
+    seconds: duration of the stroking. window_s: duration of each bag. folder: for bags and report.
+        busy: number of other processes that compute.
     """
 
     def __init__(
@@ -278,7 +277,7 @@ class Soak:
         self.seconds, self.window_s, self.folder, self.busy = seconds, window_s, folder, busy
         self.samples: dict[str, list[Sample]] = defaultdict(list)
         self.machine: list[MachineSample] = []
-        self.heard = Heard()
+        self.heard = StatusTotals()
         self.windows: list[Window] = []
         self.problems: list[str] = []
         self.paths_followed = 0
@@ -293,7 +292,7 @@ class Soak:
         self._cpu_s: dict[int, float] = {}
 
     async def run(self) -> None:
-        """Use the graph for so long; what ends it early is told in `problems`."""
+        """Use the graph for the duration; a premature end is reported in `problems`."""
         scene = self.plan.scene_message()
         assert scene is not None  # the demo has one
         precompute_graph(self.plan, say)
@@ -306,7 +305,7 @@ class Soak:
         except asyncio.CancelledError:
             self.problems.append(f"interrupted after {self.lasted_s / 60.0:.1f} minutes")
         except Exception as error:
-            # Whatever ended the graph is a result; the figures up to then are worth having.
+            # Report any error that ends the graph, with the results up to then.
             self.problems.append(f"{type(error).__name__}: {error}")
         await self._read_bags(all_of_them=True)
 
@@ -380,7 +379,7 @@ class Soak:
                     cpu_s=times.user + times.system,
                 )
             except psutil.Error:
-                continue  # killed just now: the launcher counts its restart
+                continue  # it was just killed; the launcher counts its restart
             self.samples[name].append(sample)
             self._cpu_s[pid] = sample.cpu_s
         times = psutil.cpu_times()
@@ -395,7 +394,7 @@ class Soak:
 
     async def _record(self, writer: GraphWriter) -> None:
         for number in count(1):
-            # Reading a bag takes a part of the next window.
+            # Reading a bag takes part of the next window's time.
             await asyncio.sleep(self.began_s + number * self.window_s - time.monotonic())
             writer.publish("recording", Recording(running=False))
             writer.publish("recording", Recording(running=True))
@@ -404,14 +403,14 @@ class Soak:
             say(f"{(time.monotonic() - self.began_s) / 60.0:.0f} minutes: to arm {newest} ms")
 
     async def _read_bags(self, *, all_of_them: bool = False) -> None:
-        """Read the bags that are complete, in a process that gives way, and remove them.
+        """Evaluate the complete bags in a process with low priority, and remove them.
 
-        The newest is being written, until the end; then it is kept.
+        The newest bag is still being written; at the end it is evaluated and not removed.
         """
         bags = sorted(self.folder.glob("soak-*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
         context = multiprocessing.get_context("spawn")
         for bag in bags if all_of_them else bags[:-1]:
-            with ProcessPoolExecutor(1, mp_context=context, initializer=give_way) as pool:
+            with ProcessPoolExecutor(1, mp_context=context, initializer=lower_priority) as pool:
                 work = asyncio.get_running_loop().run_in_executor(pool, read_window, bag)
                 try:
                     self.windows.append(await work)
@@ -422,19 +421,19 @@ class Soak:
 
 
 def start_busy_process() -> subprocess.Popen[bytes]:
-    """Start a process that computes without a pause until it is killed."""
+    """Start a process that computes continuously until it is killed."""
     program = [sys.executable, "-c", "while True: pass"]
     return subprocess.Popen(program, start_new_session=True)
 
 
-def give_way() -> None:
-    """Return the memory of the process that reads bags during the measurement."""
+def lower_priority() -> None:
+    """Lower the priority of the process that reads bags."""
     os.nice(READER_NICE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def slope(times_s: Floats, values: Floats) -> Slope | None:
-    """Theil and Sen's: the median of the slopes between all pairs; None over too short a time."""
+    """Return the median of the slopes between all pairs (Theil, Sen); None for too short a time."""
     if times_s[-1] - times_s[0] < MIN_FIT_S:
         return None
     found = theilslopes(values, times_s / 3600.0)
@@ -446,7 +445,7 @@ def warm_up_s(lived_s: float) -> float:
 
 
 def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
-    """What became of a process; of one that was restarted, of its newest start."""
+    """Summarize a process; of a restarted one, its newest start."""
     pid = samples[-1].pid
     ours = [one for one in samples if one.pid == pid]
     settled_from_s = ours[0].time_s + warm_up_s(ours[-1].time_s - ours[0].time_s)
@@ -475,8 +474,8 @@ def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
-def report_of(soak: Soak) -> dict[str, Any]:
-    """Everything, with its findings."""
+def make_report(soak: Soak) -> dict[str, Any]:
+    """Make the report of a run, with its findings."""
     processes = {name: process_report(samples) for name, samples in soak.samples.items() if samples}
     windows = [window_report(soak, window) for window in soak.windows]
     ports = [
@@ -497,7 +496,7 @@ def report_of(soak: Soak) -> dict[str, Any]:
         "last_errors": soak.heard.last_error,
         "logs_bytes_per_h": logs_growth(soak.machine),
         "log_lines": {name: lines for name, lines in soak.log_lines.items() if lines},
-        "series": {name: thinned(samples) for name, samples in soak.samples.items()},
+        "series": {name: thin_out(samples) for name, samples in soak.samples.items()},
     }
     return {**result, "findings": [*soak.problems, *findings(result)]}
 
@@ -522,13 +521,13 @@ def logs_growth(machine: Sequence[MachineSample]) -> float | None:
     return 3600.0 * grown / (machine[-1].time_s - machine[0].time_s)
 
 
-def thinned(samples: Sequence[Sample]) -> list[dict[str, Any]]:
-    """One a minute, for whoever wants to draw it."""
+def thin_out(samples: Sequence[Sample]) -> list[dict[str, Any]]:
+    """Return one sample per minute, for plots."""
     return [asdict(one) for one in samples[:: round(60.0 / SAMPLE_S)]]
 
 
 def findings(result: dict[str, Any]) -> list[str]:
-    """What grew, drifted or went wrong, a sentence each."""
+    """Describe each growth, drift or error in a sentence."""
     found = []
     for name, process in result["processes"].items():
         memory = process["uss"]
@@ -564,7 +563,7 @@ def findings(result: dict[str, Any]) -> list[str]:
 
 
 def drifts(windows: Sequence[dict[str, Any]]) -> list[str]:
-    """Latencies of the last third of the windows against those of the first."""
+    """Compare the latencies of the last third of the windows with those of the first."""
     found = []
     third = len(windows) // 3
     for what in ("to_fingertip_ms", "to_arm_ms", "to_frame_ms"):
@@ -584,8 +583,8 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in lines)
 
 
-def in_words(result: dict[str, Any]) -> str:
-    """The report for people, in Markdown."""
+def to_markdown(result: dict[str, Any]) -> str:
+    """Format the report as Markdown."""
 
     def mib(value: float) -> str:
         return f"{value / MIB:.1f}"
@@ -704,7 +703,7 @@ def say(text: str) -> None:
 
 
 async def until_interrupted(soak: Soak) -> None:
-    """Run it; the first SIGINT or SIGTERM ends it in order."""
+    """Run until the end; the first SIGINT or SIGTERM ends the run normally."""
     task = asyncio.create_task(soak.run())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -734,10 +733,10 @@ def main() -> int:
         busy=given.busy,
     )
     asyncio.run(until_interrupted(soak))
-    result = report_of(soak)
+    result = make_report(soak)
     (folder / "soak.json").write_text(json.dumps(result, indent=1))
-    (folder / "soak.md").write_text(in_words(result) + "\n")
-    print(json.dumps(result) if given.json else in_words(result))
+    (folder / "soak.md").write_text(to_markdown(result) + "\n")
+    print(json.dumps(result) if given.json else to_markdown(result))
     say(f"report and newest bag are in {folder}")
     return 1 if result["findings"] else 0
 

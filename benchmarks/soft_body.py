@@ -40,7 +40,7 @@ Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
-"""Position along the axis (m) and angle: points that no table is computed from."""
+"""Position along the axis (m) and angle of points that are not samples of a table."""
 JUDGE_RATIO = 0.3
 """Spacing of the reference mesh at the push, in finger radii: finer than the table's."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
@@ -49,12 +49,12 @@ HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
 STEP_M, STEPS = 2e-5, 300
 FROM_M = (0.004, 0.003)
 MIN_TOUCH_ANGLE_RAD = 0.7
-"""The finest mesh is touchable over less of the front, so that its table fits into memory."""
+"""Touchable height of the finest mesh, so that its table fits into memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slides:
-    """The results of sliding at one depth: per step, except the largest jump (m)."""
+    """Results of a slide at one depth: values per step, and the maximum jump, m."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -69,8 +69,8 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
 
 
-def judge_table(scene: Scene, spacing_m: float) -> None:
-    """Compute or load the table, compare it with full Newton, slide over it, print."""
+def evaluate_table(scene: Scene, spacing_m: float) -> None:
+    """Evaluate a table: compute or load it, compare it with full Newton, slide over it, print."""
     maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
@@ -82,7 +82,7 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     start = time.perf_counter()
     bodies = maker.bodies(scene, "auto", lambda *_: None)
     if len(bodies) == 1:
-        bodies.insert(0, maker.build_table(scene, bodies[0], say))
+        bodies.insert(0, maker.build_table(scene, bodies[0], print_progress))
     best, linear = bodies
     print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
     if isinstance(best.method, TableSoftBody):
@@ -96,24 +96,24 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
         sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
-        judge_push(scene, mesh, sample, best, linear)
+        evaluate_push(scene, mesh, sample, best, linear)
     for depth_m in DEPTHS_M:
-        say_slides(scene, slide(best, radius_m, depth_m), depth_m)
+        print_slides(scene, slide(best, radius_m, depth_m), depth_m)
 
 
-def say(done: int, total: int, need: precompute.WorkBudget) -> None:
+def print_progress(done: int, total: int, need: precompute.WorkBudget) -> None:
     """Print progress on one line."""
     print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
 
 
-def judge_push(
+def evaluate_push(
     scene: Scene,
     mesh: SolidMesh,
     sample: snapshots.SamplePoint,
     best: body.SceneBody,
     linear: body.SceneBody,
 ) -> None:
-    """Print the largest error off the finger and the error of the force, depth by depth."""
+    """Print the maximum error away from the finger and the force error, by depth."""
     job = snapshots.make_snapshot_job(
         best.spec.mesh,
         mesh,
@@ -143,7 +143,7 @@ def judge_push(
 
 
 def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
-    """Slide in every direction at one depth."""
+    """Slide in each direction at one depth."""
     forces, stiffness, durations, jump = [], [], [], 0.0
     for heading in HEADINGS_RAD:
         before: NDArray[np.float32] | None = None
@@ -165,8 +165,7 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
 
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
-    """Return Hertz's force of a sphere on a half-space curved like the cylinder, with a circular
-    patch."""
+    """Return Hertz's force of a sphere on a half-space with the cylinder's curvature, N."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
     finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / cylinder_of(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
@@ -194,10 +193,10 @@ def measure(scene: Scene, spacing_m: float) -> None:
         flush=True,
     )
     for depth_m in DEPTHS_M:
-        say_slides(scene, slide(built, cylinder_of(scene).radius_m, depth_m), depth_m)
+        print_slides(scene, slide(built, cylinder_of(scene).radius_m, depth_m), depth_m)
 
 
-def say_slides(scene: Scene, slides: Slides, depth_m: float) -> None:
+def print_slides(scene: Scene, slides: Slides, depth_m: float) -> None:
     mean_n, stiffness = slides.force_n.mean(), slides.stiffness_n_per_m
     median_s, p99_s = np.quantile(slides.step_s, [0.5, 0.99])
     print(
@@ -213,7 +212,7 @@ def say_slides(scene: Scene, slides: Slides, depth_m: float) -> None:
 def main() -> None:
     scene = load_scene(SCENE_FILE)
     if "--table" in sys.argv[1:]:
-        judge_table(scene, DEMO_SPACING_M)
+        evaluate_table(scene, DEMO_SPACING_M)
         return
     for spacing_m in SPACINGS_M:
         measure(scene, spacing_m)

@@ -1,10 +1,10 @@
-"""Measure where the soft body's methods fail, and the system's response: docs/limits-soft-body.md.
+"""Measure the limits of the soft body's methods, for docs/limits-soft-body.md.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_limits [CASE ...]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_limits [CASE ...]
 
-The bodies are small and coarse, so that it takes minutes. Depths at which Newton ends depend on the
-mesh, and are printed with it. The nonlinear table consists of such pushes: it ends `END_SPAN_M`
-before they do.
+The bodies are small and coarse, so that the benchmark takes minutes. The maximum depth of Newton's
+method depends on the mesh, and is printed with it. The nonlinear table consists of such pushes, and
+ends `END_SPAN_M` before them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A scene's body by the linear method, and its mesh."""
+    """Scene's body by the linear method, and its mesh."""
 
     scene: Scene
     soft: SceneBody
@@ -55,7 +55,7 @@ class Body:
     mesh: SolidMesh
 
 
-def scene_of(
+def make_scene(
     geometry: dict[str, Any],
     support: dict[str, Any],
     *,
@@ -76,11 +76,13 @@ def scene_of(
 
 
 def cylinder(**changes: float) -> Scene:
-    return scene_of(CYLINDER, STRIP, height_m=0.02, **changes)
+    return make_scene(CYLINDER, STRIP, height_m=0.02, **changes)
 
 
-def body_of(scene: Scene, spacing_m: float = SPACING_M, *, meshed_for: Scene | None = None) -> Body:
-    """meshed_for: the scene whose finger's size decides whether the mesh is fine enough."""
+def make_body(
+    scene: Scene, spacing_m: float = SPACING_M, *, meshed_for: Scene | None = None
+) -> Body:
+    """Make the scene's body; meshed_for: scene whose finger's size determines the mesh."""
     spec = make_soft_body_spec(meshed_for or scene, spacing_m)
     model = compute(spec, lambda *_: None)
     soft = build_scene_body(
@@ -89,7 +91,7 @@ def body_of(scene: Scene, spacing_m: float = SPACING_M, *, meshed_for: Scene | N
     return Body(scene, soft, model, build_mesh(spec.mesh))
 
 
-def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
+def make_sample(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
     found = body.soft.shape.closest(body.soft.front + np.array([x, y, 0.0]))
     return SamplePoint(found.point, found.normal)
 
@@ -118,7 +120,7 @@ def table_mm(newton_mm: float) -> float:
     return max(0.0, newton_mm - 1e3 * END_SPAN_M)
 
 
-def overturned(body: Body, moved: NDArray[Any]) -> int:
+def count_inverted(body: Body, moved: NDArray[Any]) -> int:
     """Return the number of skin triangles whose normal is rotated by more than a right angle."""
 
     def normals(points: Floats) -> Floats:
@@ -159,11 +161,11 @@ def incompressible() -> None:
     row("ν", "linear: force at 3 mm", "Newton: to", "table: to", "refused")
     for nu in (0.3, 0.45, 0.49, 0.499, 0.4999, 0.49995):
         try:
-            body = body_of(cylinder(nu=nu))
+            body = make_body(cylinder(nu=nu))
         except ValueError as error:
             row(nu, "-", "-", "-", error)
             continue
-        sample = site_of(body)
+        sample = make_sample(body)
         force = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.003)).force_n
         end = deepest_mm(newton(body, sample))
         newtons = f"{1e3 * float(force @ sample.normal):.1f} mN"
@@ -172,10 +174,10 @@ def incompressible() -> None:
 
 def inversion() -> None:
     """Push to increasing depths."""
-    row("skin spacing", "linear field inverts at", "Newton: to", "shown at 50 mm", "overturned")
+    row("skin spacing", "linear field inverts at", "Newton: to", "shown at 50 mm", "count_inverted")
     for spacing in (0.005, 0.004, 0.003):
-        body = body_of(cylinder(), spacing)
-        sample = site_of(body)
+        body = make_body(cylinder(), spacing)
+        sample = make_sample(body)
         end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, sample)):g} mm"
         answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.050))
         largest = 1e3 * float(np.linalg.norm(answer.displacement, axis=1).max())
@@ -185,15 +187,15 @@ def inversion() -> None:
             f"{linear_inversion_mm(body, sample):g} mm",
             end,
             f"skin moves {largest:.1f} mm, {flag}",
-            overturned(body, answer.displacement),
+            count_inverted(body, answer.displacement),
         )
 
 
 def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float, float, int]:
     """Slide a finger across a body at constant depth, in steps of 0.02 mm.
 
-    Returns the largest displacement (mm) of a skin node in a step, the fraction of the steps that
-    is flagged, and the maximum number of inverted triangles.
+    Return the maximum displacement (mm) of a skin node in a step, the fraction of flagged steps,
+    and the maximum number of inverted triangles.
     """
     held: ContactAnchor | None = None
     before: NDArray[Any] | None = None
@@ -205,7 +207,7 @@ def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float
         answer, held = body.soft.respond(point, held)
         flagged += not answer.in_range
         if step % 50 == 0:
-            most = max(most, overturned(body, answer.displacement))
+            most = max(most, count_inverted(body, answer.displacement))
         if before is not None:
             move = float(np.linalg.norm(answer.displacement - before, axis=1).max())
             jump = max(jump, 1e3 * move)
@@ -215,10 +217,17 @@ def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float
 
 def rim() -> None:
     """Slide a finger over the edge of a box, from its front to its side."""
-    row("edge radius", "depth", "largest jump", "flagged", "overturned", "Newton on the edge: to")
+    row(
+        "edge radius",
+        "depth",
+        "largest jump",
+        "flagged",
+        "count_inverted",
+        "Newton on the edge: to",
+    )
     for edge in (0.010, 0.005, 0.0025):
         box = {"shape": "rounded_box", "size_m": [0.06, 0.05, 0.03], "edge_radius_m": edge}
-        body = body_of(scene_of(box, STRIP, height_m=0.015))
+        body = make_body(make_scene(box, STRIP, height_m=0.015))
         start = np.array([0.018, 0.001, 0.03])
         found = body.soft.shape.closest(np.array([0.030, 0.001, 0.015]))
         end = deepest_mm(newton(body, SamplePoint(found.point, found.normal), DEPTHS_M[:15]))
@@ -235,18 +244,17 @@ def rim() -> None:
 
 
 def two_supports() -> None:
-    """Compare a cylinder fixed at the middles of its two ends only with one fixed along its
-    back."""
+    """Compare a cylinder fixed at the middles of its ends only with one fixed along its back."""
     row("held", "held nodes", "linear: force at 5 mm", "skin moves at most", "Newton: to")
     ends = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
     for name, support in (("back", STRIP), ("two ends", ends), ("one point", point)):
         try:
-            body = body_of(scene_of(CYLINDER, support, height_m=0.02))
+            body = make_body(make_scene(CYLINDER, support, height_m=0.02))
         except ValueError as error:
             row(name, "-", f"refused: {error}", "-", "-")
             continue
-        sample = site_of(body)
+        sample = make_sample(body)
         answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.005))
         row(
             name,
@@ -259,11 +267,11 @@ def two_supports() -> None:
 
 def slivers() -> None:
     """Flatten elements: move the nodes inside the cylinder towards a plane."""
-    row("flattened to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
-    base = body_of(cylinder())
-    sample = site_of(base)
+    row("flatten_element to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
+    base = make_body(cylinder())
+    sample = make_sample(base)
     for share in (1.0, 0.3, 0.1, 0.03, 0.01, 0.001, 0.0):
-        nodes = flattened(base.mesh, share)
+        nodes = flatten_element(base.mesh, share)
         try:
             NeoHookeanSolid(nodes, base.mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
             force = force_n(base, nodes, sample)
@@ -275,10 +283,10 @@ def slivers() -> None:
         row(share, f"{thinnest(nodes, base.mesh):.2g}", f"{1e3 * force:.1f} mN", f"{end:g} mm")
 
 
-def flattened(mesh: SolidMesh, share: float) -> Floats:
+def flatten_element(mesh: SolidMesh, share: float) -> Floats:
     """Return the nodes of a mesh with one inner corner close to the opposite face of an element.
 
-    The distance is `share` of the corner's height; edges stay straight.
+    The distance is `fraction` of the corner's height; edges remain straight.
     """
     skin = np.zeros(len(mesh.nodes), dtype=bool)
     skin[mesh.skin] = True
@@ -317,8 +325,7 @@ def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
 
 
 def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
-    """Return the force of a finger 3 mm deep by Newton on these nodes; NaN where it does not
-    converge."""
+    """Return the force of a finger 3 mm deep by Newton's method; NaN if it does not converge."""
     mesh = replace(body.mesh, nodes=nodes)
     answer = newton(replace(body, mesh=mesh), sample, (0.003,))
     modulus = body.scene.object.material.young_modulus_pa
@@ -328,7 +335,7 @@ def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
 def teleport() -> None:
     """Compare a finger that jumps in every frame with one that moved straight to each point."""
     row("finger", "skin differs from that of a finger fresh from outside by at most")
-    body, rng = body_of(cylinder()), np.random.default_rng(4)
+    body, rng = make_body(cylinder()), np.random.default_rng(4)
     held: ContactAnchor | None = None
     worst, kept = {"near": 0.0, "across": 0.0}, 0
     for _ in range(600):
@@ -346,7 +353,7 @@ def teleport() -> None:
     row(
         f"by more ({kept} of 600 jumps): the place it entered by stays", f"{worst['across']:.0f} mm"
     )
-    sample, forces = site_of(body), []
+    sample, forces = make_sample(body), []
     for steps in (1, 40):
         depths = tuple(float(d) for d in np.linspace(0.0, 0.006, steps + 1)[1:])
         forces.append(float(newton(body, sample, depths).force_n[-1] @ sample.normal))
@@ -357,8 +364,8 @@ def small_tip() -> None:
     """Push with a fingertip smaller than the mesh under it."""
     row("tip radius", "over spacing", "depth", "linear: force over Hertz", "Newton: over Hertz")
     for radius in (0.007, 0.003, 0.0015, 0.0007, 0.0003):
-        body = body_of(cylinder(finger_m=radius), meshed_for=cylinder())
-        sample, depth = site_of(body), 0.5 * radius
+        body = make_body(cylinder(finger_m=radius), meshed_for=cylinder())
+        sample, depth = make_sample(body), 0.5 * radius
         modulus = body.scene.object.material.young_modulus_pa
         bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / RADIUS_M))
         hertz = 4.0 / 3.0 * modulus / (1.0 - 0.45**2) * np.sqrt(1.0 / bend) * depth**1.5
@@ -380,7 +387,7 @@ def small_tip() -> None:
 def beyond() -> None:
     """Move a finger off the touchable skin: past the cylinder's end, and around to its back."""
     row("way", "flagged from", "force half at", "force none at")
-    body = body_of(cylinder())
+    body = make_body(cylinder())
     for name, ways in (
         ("past the end", [(1e-4 * i, 0.0) for i in range(450)]),
         ("around to the support", [(0.0, 0.005 * i) for i in range(620)]),

@@ -1,16 +1,16 @@
-"""Measure time and memory of a soft body response, by skin nodes and by contact nodes.
+"""Measure time and memory of a soft body response, by numbers of skin and contact nodes.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts]
 
 Bodies of 500 to 20,000 skin nodes respond to fingers at random points and to slowly moving ones.
-Their geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
-numbers in the tables are synthetic, and only some nodes have rows, as many as fit into
-`TABLE_BYTES`. Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with
-the nonlinear table. The memory of a full table is printed beside it. The floor is the time that
-this machine needs at that moment to read the same number of bytes, by a plain dot product.
+The geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
+tables contain make_synthetic_body numbers, and rows for as many nodes as fit into `TABLE_BYTES`.
+Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with the nonlinear
+table. The memory of a full table is printed as well. The floor is this machine's current time to
+read the same number of bytes, by a dot product.
 
-Writes soft-body-size.svg and soft-body-size.json. Takes a minute and 3 GB. With --redraw nothing is
-measured: the numbers in the folder are drawn again.
+Writes soft-body-size.svg and soft-body-size.json. Takes a minute and 3 GB. With --redraw, only the
+plot is drawn again from the numbers in the folder.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ DEPTH_M = 0.005
 CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
-"""Wider than the method's range, so that the contact grows with the depth."""
+"""Finger radius, larger than the method's range so that the contact grows with the depth."""
 TABLE_BYTES, MAX_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
 STEPS = 600
@@ -65,8 +65,10 @@ ROWS_PER_ANSWER = 6 * 4
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One measurement; times in s: median and 99 of 100 at random places and on a slow slide, and
-    what reading `read_bytes` from random places of memory takes."""
+    """Measurement; times in s, median and 99th percentile, at random points and on a slow slide.
+
+    floor_s: time to read `read_bytes` from random positions in memory.
+    """
 
     method: str
     skin_nodes: int
@@ -83,7 +85,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Synthetic:
-    """A body of the right size: rows of synthetic numbers at the contact nodes of a patch."""
+    """Body of a given size, with make_synthetic_body rows at the contact nodes of a patch."""
 
     mesh: SolidMesh
     response: SkinResponse
@@ -92,9 +94,8 @@ class Synthetic:
     half_m: float
 
 
-def patch_of(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
-    """The touch nodes (numbers among them) around the front whose rows fit into `TABLE_BYTES`, and
-    their faces."""
+def find_patch(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
+    """Return the contact nodes around the front that fit into `TABLE_BYTES`, and their faces."""
     touched = mesh.nodes[mesh.contact_nodes]
     front = touched[int(touched[:, 2].argmax())]
     order = np.argsort(np.abs(touched - front).max(axis=1), kind="stable")
@@ -104,9 +105,11 @@ def patch_of(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
     return np.unique(faces), faces
 
 
-def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) -> Synthetic:
-    """rows_per_place: 1 of the linear table, more of the nonlinear."""
-    numbers, faces = patch_of(mesh, rows_per_place * 12 * len(mesh.skin))
+def make_synthetic_body(
+    scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int
+) -> Synthetic:
+    """Make a synthetic body; rows_per_place: 1 for the linear table, more for the nonlinear one."""
+    numbers, faces = find_patch(mesh, rows_per_place * 12 * len(mesh.skin))
     rest = mesh.nodes[mesh.skin]
     contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes[numbers])
     places = rest[contact_nodes]
@@ -131,8 +134,7 @@ def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) 
 
 
 def floor_s(read_bytes: float) -> float:
-    """Return the median time to read this many bytes in one piece from random positions of
-    memory."""
+    """Return the median time to read this many bytes from random positions in memory, s."""
     source, rng = np.ones(FLOOR_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
     count = max(16, int(read_bytes / 4))
     durations = []
@@ -144,9 +146,8 @@ def floor_s(read_bytes: float) -> float:
     return float(np.median(durations))
 
 
-def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[ContactQuery]:
-    """Return contacts at random points of the patch, or back and forth along a line at 0.02 mm a
-    step."""
+def make_pushes(body: Synthetic, depth_m: float, *, slow: bool) -> list[ContactQuery]:
+    """Return contacts at random points of the patch, or on a line in steps of 0.02 mm."""
     rng = np.random.default_rng(2)
     ways = rng.uniform(-body.half_m, body.half_m, (STEPS, 2))
     if slow:
@@ -169,7 +170,7 @@ def timed(respond: Callable[[ContactQuery], Any], queries: Sequence[ContactQuery
 
 
 def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
-    body = synthetic(scene, mesh, shape, rows_per_place=1)
+    body = make_synthetic_body(scene, mesh, shape, rows_per_place=1)
     method = LinearSoftBody(
         body.response,
         shape,
@@ -179,7 +180,7 @@ def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) ->
         linear_depth_m=LINEAR_RANGE_M[0],
         max_depth_m=LINEAR_RANGE_M[1],
     )
-    queries = pushes_on(body, depth_m, slow=False)
+    queries = make_pushes(body, depth_m, slow=False)
     contacts = [method.contact.solve(push, depth_m) for push in queries]
     count = float(np.median([0 if one is None else len(one.nodes) for one in contacts]))
     whole = len(mesh.contact_nodes) * (12 * len(mesh.skin) + 8 * len(mesh.contact_nodes))
@@ -196,7 +197,7 @@ def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) ->
 
 def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
     levels = len(DEPTHS_M) + len(LINEAR_DEPTHS_M)
-    body = synthetic(scene, mesh, shape, rows_per_place=levels)
+    body = make_synthetic_body(scene, mesh, shape, rows_per_place=levels)
     places = len(body.response.contact_nodes)
     row = np.tile(body.response.influence[0], levels).reshape(1, levels, -1)
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *DEPTHS_M])
@@ -216,7 +217,7 @@ def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> 
         linear_depth_m=0.006,
     )
     whole = table_bytes(len(mesh.contact_nodes), len(mesh.skin), len(DEPTHS_M))
-    queries = pushes_on(body, depth_m, slow=False)
+    queries = make_pushes(body, depth_m, slow=False)
     return measured(
         method,
         body,
@@ -239,7 +240,7 @@ def measured(
     whole_table_bytes: int,
 ) -> Point:
     read = rows * 12.0 * len(body.response.rest)
-    slow = pushes_on(body, depth_m, slow=True)
+    slow = make_pushes(body, depth_m, slow=True)
     timed(method.respond, queries[:20])
     at_random, slowly = timed(method.respond, queries), timed(method.respond, slow)
     return Point(
@@ -313,15 +314,15 @@ def main() -> None:
         numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
     kept = json.loads(numbers.read_text())
     with page_style():
-        draw(points_of(kept[BY_SIZE]), points_of(kept[BY_CONTACT]), picture)
+        draw(make_points(kept[BY_SIZE]), make_points(kept[BY_CONTACT]), picture)
 
 
-def points_of(kept: Sequence[dict[str, Any]]) -> list[Point]:
+def make_points(kept: Sequence[dict[str, Any]]) -> list[Point]:
     return [Point(**one) for one in kept]
 
 
 def measure_all() -> dict[str, Any]:
-    """Measure all sizes and contacts, as they are stored."""
+    """Measure all sizes and contacts."""
     scene = load_scene(SCENE_FILE)
     shape = make_shape(dict(cylinder_of(scene)))
     by_size, by_contact = [], []

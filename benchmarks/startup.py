@@ -1,9 +1,9 @@
-"""How soon a command answers: from the start of its process to its end, on this machine.
+"""Measure the time of commands, from the start of the process to its end, on this machine.
 
-    python -m benchmarks.startup [--rounds 15] [--json]
+python -m benchmarks.startup [--rounds 15] [--json]
 
-Beside a graph of one node (the twin's finger, 60 Hz).  All take turns in every round; the ratio is
-to a Python of this version that does nothing.
+A graph of one node (the finger simulator, 60 Hz) runs meanwhile. All commands run in turn in every
+round. Times are also given relative to an empty program of the same Python.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def seconds(command: list[str]) -> float:
 
 
 async def measure(rounds: int) -> dict[str, list[float]]:
-    """Seconds of each command, round by round, while the graph runs."""
+    """Return the times of each command in each round while the graph runs, s."""
     found: dict[str, list[float]] = {name: [] for name in COMMANDS}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "startup.yaml"
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        os.environ[ROOT_VARIABLE] = folder  # no other graph is spoken to
+        os.environ[ROOT_VARIABLE] = folder  # use no other graph
         found = asyncio.run(measure(options.rounds))
     rows = [
         {

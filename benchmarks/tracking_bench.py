@@ -1,4 +1,4 @@
-"""What the tracking benchmarks share: a triangulator before the twin's camera, frame by frame."""
+"""Run a triangulator on images of the simulated camera, frame by frame, for benchmarks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 TruePathCase = Callable[[float], Floats]
-"""The true fingertip (3,) at a time in seconds."""
+"""Function that returns the true fingertip (3,) at a time, s."""
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
@@ -36,16 +36,16 @@ CALIBRATION_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 MACHINE = "2-core Intel Xeon VM, no GPU"
 
 WRONG_FOOTED_M = 5e-3
-"""A fingertip that is called valid and is farther from the truth is of something else."""
+"""Maximum error of a valid fingertip of the finger itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture to be taken.
+    """Frame to simulate.
 
-    time_s: middle of its exposure in truth.  stamp_s: the same by the camera's clock; None: it is
-    right.  mark: false where the finger shows none.  right_from_column: the right camera reads out
-    its pixels from there on only.
+    time_s: true middle of its exposure. stamp_s: stamp of the camera; None if correct. mark:
+        whether the finger has its marker. right_from_column: first column that the right camera
+        reads.
     """
 
     time_s: float
@@ -60,8 +60,8 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class DiscCutouts:
-    """A frame's truth (3,) and what the triangulator said of it; None: it came too late."""
+class ObservedFrame:
+    """True fingertip (3,) of a frame, and the triangulator's message; None if it was late."""
 
     frame: Frame
     truth: Floats
@@ -82,14 +82,14 @@ class DiscCutouts:
 
     @property
     def covariance(self) -> Floats:
-        """(3, 3) m^2 that was published for the position."""
+        """Return the published covariance (3, 3) m^2 of the position."""
         assert self.fingertip is not None
         return self.fingertip.covariance[:3, :3]
 
 
 @dataclass
 class Observer:
-    """A triangulator that is shown pictures; calibration None: the scene's optics are exact."""
+    """Triangulator with simulated images; calibration None: exact optics of the scene."""
 
     scene: Scene
     calibration: Path | None = CALIBRATION_FILE
@@ -108,8 +108,8 @@ class Observer:
         await self.node.step("scene", self.scene, Header(1, 0, 0, "virtual", "bench", 1))
         return self
 
-    async def show(self, frame: Frame, motion: TruePathCase) -> DiscCutouts:
-        """Take the picture and hand it over; a handler's error is raised here."""
+    async def show(self, frame: Frame, motion: TruePathCase) -> ObservedFrame:
+        """Simulate a frame and pass it to the node; raises the error of a handler."""
         exposure_s = self.scene.camera.exposure_s
         left, right = frame.camera.picture(
             lambda offset_s: motion(frame.time_s + offset_s),
@@ -126,17 +126,19 @@ class Observer:
             right=np.ascontiguousarray(right[:, column:]),
             right_origin_px=(column, 0),
         )
-        return DiscCutouts(frame, motion(frame.time_s), await self.hand_over(pair, frame.stamp_ns))
+        return ObservedFrame(
+            frame, motion(frame.time_s), await self.process_pair(pair, frame.stamp_ns)
+        )
 
-    async def hand_over(self, pair: StereoPair, stamp_ns: int) -> Fingertip | None:
-        """What is said of a pair; None: nothing, it came too late.  Raises a handler's error."""
+    async def process_pair(self, pair: StereoPair, stamp_ns: int) -> Fingertip | None:
+        """Pass a pair to the node; return its message, None for a late pair."""
         self._said.clear()
         await self.node.step("stereo", pair, Header(1, stamp_ns, stamp_ns, "virtual", "camera", 1))
         if self.node.errors:
             raise RuntimeError(f"triangulator: {self.node.last_error}")
         return self._said[0] if self._said else None
 
-    async def follow(self, frames: Iterable[Frame], motion: TruePathCase) -> list[DiscCutouts]:
+    async def follow(self, frames: Iterable[Frame], motion: TruePathCase) -> list[ObservedFrame]:
         return [await self.show(frame, motion) for frame in frames]
 
     def _keep(self, topic: Topic, message: Message, header: Header) -> None:
@@ -151,7 +153,7 @@ def bench_scene() -> Scene:
 def twin_camera(
     scene: Scene, clutter: Clutter, *, seed: int = 1, sensor: Sensor | None = None
 ) -> TwinCamera:
-    """The camera of the rig as it really stands."""
+    """Make the camera of the true rig."""
     return TwinCamera(
         make_true_camera(scene.camera),
         finger_radius_m=scene.finger.radius_m,
@@ -162,7 +164,7 @@ def twin_camera(
 
 
 def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Floats:
-    """(3, 3) m^2 in the world: by how much the calibration says that all fingertips are off."""
+    """Return the covariance (3, 3) m^2 of all fingertips by the calibration's uncertainty."""
     uncertainty = load_calibration(file).uncertainty
     if uncertainty is None:
         raise ValueError(f"{file}: uncertainty: null; calibrate again, so that it is known")
@@ -173,7 +175,7 @@ def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Float
 
 
 def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> TruePathCase:
-    """A finger on a path, its time counted from the path's start, with its unsteadiness."""
+    """Make a finger with tremor on a path, with times from the path's start."""
     motion = FingerMotion.resting(path.positions_world_m[0], seed=seed).followed_by(
         0.0,
         times_s=path.times_s,
@@ -189,7 +191,7 @@ def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> TruePathCase:
 def paths_motion(
     paths: Sequence[FingerPath], scene: Scene, *, seed: int
 ) -> tuple[TruePathCase, float]:
-    """A finger that goes over from each path to the next at its end, and how long it takes."""
+    """Make a finger that follows several paths; return it and the total duration."""
     motion = FingerMotion.resting(paths[0].positions_world_m[0], seed=seed)
     starts_s, motions = [0.0], [motion]
     for path in paths:
@@ -216,10 +218,10 @@ def paths_motion(
     return at, end_s
 
 
-def sigmas(seen: DiscCutouts, added: Floats) -> float:
-    """How many of its stated standard deviations a fingertip is off (Mahalanobis).
+def sigmas(seen: ObservedFrame, added: Floats) -> float:
+    """Return the Mahalanobis distance of a fingertip from the truth, in standard deviations.
 
-    added: (3, 3) m^2 of what the track's own covariance leaves out, the calibration's.
+    added: (3, 3) m^2 of errors that the track's covariance excludes, those of the calibration.
     """
     error = seen.error_m
     return float(np.sqrt(error @ np.linalg.solve(seen.covariance + added, error)))

@@ -1,21 +1,18 @@
-"""Does the fingertip ever jump, or follow something else?  100,000 frames that try to make it.
+"""Test whether the fingertip jumps or follows another object, over 100,000 adverse frames.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000] [--json]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000] [--json]
 
-A finger makes gestures, slow and fast, before the sheet; after half a second, in which it is seen
-alone, it is in a crowd redrawn for every 2000 frames: beads like the mark that swing past it or
-lie still, lamps' images in one view or both, some brighter than the mark, cables before it all; its
-mark is hidden at random for up to a second, and frames are lost.  The triangulator has the shipped
-calibration.  Prints
+A finger makes slow and fast gestures in front of the sheet. After half a second it is surrounded by
+clutter, which changes every 2000 frames: beads like the marker that swing or rest, reflections of
+lamps in one view or both, and cables in front. The marker is randomly hidden for up to a second,
+and frames are lost. The triangulator has the shipped calibration. Prints
 
-- jumps: from one valid fingertip to the next, what it went further than the finger itself did, over
-  the standard deviation that both published covariances together give: that of the whole vector
-  (root of the trace of their sum), and that along the way gone;
-- wrong-footed frames: valid, and further than 5 mm from the finger;
-- re-acquisition: from the first frame in which the mark is in full view again to the next valid
-  one.
+- jumps: motion between two valid fingertips minus the finger's, over the standard deviation by both
+  published covariances; for the whole vector (root of the trace of their sum), and along the motion
+- wrong frames: valid, and more than 5 mm from the finger
+- re-acquisition: time from the first frame with the marker in full view to the next valid one
 
-Some 10 minutes on two cores.
+Takes some 10 minutes on two cores.
 """
 
 from __future__ import annotations
@@ -38,8 +35,8 @@ from numpy.typing import NDArray
 from benchmarks.tracking_bench import (
     MACHINE,
     WRONG_FOOTED_M,
-    DiscCutouts,
     Frame,
+    ObservedFrame,
     Observer,
     TruePathCase,
     bench_scene,
@@ -72,7 +69,7 @@ Floats = NDArray[np.float64]
 
 SEQUENCE_FRAMES = 2000
 MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
-"""Where the distractors' middles are drawn, one standard deviation: where the gestures go on."""
+"""Standard deviation of the centres of the clutter, around the gestures."""
 
 SOLE_CANDIDATE_TIME_S = 0.5
 BLINKS_PER_S = 0.4
@@ -82,11 +79,12 @@ SIGMAS = (3, 4, 5, 6)
 BEYOND_MM = (0.3, 1.0, 5.0)
 SHOWN = 30
 CLEAR_PX = 3.0
-"""What comes no nearer to the mark's edge in the picture leaves it in full view."""
+"""Minimum distance from the marker's edge in the image of objects that leave it in full view, px.
+"""
 
 
-def crowd(random: np.random.Generator) -> Clutter:
-    """The lab, with things in it that could be taken for the mark or hide it."""
+def make_clutter(random: np.random.Generator) -> Clutter:
+    """Make the lab with random clutter similar to the marker or in front of it."""
 
     def place() -> tuple[float, float, float]:
         x, y, z = random.normal(MIDDLE_M, SPREAD_M).tolist()
@@ -135,7 +133,7 @@ def crowd(random: np.random.Generator) -> Clutter:
 
 
 def gestures(scene: Scene, random: np.random.Generator) -> Iterator[FingerPath]:
-    """Gestures in any order, for ever."""
+    """Yield random gestures endlessly."""
     names = list(GESTURES)
     while True:
         name = names[int(random.integers(len(names)))]
@@ -161,7 +159,7 @@ def exposures(
 
 
 def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
-    """Return whether nothing comes between the mark and either camera, nor runs into it."""
+    """Return whether no object overlaps or touches the marker in either view."""
     clutter = camera.clutter
     blobs: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     things: list[tuple[str, Trajectory, Trajectory, float]] = [
@@ -177,7 +175,7 @@ def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
 
 
 def _gap_px(eye: Eye, tip: Floats, start: Floats, end: Floats, radius_m: float) -> float:
-    """Between the mark's edge and that of a straight thing, in the picture, lens left out."""
+    """Return the undistorted image distance between the edges of marker and object, px."""
     in_camera = apply(eye.camera_from_world, np.stack([tip, start, end]))
     slopes = in_camera[:, :2] / in_camera[:, 2:]
     way = slopes[2] - slopes[1]
@@ -190,7 +188,7 @@ def _gap_px(eye: Eye, tip: Floats, start: Floats, end: Floats, radius_m: float) 
 
 @dataclass
 class Tally:
-    """What came of some frames."""
+    """Counts and errors over frames."""
 
     frames: int = 0
     valid: int = 0
@@ -257,10 +255,10 @@ class Tally:
         }
 
 
-def tallied(seen: list[DiscCutouts], scene: Scene, seed: int) -> Tally:
-    """Judge one sequence; what comes before its first valid fingertip is no outage."""
+def evaluate_sequence(seen: list[ObservedFrame], scene: Scene, seed: int) -> Tally:
+    """Evaluate one sequence, from its first valid fingertip."""
     tally = Tally(frames=len(seen))
-    before: DiscCutouts | None = None
+    before: ObservedFrame | None = None
     clear_since_s: float | None = None
     out = False
     for one in seen:
@@ -309,11 +307,11 @@ def tallied(seen: list[DiscCutouts], scene: Scene, seed: int) -> Tally:
     return tally
 
 
-def _jump(before: DiscCutouts, after: DiscCutouts) -> tuple[float, float, float]:
-    """How much further the fingertip went than the finger did, m, and its standard deviation.
+def _jump(before: ObservedFrame, after: ObservedFrame) -> tuple[float, float, float]:
+    """Return the fingertip's motion beyond the finger's, m, and its standard deviations.
 
-    Two of them: of the difference of the two positions as a whole (root of the trace of the sum of
-    both covariances), and along its way.
+    The first is that of the whole difference (root of the trace of the sum of both covariances),
+    the second that along the motion.
     """
     assert before.fingertip is not None
     assert after.fingertip is not None
@@ -325,11 +323,11 @@ def _jump(before: DiscCutouts, after: DiscCutouts) -> tuple[float, float, float]
     return beyond_m, float(np.sqrt(np.trace(both))), float(np.sqrt(along @ both @ along))
 
 
-async def follow(seed: int, count: int) -> tuple[list[DiscCutouts], TruePathCase]:
-    """One sequence of frames, all of it drawn from its seed."""
+async def follow(seed: int, count: int) -> tuple[list[ObservedFrame], TruePathCase]:
+    """Simulate one sequence of frames from its seed."""
     scene, random = bench_scene(), np.random.default_rng(seed)
     alone = twin_camera(scene, CLUTTER["lab"], seed=seed)
-    crowded = twin_camera(scene, crowd(random), seed=seed)
+    crowded = twin_camera(scene, make_clutter(random), seed=seed)
     length_s = 1.1 * count / scene.camera.rate_hz
     paths = []
     for path in gestures(scene, random):
@@ -343,11 +341,11 @@ async def follow(seed: int, count: int) -> tuple[list[DiscCutouts], TruePathCase
 
 def run(seed: int, count: int) -> Tally:
     seen, _ = asyncio.run(follow(seed, count))
-    return tallied(seen, bench_scene(), seed)
+    return evaluate_sequence(seen, bench_scene(), seed)
 
 
 def endure(frames: int, *, processes: int, first_seed: int = 1) -> Tally:
-    """Sequences of SEQUENCE_FRAMES, each in a process of a pool."""
+    """Simulate sequences of SEQUENCE_FRAMES in a pool of processes."""
     counts = [SEQUENCE_FRAMES] * (frames // SEQUENCE_FRAMES)
     if frames % SEQUENCE_FRAMES:
         counts.append(frames % SEQUENCE_FRAMES)

@@ -1,13 +1,13 @@
-"""How tracking fails: error against severity for each way in which a fingertip can be lost.
+"""Measure how tracking fails: error against severity for each kind of disturbance.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_limits [--quick] [--json] [NAME...]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_limits [--quick] [--json] [NAME...]
 
-Each failure is brought about in the twin's camera: a finger is followed for half a second, then it
-comes about for a while at one severity, then it is over.  Of the frames meanwhile: the share that
-is valid, the reasons of the others, the errors of those that are valid, in mm and in their own
-stated standard deviations (the track's covariance and the calibration's), and after it the time
-from the first undisturbed picture to the next valid fingertip.  Draws `docs/charts/limits-*.svg`
-and prints tables; some ten minutes, with --quick one of six repetitions and no pictures.
+The simulated finger is tracked for half a second, then disturbed for some time at one severity,
+then undisturbed. For the disturbed frames the tables contain the fraction of valid ones and the
+reasons of the others. For valid ones they contain the errors in mm and in standard deviations (of
+track and calibration together). The recovery time is that from the first undisturbed image to the
+next valid fingertip. Draws `docs/charts/limits-*.svg` and prints tables. Takes some ten minutes;
+with --quick there is one repetition of six, and no charts.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from benchmarks.tracking_bench import (
     MACHINE,
     ROOT,
     WRONG_FOOTED_M,
-    DiscCutouts,
     Frame,
+    ObservedFrame,
     Observer,
     TruePathCase,
     bench_scene,
@@ -63,20 +63,20 @@ MOVE_S = 0.4
 REPETITIONS = 6
 SCREEN_M = 0.05
 SETTLED_S = 0.1
-"""A track has begun by then."""
+"""Time after which a track has started."""
 
 AFTERMATH_S = 0.3
-"""What comes so soon after a gap or a step of the clock counts as disturbed by it."""
+"""Time after a gap or a clock step that is still disturbed by it."""
 
 CHARTS = ROOT / "docs" / "charts"
 MAX_DEFOCUS_APERTURE_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
-    """What is shown: frames in order of their true times, those in [begins_s, ends_s) disturbed.
+class Scenario:
+    """Frames in order of their true times; those in [begins_s, ends_s) are disturbed.
 
-    calibration: None where the scene's optics are exact.
+    calibration: None if the scene's optics are exact.
     """
 
     motion: TruePathCase
@@ -87,15 +87,15 @@ class Stage:
     calibration: Path | None = CALIBRATION_FILE
 
 
-Setting = Callable[[Scene, float, int], Stage]
-"""The stage of a failure, at a severity, in a repetition."""
+Setting = Callable[[Scene, float, int], Scenario]
+"""Function that makes the scenario of a failure, by severity and repetition."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One way to lose a fingertip.
+    """Kind of disturbance.
 
-    severities: from mild to severe; for some there are two directions.
+    severities: from mild to severe; some have two directions.
     """
 
     title: str
@@ -106,11 +106,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What comes out at one severity; errors are of valid fingertips, None where there are none.
+    """Results at one severity; errors are of valid fingertips, None if there are none.
 
-    wrong: valid fingertips farther than 5 mm from the finger.
-    recovery_ms: from the first undisturbed picture to the next valid fingertip, median and largest;
-        None where nothing was lost or the disturbance has no end.
+    wrong: number of valid fingertips more than 5 mm from the finger.
+    recovery_ms: time from the first undisturbed image to the next valid fingertip, median and
+        maximum; None if no frame was lost or the disturbance does not end.
     """
 
     severity: float
@@ -137,40 +137,40 @@ def clean() -> TwinCamera:
 def times(
     scene: Scene, until_s: float, *, since_s: float = 0.0, rate_hz: float = 0.0
 ) -> list[float]:
-    """Middles of exposures, at the camera's own rate if no other is given."""
+    """Return middles of exposures, by default at the camera's rate."""
     period_s = 1.0 / (rate_hz or scene.camera.rate_hz)
     return [float(t) for t in np.arange(since_s, until_s - 1e-9, period_s)]
 
 
 def drawing(scene: Scene, repetition: int) -> TruePathCase:
-    """A finger that draws circles before the sheet at 86 mm/s."""
+    """Make a finger that draws circles in front of the sheet at 86 mm/s."""
     motion = path_motion(circle(scene), scene, seed=repetition)
     start_s = 1.5 + 0.7 * repetition
     return lambda time_s: motion(start_s + time_s)
 
 
 def reaching(scene: Scene, repetition: int) -> TruePathCase:
-    """A finger that reaches to and fro, at up to 0.35 m/s."""
+    """Make a finger that reaches back and forth, at up to 0.35 m/s."""
     motion = path_motion(reach(scene, seed=repetition + 1), scene, seed=repetition)
     return lambda time_s: motion(0.1 + time_s)
 
 
-def passing(scene: Scene, motion: TruePathCase, change: Callable[[Frame], Frame]) -> Stage:
-    """An undisturbed finger, a change of the frames for some time, and the finger again."""
+def passing(scene: Scene, motion: TruePathCase, change: Callable[[Frame], Frame]) -> Scenario:
+    """Make a scenario of an undisturbed finger, disturbed frames, and undisturbed frames again."""
     ends_s = BEFORE_S + DURING_S
     frames = [
         change(frame) if BEFORE_S <= frame.time_s < ends_s else frame
         for frame in (Frame(t, clean()) for t in times(scene, ends_s + AFTER_S))
     ]
-    return Stage(motion, frames, BEFORE_S, ends_s, scene)
+    return Scenario(motion, frames, BEFORE_S, ends_s, scene)
 
 
 def before(camera: TwinCamera) -> Callable[[Frame], Frame]:
     return lambda frame: replace(frame, camera=camera)
 
 
-def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Stage:
-    """Something dark with a straight edge, so many radii from the mark's centre, hides the rest."""
+def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Scenario:
+    """Occlude one view by a straight dark edge at a distance from the marker's centre, in radii."""
     middle_m = edge * MARKER_RADIUS_M + SCREEN_M
     ends = [FixedPoint((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
     screen = Occluder(ends[0], ends[1], SCREEN_M, level=30.0, carried=True, views="right")
@@ -178,8 +178,8 @@ def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Stage:
     return passing(scene, drawing(scene, repetition), before(camera))
 
 
-def off_the_edge(scene: Scene, distance_px: float, repetition: int) -> Stage:
-    """The right camera reads a region out that begins so far from the mark's centre."""
+def off_the_edge(scene: Scene, distance_px: float, repetition: int) -> Scenario:
+    """Crop the right view at a distance from the marker's centre."""
     motion = drawing(scene, repetition)
     right = clean().eyes[1]
 
@@ -190,13 +190,13 @@ def off_the_edge(scene: Scene, distance_px: float, repetition: int) -> Stage:
     return passing(scene, motion, cut)
 
 
-def with_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
+def with_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Scenario:
     camera = _camera(second_marker((1e-3 * distance_mm, 0.0, 0.0)))
     return passing(scene, drawing(scene, repetition), before(camera))
 
 
-def hidden_beside_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
-    """The second mark is there all the time, and alone while the finger's is hidden."""
+def hidden_beside_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Scenario:
+    """Hide the finger's marker while a second marker is always in view."""
     camera = _camera(second_marker((1e-3 * distance_mm, 0.0, 0.0)))
     stage = passing(
         scene, drawing(scene, repetition), lambda frame: replace(frame, camera=camera, marker=False)
@@ -208,13 +208,13 @@ def hidden_beside_a_second_mark(scene: Scene, distance_mm: float, repetition: in
     return replace(stage, frames=frames)
 
 
-def touched_by_a_highlight(scene: Scene, overlap: float, repetition: int) -> Stage:
+def touched_by_a_highlight(scene: Scene, overlap: float, repetition: int) -> Scenario:
     camera = _camera(touching_highlight(overlap))
     return passing(scene, drawing(scene, repetition), before(camera))
 
 
-def beyond_the_volume(scene: Scene, beyond_mm: float, repetition: int) -> Stage:
-    """A finger held still goes to the right, to so far beyond where fingers can be, and back."""
+def beyond_the_volume(scene: Scene, beyond_mm: float, repetition: int) -> Scenario:
+    """Move a resting finger to the right, beyond the volume by a distance, and back."""
     still = path_motion(hover(scene), scene, seed=repetition)
     way_m = float(scene.finger.volume_max_m[0]) + 1e-3 * beyond_mm
     leaves_s, returns_s = BEFORE_S + MOVE_S, BEFORE_S + MOVE_S + DURING_S
@@ -225,11 +225,11 @@ def beyond_the_volume(scene: Scene, beyond_mm: float, repetition: int) -> Stage:
         return np.asarray(still(1.0 + time_s) + np.array([way_m * (out - back), 0.0, 0.0]))
 
     frames = [Frame(t, clean()) for t in times(scene, returns_s + MOVE_S + AFTER_S)]
-    return Stage(motion, frames, leaves_s, returns_s, scene)
+    return Scenario(motion, frames, leaves_s, returns_s, scene)
 
 
-def with_a_short_baseline(scene: Scene, baseline_mm: float, repetition: int) -> Stage:
-    """A rig of perfect optics whose cameras stand so near to one another, all the time."""
+def with_a_short_baseline(scene: Scene, baseline_mm: float, repetition: int) -> Scenario:
+    """Use a rig of perfect optics with a short baseline."""
     rig = scene.camera.right_from_left.copy()
     rig[:3, 3] *= 1e-3 * baseline_mm / np.linalg.norm(rig[:3, 3])
     short = scene.model_copy(
@@ -238,7 +238,7 @@ def with_a_short_baseline(scene: Scene, baseline_mm: float, repetition: int) -> 
     camera = _exact_camera(baseline_mm, short)
     frames = [Frame(t, camera) for t in times(scene, BEFORE_S + DURING_S)]
     motion = drawing(scene, repetition)
-    return Stage(motion, frames, SETTLED_S, np.inf, short, calibration=None)
+    return Scenario(motion, frames, SETTLED_S, np.inf, short, calibration=None)
 
 
 _EXACT: dict[float, TwinCamera] = {}
@@ -256,7 +256,7 @@ def _exact_camera(baseline_mm: float, scene: Scene) -> TwinCamera:
     return _EXACT[baseline_mm]
 
 
-def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Stage:
+def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Scenario:
     motion = drawing(scene, repetition)
     depth_m = clean().eyes[0].see(motion(BEFORE_S))[1]
     aperture = Sensor(aperture_m=MAX_DEFOCUS_APERTURE_M)
@@ -264,36 +264,36 @@ def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Stage:
     return passing(scene, motion, before(_camera(Clutter(), sensor)))
 
 
-def is_overexposed(scene: Scene, exposure: float, repetition: int) -> Stage:
+def is_overexposed(scene: Scene, exposure: float, repetition: int) -> Scenario:
     camera = _camera(Clutter(), Sensor(exposure=exposure))
     return passing(scene, drawing(scene, repetition), before(camera))
 
 
-def slowed(scene: Scene, rate_hz: float, repetition: int) -> Stage:
-    """The camera's rate falls for the rest of the time."""
+def slowed(scene: Scene, rate_hz: float, repetition: int) -> Scenario:
+    """Reduce the camera's rate for the remaining time."""
     ends_s = BEFORE_S + 2.0 * DURING_S
     moments = times(scene, BEFORE_S) + times(scene, ends_s, since_s=BEFORE_S, rate_hz=rate_hz)
     frames = [Frame(t, clean()) for t in moments]
-    return Stage(reaching(scene, repetition), frames, BEFORE_S, np.inf, scene)
+    return Scenario(reaching(scene, repetition), frames, BEFORE_S, np.inf, scene)
 
 
-def interrupted(scene: Scene, gap_ms: float, repetition: int) -> Stage:
-    """No pictures for a while; what comes after is what counts."""
+def interrupted(scene: Scene, gap_ms: float, repetition: int) -> Scenario:
+    """Interrupt the images; the frames after the gap are evaluated."""
     again_s = BEFORE_S + 1e-3 * gap_ms
     moments = times(scene, BEFORE_S) + times(scene, again_s + AFTER_S, since_s=again_s)
     frames = [Frame(t, clean()) for t in moments]
-    return Stage(reaching(scene, repetition), frames, again_s, again_s + AFTERMATH_S, scene)
+    return Scenario(reaching(scene, repetition), frames, again_s, again_s + AFTERMATH_S, scene)
 
 
-def stepped(scene: Scene, step_ms: float, repetition: int) -> Stage:
-    """The camera's clock steps ahead, or back."""
+def stepped(scene: Scene, step_ms: float, repetition: int) -> Scenario:
+    """Step the camera's clock forwards or backwards."""
     start_s = 10.0  # so that no stamp is negative
     frames = [
         Frame(t, clean(), stamp_s=start_s + t + (1e-3 * step_ms if t >= BEFORE_S else 0.0))
         for t in times(scene, BEFORE_S + AFTER_S)
     ]
     motion = drawing(scene, repetition)
-    return Stage(motion, frames, BEFORE_S, BEFORE_S + AFTERMATH_S, scene)
+    return Scenario(motion, frames, BEFORE_S, BEFORE_S + AFTERMATH_S, scene)
 
 
 FAILURES: dict[str, Failure] = {
@@ -372,39 +372,39 @@ FAILURES: dict[str, Failure] = {
 }
 
 
-async def perform(stage: Stage) -> list[DiscCutouts]:
+async def run_scenario(stage: Scenario) -> list[ObservedFrame]:
     observer = await Observer(stage.scene, calibration=stage.calibration).start()
     return await observer.follow(stage.frames, stage.motion)
 
 
 def measure(name: str, severity: float, *, repetitions: int = REPETITIONS) -> Row:
-    """One severity of one failure."""
+    """Measure one severity of one disturbance."""
     scene = bench_scene()
-    shown: list[DiscCutouts] = []
+    shown: list[ObservedFrame] = []
     recoveries_ms: list[float] = []
     added = np.zeros((3, 3))
     for repetition in range(repetitions):
         stage = FAILURES[name].setting(scene, severity, repetition)
         if stage.calibration is not None:
             added = calibration_covariance(scene)
-        seen = asyncio.run(perform(stage))
+        seen = asyncio.run(run_scenario(stage))
         shown += [one for one in seen if stage.begins_s <= one.frame.time_s < stage.ends_s]
         after = [one for one in seen if one.frame.time_s >= stage.ends_s]
         if name in ("gap", "clock"):  # these are over when the next picture comes
             after = [one for one in seen if one.frame.time_s >= stage.begins_s]
         if after:
             recoveries_ms.append(recovery_ms(after))
-    return judged(severity, shown, recoveries_ms, added)
+    return evaluate(severity, shown, recoveries_ms, added)
 
 
-def recovery_ms(after: Sequence[DiscCutouts]) -> float:
-    """To the first valid fingertip; infinite if none comes."""
+def recovery_ms(after: Sequence[ObservedFrame]) -> float:
+    """Return the time to the first valid fingertip, ms; infinite if there is none."""
     back_s = next((one.frame.time_s for one in after if one.valid), np.inf)
     return 1e3 * (back_s - after[0].frame.time_s)
 
 
-def judged(
-    severity: float, shown: Sequence[DiscCutouts], recoveries_ms: Sequence[float], added: Floats
+def evaluate(
+    severity: float, shown: Sequence[ObservedFrame], recoveries_ms: Sequence[float], added: Floats
 ) -> Row:
     valid = [one for one in shown if one.valid]
     errors_mm = 1e3 * np.array([float(np.linalg.norm(one.error_m)) for one in valid])
@@ -426,7 +426,7 @@ def judged(
 
 
 def tables(results: dict[str, list[Row]]) -> str:
-    """What docs/limits.md shows, in Markdown: a table for each failure."""
+    """Format the tables of docs/limits.md as Markdown."""
     lines = []
     for name, rows in results.items():
         failure = FAILURES[name]
@@ -455,7 +455,7 @@ def tables(results: dict[str, list[Row]]) -> str:
 
 
 def draw(name: str, rows: Sequence[Row]) -> Path:
-    """One picture: errors of what is valid above, what comes out below; fit for light and dark."""
+    """Draw a chart, for light and dark themes: errors and fraction of valid fingertips."""
     import matplotlib as mpl
 
     mpl.use("svg")

@@ -1,7 +1,7 @@
 #!/bin/sh
-# Makes a key pair for each host that runs in a container and writes the public halves into the
-# launch file: docker/keys.sh LAUNCH_FILE [HOST...].  On three machines each makes its own instead
-# (docs/deploy.md): a secret key never leaves its computer.
+# Creates a key pair for each host that runs in a container, and writes the public keys into the
+# launch file: docker/keys.sh LAUNCH_FILE [HOST...].  On three machines, create the keys on each of
+# them (docs/deploy.md), so that no secret key leaves its computer.
 set -eu
 launch_file=$1
 shift
@@ -14,5 +14,5 @@ for host in "$@"; do
     fi
     FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys install "$launch_file" "$host"
 done
-# In the containers flexsheet is user 1000.
+# The user in the containers is 1000.
 [ "$(id -u)" -ne 0 ] || chown -R 1000 "$here/keys"

@@ -1,4 +1,4 @@
-"""Contain one folder per node: `node.py` wires, the modules beside it compute.
+"""Provide the nodes, one folder each: `node.py` connects ports, other modules compute.
 
 `NODES` lists the nodes that a launch file can name. A class is imported when it is used, so that a
 process does not load the libraries of other nodes.
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """Name what a node is to the launcher, the doctor and the replay, whatever its class name.
+    """Role of a node for the launcher, the doctor and the replay, independent of its class name.
 
-    A node class declares it as `role`. A class that publishes the state of an arm is an arm bridge
-    without a declaration.
+    A node class declares it as `role`. A class that publishes ArmState is an arm bridge by default.
     """
 
     ARM_BRIDGE = "arm_bridge"
@@ -50,7 +49,7 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """Report a node name that is not in the table; the message suggests one that is."""
+    """The node name is not in the table; the message suggests a similar one."""
 
     code = "unknown-node"
     remedy = "`flexsheet node list` prints all names."
@@ -59,18 +58,18 @@ class UnknownNodeError(FlexsheetError, KeyError):
 def node_class(name: str) -> type[Node]:
     """Import the class of a node type: a name of the table, or "module:Class".
 
-    Launch files and bags written before the package was named `flexsheet` name modules as
-    "nodes.planner.node"; these are found too. UnknownNodeError for any other name; ImportError or
-    AttributeError for a module or class that does not exist.
+    Module names without the package, such as "nodes.planner.node" in old launch files and bags, are
+    accepted. Raises UnknownNodeError for an unknown name, ImportError or AttributeError for a
+    missing module or class.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
     if class_name and not all(map(str.isidentifier, (*module_name.split("."), class_name))):
-        raise UnknownNodeError(f'"{name}" is no node: write "package.module:Class"')
+        raise UnknownNodeError(f'invalid node type "{name}": expected "package.module:Class"')
     if module_name.startswith("nodes."):
         module_name = f"{__package__}.{module_name.removeprefix('nodes.')}"
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
-        hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(NODES)}"
+        hint = f'; did you mean "{near[0]}"?' if near else f"; known nodes: {', '.join(NODES)}"
         raise UnknownNodeError(f'unknown node "{name}"{hint}')
     return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
-"""Cache results on disk: one file of arrays per result, whole or absent, checked when it is read.
+"""Cache results on disk: one file of arrays per result, written atomically and checked when read.
 
-A long computation stores checkpoints in a folder beside the final file. An interrupted computation
-continues from them.
+A long computation stores checkpoints in a folder beside the file, and continues from them after an
+interruption.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ Arrays = Mapping[str, NDArray[Any]]
 T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""Exceptions that reading a truncated, changed or foreign file may raise."""
+"""Exceptions that reading a truncated, modified or foreign file can raise."""
 
 CACHED_S = 1.0
-"""Steps that finish this soon after the start were cached and do not count for the time left."""
+"""Steps that finish within this time after the start were cached; the estimate excludes them."""
 MINUTE_S = 60.0
 
 
 def default_cache_dir() -> Path:
-    """Return $XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
+    """Return the user's cache directory: $XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
 
@@ -45,10 +45,10 @@ def make_digest(value: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Specification(Generic[T]):
-    """All that a cached result depends on, and how the result becomes arrays and back.
+    """Key of a cached result, and its conversion to arrays and back.
 
-    kind: of result, the first part of the file name. depends_on: a JSON value, with the version of
-    the code that computes the result. decode raises one of `DAMAGE` for arrays that it cannot use.
+    kind: first part of the file name. depends_on: JSON value of all inputs, with the version of the
+    code that computes the result. decode: raises one of `DAMAGE` for invalid arrays.
     """
 
     kind: str
@@ -57,20 +57,20 @@ class Specification(Generic[T]):
     decode: Callable[[dict[str, NDArray[Any]]], T]
 
     def path(self, cache_dir: Path | None) -> Path:
-        """Return the file of the result. cache_dir: None: the user's cache."""
+        """Return the file of the result. cache_dir: None for the user's cache."""
         return (
             cache_dir or default_cache_dir()
         ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
 
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
-        """Return the store of what an interrupted computation has finished."""
+        """Return the store for the checkpoints of the computation."""
         return CheckpointStore(self.path(cache_dir).with_suffix(".parts"))
 
 
 def cached(specification: Specification[T], cache_dir: Path | None, compute: Callable[[], T]) -> T:
-    """Return the cached result, or compute and store it, and then delete its checkpoints.
+    """Return the cached result, or compute and store it, then delete its checkpoints.
 
-    Raises OSError if the result cannot be written, and what `compute` raises.
+    Raises OSError if the result cannot be written, and the exceptions of `compute`.
     """
     result = load_cached(specification, cache_dir)
     if result is None:
@@ -81,7 +81,7 @@ def cached(specification: Specification[T], cache_dir: Path | None, compute: Cal
 
 
 def load_cached(specification: Specification[T], cache_dir: Path | None) -> T | None:
-    """Return the cached result; None if there is none, or if its file is damaged (logged)."""
+    """Return the cached result; None if the file does not exist or is damaged (logged)."""
     path = specification.path(cache_dir)
     content = load_arrays(path)
     if content is None:
@@ -101,12 +101,12 @@ def save_cached(specification: Specification[T], cache_dir: Path | None, result:
 
 
 def encode_fields(result: Any) -> dict[str, NDArray[Any]]:
-    """Return the fields of a dataclass that holds arrays only, by name."""
+    """Return the array fields of a dataclass by name."""
     return {one.name: np.asarray(getattr(result, one.name)) for one in fields(result)}
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of a file; None if there is none, or if it is damaged (logged)."""
+    """Return the arrays of a file; None if it does not exist or is damaged (logged)."""
     try:
         # Reading a member of the archive to its end verifies its CRC-32.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -119,14 +119,14 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
 
 
 def warn_damaged(path: Path, error: Exception) -> None:
-    """Log that a file cannot be used and that its content is computed again."""
+    """Log that a file is damaged and that its content is computed again."""
     structlog.get_logger().warning(
         "damaged cache file, computing it again", path=str(path), error=repr(error)
     )
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays so that a reader sees the whole file or none.
+    """Write arrays to a file atomically.
 
     Raises OSError if the file cannot be written.
     """
@@ -144,7 +144,7 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Delete the temporary files of processes that were killed while they wrote."""
+    """Delete the temporary files of processes that were killed during a write."""
     import psutil
 
     for leftover in path.parent.glob(f".{path.stem}.*.tmp"):
@@ -155,16 +155,16 @@ def _remove_leftovers(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStore:
-    """The finished parts of a computation, in a folder of their own."""
+    """Store for the finished parts of a computation, one file each in a folder."""
 
     folder: Path
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return a stored part; None as `load_arrays`."""
+        """Return a stored part; None if it does not exist or is damaged."""
         return load_arrays(self._path(name))
 
     def save(self, name: str, arrays: Arrays) -> None:
-        """Store a part. Raises OSError as `save_arrays`."""
+        """Store a part. Raises OSError if the file cannot be written."""
         save_arrays(self._path(name), arrays)
 
     def get(
@@ -186,16 +186,16 @@ class CheckpointStore:
 
 
 class EtaEstimator:
-    """Estimate the time left of a long computation from the duration of its finished steps."""
+    """Estimator of the remaining time of a long computation, from its finished steps."""
 
     def __init__(self) -> None:
         self._total = self._last = self._cached = 0
         self._start_s = 0.0
 
     def text(self, done: int, total: int, now_s: float) -> str:
-        """Return a text such as "40 %, about 3 min left" for the finished steps at time now_s.
+        """Format the progress at the time now_s, such as "40 %, about 3 min left".
 
-        Another total, or fewer finished steps than before, starts a new estimate.
+        A different total, or fewer finished steps than before, starts a new estimate.
         """
         if total != self._total or done < self._last:
             self._total, self._start_s = total, now_s

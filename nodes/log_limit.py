@@ -14,10 +14,10 @@ import structlog
 LIMITED_LEVELS = {"warning", "error", "critical"}
 REPORT_PERIOD_S = 60.0
 MAX_DISTINCT = 1000
-"""Number of distinct records that are counted; the least recent one is dropped first."""
+"""Maximum number of distinct records to count; the least recent one is dropped."""
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
-_WITHOUT_MEANING = {"exc_info", "count"}
+_IGNORED_KEYS = {"exc_info", "count"}
 
 Record = MutableMapping[str, Any]
 Key = tuple[tuple[str, str], ...]
@@ -25,24 +25,22 @@ Key = tuple[tuple[str, str], ...]
 
 @dataclass(slots=True)
 class Repeats:
-    """Count a record, and store when it was last logged (s)."""
+    """Number of repetitions of a record, and the time it was last logged, s."""
 
     count: int = 0
     logged_s: float = float("-inf")
 
 
 class RepeatLimiter:
-    """Limit repeated log records: pass only the 1st, 10th, 100th, ... of equal records.
+    """structlog processor that passes only the 1st, 10th, 100th, ... of equal records.
 
-    This class is a structlog processor.
-
-    A record that continues also passes once in REPORT_PERIOD_S. Records are equal if they differ in
-    numbers only. From the second on, a passed record has its `count` since the start of the node.
+    A repeated record also passes once in REPORT_PERIOD_S. Records that differ only in numbers are
+    equal. Repeated records that pass contain their `count` since the start of the node.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
-        self._known: OrderedDict[Key, Repeats] = OrderedDict()
+        self._repeats: OrderedDict[Key, Repeats] = OrderedDict()
 
     def __call__(self, logger: Any, method: str, record: Record) -> Record:
         if method not in LIMITED_LEVELS:
@@ -61,12 +59,12 @@ class RepeatLimiter:
         key = tuple(
             (name, _NUMBER.sub("#", str(value)))
             for name, value in sorted(record.items())
-            if name not in _WITHOUT_MEANING
+            if name not in _IGNORED_KEYS
         )
-        repeats = self._known.setdefault(key, Repeats())
-        self._known.move_to_end(key)
-        if len(self._known) > MAX_DISTINCT:
-            self._known.popitem(last=False)
+        repeats = self._repeats.setdefault(key, Repeats())
+        self._repeats.move_to_end(key)
+        if len(self._repeats) > MAX_DISTINCT:
+            self._repeats.popitem(last=False)
         return repeats
 
 

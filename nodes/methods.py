@@ -1,8 +1,8 @@
-"""Describe method families: interchangeable functions, one reference, errors in the scene's units.
+"""Define method families: interchangeable functions with one reference, for benchmarks.
 
-A node's folder holds its methods as plain functions and describes them in `FAMILY = Family(...)`.
-`launch.methods.charts` times every method, measures its error against the reference over the
-scene's working range, and draws speed against accuracy.
+A node's folder contains its methods as plain functions and a `Family` of them. The module
+`launch.methods.charts` plots the time of each method against its error over the scene's working
+range.
 """
 
 from __future__ import annotations
@@ -17,24 +17,23 @@ import numpy as np
 from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
-"""A trial is repeated until this total time has passed, but at least this often."""
+"""Total time after which a trial is not repeated further, and minimum number of repetitions."""
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
-"""The conditions of a measurement, in the scene's units: {"depth_mm": 10}."""
+"""Conditions of a measurement by name: {"depth_mm": 10}."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One measurable use of one method: `run` is timed, `error` evaluates its result.
+    """Measurement of one method at one case: `run` is timed, `error` evaluates its result.
 
-    case: the conditions; methods are compared at equal cases.
     error: takes the result of `run`, returns the error in the family's unit.
-    in_range: whether the method's stated range covers this case.
-    in_scene: whether the scene's working range includes this case; others show where methods end.
-    size: the size of the method's problem ({"skin_nodes": 1210}), reported with the case.
-    extra_metrics: further figures of the result of `run`, with units in their names.
-    reference_uncertainty: of the reference itself, for the error ("error") and for extra metrics.
+    in_range: whether the method's valid range includes the case.
+    in_scene: whether the scene's working range includes the case.
+    size: size of the method's problem ({"skin_nodes": 1210}), reported with the case.
+    extra_metrics: computes further figures of the result of `run`, with units in their names.
+    reference_uncertainty: uncertainty of the reference for "error" and for extra metrics.
     """
 
     method: str
@@ -49,18 +48,18 @@ class Trial:
 
 
 def prepare_nothing(scene: Scene, on_progress: Progress) -> None:
-    """Do nothing, for a family whose trials need no long computation."""
+    """Do nothing: default of `Family.prepare`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """A set of interchangeable methods.
+    """Set of interchangeable methods.
 
-    trials: yields the trials of every method over a scene's working range. A trial may be run until
+    trials: yields the trials of every method over a scene's working range; each must be run before
         the next one is requested.
-    tolerance: the scene's tolerance, in `unit`.
-    sweep_key: the key of the case over which errors are drawn in a diagram of their own, if any.
-    prepare: computes and caches what takes long and `trials` needs; reports done and total steps.
+    tolerance: returns the scene's tolerance, in `unit`.
+    sweep_key: key of the case for a separate plot of the errors; None for no such plot.
+    prepare: computes and caches the data that `trials` uses; reports done and total steps.
     """
 
     name: str
@@ -75,10 +74,9 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """The measured time and error of one method at one case.
+    """Measured time and error of one method at one case; see `Trial`.
 
-    params: the case and the method's size together. in_scene, extra_metrics,
-    reference_uncertainty: as of its trial.
+    params: the case with the size of the method's problem.
     """
 
     method: str
@@ -94,7 +92,7 @@ class Point:
 
 
 def measure(trial: Trial, *, repeats: int) -> Point:
-    """Time `trial.run` `repeats` times after one warm-up run, and evaluate its result.
+    """Time `repeats` runs of a trial after a warm-up run, and evaluate the result.
 
     Slow trials are repeated less often, see `MAX_TRIAL_S`.
     """
@@ -120,17 +118,15 @@ def measure(trial: Trial, *, repeats: int) -> Point:
     )
 
 
-def clip_range(largest: float, usual: Sequence[float]) -> tuple[float, ...]:
-    """Return the usual values within a working range, and the end of the range."""
-    within = [value for value in usual if value < largest * (1.0 - 1e-6)]
-    return (*within, largest)
+def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
+    """Return the values below the end of a working range, and that end."""
+    return (*(value for value in values if value < end * (1.0 - 1e-6)), end)
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
     """Return the methods that no other method dominates in at least one case of their range.
 
-    Cases are compared one by one: a cheap method is often exact for small cases and useless for
-    others. The fastest method is first, by the slowest median of each.
+    Methods are compared at equal cases only, and sorted by the maximum of their median times.
     """
     usable = [point for point in points if point.in_range]
     front = {
@@ -142,7 +138,7 @@ def pareto_front(points: Sequence[Point]) -> list[str]:
 
 
 def dominates(one: Point, other: Point) -> bool:
-    """Return whether a method is as fast and as exact as another, and better in one of the two."""
+    """Return whether a method is at least as fast and exact as another, and not equal to it."""
     return (
         one.median_s <= other.median_s
         and one.error <= other.error

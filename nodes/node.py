@@ -1,7 +1,7 @@
-"""Define the base class of nodes: ports are annotations, handlers are found by name.
+"""Define the base class of nodes: ports are annotations, handlers are methods named after ports.
 
     class Follower(Node):
-        "Publish a sheet target one hand's breadth above the finger."
+        "Publish a sheet target 10 cm above the finger."
 
         parameters: FollowerParameters
         fingertip: Input[Fingertip]
@@ -10,10 +10,10 @@
         def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
             self.sheet_target.publish(..., source_ns=header.source_ns)
 
-A node knows no sockets.  It gets parameters, a clock and a function that sends its messages.  The
-same class therefore runs live (`nodes.runner`), in replay and in a unit test.  Handlers are plain
-functions or coroutines.  A coroutine handler never runs twice at once.  On a `latest` topic it
-skips messages that were superseded while it ran.
+A node does not use sockets.  Its arguments are parameters, a clock and a function that sends
+messages.  The same class therefore runs live (`nodes.runner`), in replay and in a unit test.
+Handlers are functions or coroutines.  Only one call of a coroutine handler runs at a time.  On a
+`latest` topic it skips messages that were superseded during its last call.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
 MAX_LOG_ROWS = 20_000
 RESEND_NS = 5_000_000_000
-"""For this long after the start each status repeats the whole log, for late recorders."""
+"""Time after the start in which each status contains the full log, for late recorders."""
 
 
 class NodeParameters(LimitedModel):
-    """Hold a node's parameters; subclasses declare theirs, with units in the names and defaults."""
+    """Base class of a node's parameters, which subclasses declare as fields with defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(slots=True)
 class PortCounts:
-    """Count the messages of a port, for the status message."""
+    """Counters of a port, for the status message."""
 
     messages: int = 0
     dropped: int = 0
@@ -101,7 +101,7 @@ class PortCounts:
 
 
 class ExecutionLog:
-    """Log the handler calls of a node, in order, for a replay.
+    """Log of a node's handler calls in order, for a replay.
 
     Rows are those of `flexsheet.messages.types.Status.execution_log`.
     """
@@ -118,7 +118,7 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the rows (n, 4), and delete them once RESEND_NS have passed since the start."""
+        """Return the rows (n, 4); delete them if RESEND_NS have passed since the start."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
@@ -126,9 +126,9 @@ class ExecutionLog:
 
 
 class Input(Generic[M]):
-    """Hold the latest message of a subscribed topic, with its header and counts.
+    """Latest message of a subscribed topic, with its header and counters.
 
-    All stamps are of this host's clock. clock_trouble: why they cannot be trusted; empty: they can.
+    All stamps are of this host's clock. clock_problem: the reason why they are not reliable, or "".
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -136,24 +136,22 @@ class Input(Generic[M]):
         self.message: M | None = None
         self.header: Header | None = None
         self.received_ns: int = 0
-        self.clock_trouble = ""
+        self.clock_problem = ""
         self.counts = PortCounts()
         self.on_accept: Callable[[Header, int], None] | None = None
         self._clock = clock
 
     def age_s(self) -> float:
-        """Return the seconds since the source stamp of the latest message; infinite before the
-        first.
+        """Return the time since the source stamp of the latest message; infinite before it.
 
-        For a clock of another host that is not measured: the seconds since the message was
-        received.
+        If the offset of the sender's clock is unknown, the age since the reception is returned.
         """
         if self.header is None:
             return float("inf")
         return (self._clock.now_ns() - self.header.source_ns) * 1e-9
 
-    def accept(self, message: M, header: Header, clock_trouble: str = "") -> None:
-        self.message, self.header, self.clock_trouble = message, header, clock_trouble
+    def accept(self, message: M, header: Header, clock_problem: str = "") -> None:
+        self.message, self.header, self.clock_problem = message, header, clock_problem
         self.received_ns = self._clock.now_ns()
         self.counts.count(header, self.received_ns)
         if self.on_accept is not None:
@@ -161,7 +159,7 @@ class Input(Generic[M]):
 
 
 class Output(Generic[M]):
-    """Publish messages of a topic, and number and stamp them."""
+    """Publisher of a topic that numbers and stamps its messages."""
 
     def __init__(
         self, topic: Topic, clock: Clock, send: Send, *, writer: str, epoch: int, plan: str
@@ -172,7 +170,7 @@ class Output(Generic[M]):
         self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
-        """Publish `message`; `source_ns` is the stamp of its source (default: now)."""
+        """Publish a message; source_ns: stamp of its source (default: now)."""
         now_ns = self._clock.now_ns()
         header = Header(
             sequence=self.counts.messages + 1,
@@ -190,7 +188,7 @@ class Output(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """Describe a declared input or output of a node class."""
+    """Declared input or output of a node class."""
 
     name: str
     direction: str
@@ -199,14 +197,14 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """Name a periodic method; `rate_parameter` names the parameter with its rate in Hz."""
+    """Periodic method; rate_parameter: name of the parameter with its rate, Hz."""
 
     method: str
     rate_parameter: str
 
 
 def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a method to be called at the rate (Hz) of the named parameter."""
+    """Decorate a method that is called at the rate (Hz) of the named parameter."""
 
     def mark(method: Callable[..., Any]) -> Callable[..., Any]:
         method.__periodic__ = rate_parameter  # type: ignore[attr-defined]  # a function attribute
@@ -215,10 +213,10 @@ def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[...
     return mark
 
 
-def ports_of(node_class: type[Node]) -> dict[str, Port]:
-    """Return the declared ports of a node class, in the order of declaration.
+def find_ports(node_class: type[Node]) -> dict[str, Port]:
+    """Return the declared ports of a node class by name, in the order of declaration.
 
-    A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file may connect
+    A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file can connect
     it to another topic of the same type.
     """
     ports = {}
@@ -231,26 +229,26 @@ def ports_of(node_class: type[Node]) -> dict[str, Port]:
 
 
 def further_port(topic_name: str) -> str:
-    """Name the port of a topic that `Node.further_inputs` returned."""
+    """Return the port name of a topic that `Node.further_inputs` returned."""
     return f"in/{topic_name}"
 
 
-def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
+def find_parameters_type(node_class: type[Node]) -> type[NodeParameters]:
     """Return the declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
-def role_of(node_class: type[Node]) -> NodeRole | None:
-    """Return the role of a node class; a class that publishes ArmState is an arm bridge."""
+def find_role(node_class: type[Node]) -> NodeRole | None:
+    """Return the declared role of a node class; ARM_BRIDGE for one that publishes ArmState."""
     publishes = {
-        port.message for port in ports_of(node_class).values() if port.direction == "output"
+        port.message for port in find_ports(node_class).values() if port.direction == "output"
     }
     if node_class.role is None and ArmState in publishes:
         return NodeRole.ARM_BRIDGE
     return node_class.role
 
 
-def timers_of(node_class: type[Node]) -> list[Timer]:
+def find_timers(node_class: type[Node]) -> list[Timer]:
     """Return the methods of a node class that are marked `@periodic`."""
     return [
         Timer(name, member.__periodic__)
@@ -260,35 +258,35 @@ def timers_of(node_class: type[Node]) -> list[Timer]:
 
 
 class Node:
-    """Base class of all nodes; see the docstring of the module."""
+    """Base class of all nodes; see the module's docstring."""
 
     parameters: NodeParameters
     status: Output[Status]
 
     takes_frames: ClassVar[bool] = False
-    """Whether `deliver` gets each message as the frames of the wire, undecoded."""
+    """Whether `deliver` is called with the undecoded frames of each message."""
     measures_clocks: ClassVar[bool] = False
-    """Whether stamps of other hosts stay in the time of their clocks."""
+    """Whether stamps of other hosts are not converted to this host's clock."""
     role: ClassVar[NodeRole | None] = None
     opens_devices: ClassVar[bool] = False
-    """Whether it opens devices, ports or files: a replay must not start it."""
+    """Whether it opens devices, ports or files, so that a replay must not start it."""
 
     async def settle(self) -> None:
-        """Wait for work that handlers have started; a replay continues after it."""
+        """Wait for the work that handlers have started; a replay awaits it after each step."""
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        """Return why `bag verify` must not step a node with these parameters; empty: it may."""
+        """Return why `bag verify` cannot replay a node with these parameters; "" if it can."""
         if cls.opens_devices:
-            return "it uses devices of its own, whose data are not in the bag"
+            return "it reads devices, whose data are not in the bag"
         return ""
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
-        """Name the topics to subscribe to beside the declared ports.
+        """Return the topics to subscribe to in addition to the declared ports.
 
-        For a node whose inputs depend on its parameters and on the topics that the graph writes.
-        The ports of these topics are named by `further_port`.
+        written: topics that the graph writes. The ports of further topics are named by
+        `further_port`.
         """
         return ()
 
@@ -305,8 +303,9 @@ class Node:
     ) -> None:
         """Connect the ports to topics.
 
-        topics: names of topics by port, where they differ: {"arm": "arm_left"}. epoch: identifies
-        one start of the node; default: the time of the start. A replay gives its own.
+        topics: topic names by port, if they differ: {"arm": "arm_left"}.
+        epoch: identifier of one start of the node; default: the time of the start.
+        Raises TypeError for a topic of another message type.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
@@ -322,13 +321,13 @@ class Node:
         self._execution_log = ExecutionLog(clock)
         if epoch is None:
             epoch = self.started_ns
-        declared = ports_of(type(self))
+        declared = find_ports(type(self))
         for port in declared.values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
-                    f"{name}.{port.name} carries {port.message.__name__}, "
-                    f'topic "{topic.name}" carries {topic.message.__name__}'
+                    f"{name}.{port.name}: expected a topic of {port.message.__name__}, "
+                    f'found "{topic.name}" of {topic.message.__name__}'
                 )
             if port.direction == "input":
                 self.inputs[port.name] = Input(topic, clock)
@@ -353,22 +352,22 @@ class Node:
         }
 
     async def setup(self) -> None:
-        """Open devices; called once before the first message."""
+        """Open devices; the runner calls it once before the first message."""
 
     async def close(self) -> None:
-        """Release devices; called once at the end, also after an error."""
+        """Release devices; the runner calls it once at the end, also after an error."""
 
     def _handler(self, port: str) -> Handler | None:
         return getattr(self, f"on_{port}", None)
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
-        """Pass a message to the input; a plain handler runs now, a coroutine in its own task."""
-        message, header, clock_trouble = self._localised(message, header)
+        """Pass a message to its input and handler; a coroutine handler runs in a separate task."""
+        message, header, clock_problem = self._localise(message, header)
         mailbox = self._mailboxes.get(port)
         if mailbox is not None:
-            mailbox.put(message, header, clock_trouble)
+            mailbox.put(message, header, clock_problem)
             return
-        self.inputs[port].accept(message, header, clock_trouble)
+        self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             try:
@@ -377,23 +376,23 @@ class Node:
                 self.report_error(f"on_{port}", error)
 
     async def step(self, port: str, message: Message, header: Header) -> None:
-        """Pass a message to the input, and wait until its handler has ended: replay, tests."""
-        await self.take(port, *self._localised(message, header))
+        """Pass a message to its input, and await its handler; for replay and tests."""
+        await self.handle(port, *self._localise(message, header))
 
-    def _localised(self, message: Message, header: Header) -> tuple[Message, Header, str]:
+    def _localise(self, message: Message, header: Header) -> tuple[Message, Header, str]:
         if self.measures_clocks:
             return message, header, ""
         return self.clock_table.localised(message, header, self.clock.now_ns())
 
-    async def take(self, port: str, message: Message, header: Header, clock_trouble: str) -> None:
-        """Do as `step`, with a message whose stamps are of this clock already."""
-        self.inputs[port].accept(message, header, clock_trouble)
+    async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
+        """Pass a message with stamps of this clock to its input, and await its handler."""
+        self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or timer; count, log and report an exception in the status."""
+        """Call a handler or timer; an exception is counted, logged and reported in the status."""
         try:
             result = function(*arguments)
             if inspect.isawaitable(result):
@@ -406,23 +405,23 @@ class Node:
         return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
-        """Call the method of one of `timers_of` the node."""
+        """Call a periodic method and log the call."""
         if not self.opens_devices:
             self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error, store it for the status, and log it with its traceback."""
+        """Count an error, report it in the status, and log it with its traceback."""
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
         self.log.error("handler failed", what=what, error=str(error), exc_info=error)
 
     def is_superseded(self, port: str) -> bool:
-        """Return whether a newer message waits for a port's coroutine handler; from any thread."""
+        """Return whether a newer message waits for a port's coroutine handler; thread-safe."""
         return self._mailboxes[port].has_waiting
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
-        """Return the tasks in which coroutine handlers run, for the runner to end."""
+        """Return the tasks in which coroutine handlers run."""
         return [box.task for box in self._mailboxes.values() if box.task is not None]
 
     def stop_mailboxes(self) -> None:
@@ -431,7 +430,7 @@ class Node:
 
 
 class Mailbox:
-    """Queue messages for a coroutine handler: the latest one, or a bounded number of all."""
+    """Queue of messages for a coroutine handler: the latest one, or a bounded number."""
 
     def __init__(self, node: Node, port: str) -> None:
         self._node, self._port = node, port
@@ -442,7 +441,7 @@ class Mailbox:
         self._waiting: deque[tuple[Message, Header, str]] = deque()
         self.task: asyncio.Task[None] | None = None
 
-    def put(self, message: Message, header: Header, clock_trouble: str) -> None:
+    def put(self, message: Message, header: Header, clock_problem: str) -> None:
         if len(self._waiting) >= self._capacity:
             self._waiting.popleft()
             self._input.counts.dropped += 1
@@ -450,18 +449,18 @@ class Mailbox:
                 self._node.report_error(
                     f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
                 )
-        self._waiting.append((message, header, clock_trouble))
+        self._waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():
             self.task = asyncio.get_running_loop().create_task(self._drain())
 
     @property
     def has_waiting(self) -> bool:
-        """Return whether a message waits whose handler has not begun."""
+        """Return whether a message is in the queue."""
         return bool(self._waiting)
 
     async def _drain(self) -> None:
         while self._waiting:
-            await self._node.take(self._port, *self._waiting.popleft())
+            await self._node.handle(self._port, *self._waiting.popleft())
 
     def stop(self) -> None:
         if self.task is not None:

@@ -1,4 +1,4 @@
-"""Mark node parameters by type, so that the launcher knows their use whatever they are called."""
+"""Define annotated types of node parameters, by which the launcher identifies their use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """What the launcher does with a parameter's value."""
+    """Use of a parameter's value."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"
@@ -23,13 +23,13 @@ class ParameterMark(StrEnum):
 
 
 ListenPort = Annotated[int, Field(ge=0, le=65535), ParameterMark.LISTEN_PORT]
-"""TCP port on which the node listens; 0 lets the system choose."""
+"""TCP port on which the node listens; 0 for any free port."""
 
 DeviceHost = Annotated[str, ParameterMark.DEVICE_HOST]
 """IP address of the device that the node controls."""
 
 DevicePort = Annotated[int, Field(ge=1, le=65535), ParameterMark.DEVICE_PORT]
-"""Port at which the device listens."""
+"""TCP port of the device."""
 
 DeviceFile = Annotated[str, ParameterMark.DEVICE_FILE]
 """Path of a device file, or the URL of a stream; the doctor checks that a path exists."""
@@ -45,9 +45,9 @@ ParameterKey = tuple[str | int, ...]
 
 
 def find_marked(parameters: BaseModel, mark: ParameterMark) -> dict[ParameterKey, Any]:
-    """Return the values of the marked parameters by key, without those that are None.
+    """Return the values of the marked parameters by key, except None.
 
-    Nested models, unions and sequences are searched too.
+    Nested models, unions and sequences are included.
     """
     return {key: value for key, value in _search_fields(parameters, (), mark) if value is not None}
 

@@ -1,6 +1,6 @@
-"""Runs one node live: connects its ports to sockets, runs its timers and publishes its status.
+"""Run one node live: connect its ports to sockets, run its timers and publish its status.
 
-The launcher writes a `NodeConfig` to a file and starts one process per node with it; a test may
+The launcher writes a `NodeConfig` to a file and starts one process per node with it; a test can
 call `run_node` in its own loop.
 """
 
@@ -30,7 +30,7 @@ from flexsheet.messages.topics import Delivery, Topic, topic_named
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.log_limit import RepeatLimiter
-from flexsheet.nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from flexsheet.nodes.node import Node, PortCounts, Timer, find_parameters_type, find_timers
 from flexsheet.nodes.signals import handle_signals
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -40,9 +40,9 @@ KEYS_PERIOD_S = 1.0
 
 
 class PortConfig(BaseModel):
-    """One port of a node: the topic it is connected to and where.
+    """Port of a node, its topic and its endpoints.
 
-    endpoints: ZeroMQ endpoints; those of an input can name the writer expected there.
+    endpoints: ZeroMQ endpoints; those of an input can name the expected writer.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -55,9 +55,9 @@ class PortConfig(BaseModel):
 class NodeConfig(BaseModel):
     """Configuration of one node's process.
 
-    keys_file: the file of a `KeyRing`; None: there are no keys.
-    estop_resetters: writers that may reset an e-stop; None: all.
-    clocks: the topic on which the host's clock node reports other hosts' clocks; None: one host.
+    keys_file: file of a `KeyRing`; None for no encryption.
+    estop_resetters: writers that may reset an e-stop; None for all.
+    clocks: topic with the offsets of other hosts' clocks; None for a single host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -76,7 +76,7 @@ class NodeConfig(BaseModel):
 
 
 class NodeTransport:
-    """The sockets of one node, by topic (outputs) and by port (inputs)."""
+    """Sockets of one node, by topic (outputs) and by port (inputs)."""
 
     def __init__(self, config: NodeConfig, log: Any) -> None:
         self._config, self._log = config, log
@@ -91,19 +91,19 @@ class NodeTransport:
             if output.endpoints:
                 topic = topic_named(output.topic)
                 endpoints = [str(one) for one in output.endpoints]
-                refused = self._refusals(node.outputs[output.port].counts, topic)
+                on_refused = self._make_refusal_handler(node.outputs[output.port].counts, topic)
                 self._publishers[topic.name] = Publisher(
-                    topic, endpoints, keys=self.keys, on_refused=refused
+                    topic, endpoints, keys=self.keys, on_refused=on_refused
                 )
 
-    def _refusals(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
-        """Count and log refused connections."""
+    def _make_refusal_handler(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
+        """Return a function that counts and logs refused connections."""
 
-        def refused(text: str) -> None:
+        def on_refused(text: str) -> None:
             counts.rejected += 1
             self._log.warning("output", topic=topic.name, problem=text)
 
-        return refused
+        return on_refused
 
     def open_inputs(self, node: Node) -> None:
         if self._config.clocks is not None:
@@ -112,7 +112,7 @@ class NodeTransport:
                 self._config.clocks.endpoints,
                 lambda clocks, _: node.clock_table.update(clocks),
                 PortCounts(),
-                on_problem=partial(self._tell, node),
+                on_problem=partial(self._report_problem, node),
                 plan=self._config.plan_hash,
             )
             subscriber.start()
@@ -128,10 +128,10 @@ class NodeTransport:
                 config.endpoints,
                 deliver_to(config.port),
                 node_input.counts,
-                on_problem=partial(self._tell, node),
+                on_problem=partial(self._report_problem, node),
                 unopened=node.takes_frames,
                 keys=self.keys,
-                # The status of nodes with another plan must be shown as well.
+                # The status of nodes with another plan must be accepted.
                 plan=None
                 if node_input.topic.message in (Status, HostStatus)
                 else self._config.plan_hash,
@@ -143,7 +143,7 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket that stops a node with devices although its launcher does not respond."""
+        """Open a socket that stops a node with devices even if its launcher does not respond."""
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -153,7 +153,7 @@ class NodeTransport:
         self._stop_socket = StopSocket(Path(self._config.run_dir), "node", node.name, stop)
         self._stop_socket.open()
 
-    def _tell(self, node: Node, text: str) -> None:
+    def _report_problem(self, node: Node, text: str) -> None:
         node.last_error = text
         self._log.warning("input", problem=text)
 
@@ -167,14 +167,14 @@ class NodeTransport:
             if not permits or header.writer in allowed:
                 return None
             return (
-                f"{header.writer} may not reset an e-stop or let the arms move; the launch file "
-                "says whose hosts may: hosts.NAME.may_reset_estop"
+                f"{header.writer} may not reset an e-stop or enable the arms; set "
+                "hosts.NAME.may_reset_estop of its host in the launch file"
             )
 
         return rejection_reason
 
     def renew_keys(self) -> None:
-        """Read the keys again if they have changed, and reconnect the sockets concerned."""
+        """Reload the keys if they have changed, and reconnect the affected sockets."""
         if self.keys is None:
             return
         try:
@@ -206,7 +206,7 @@ class NodeTransport:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on an absolute grid; skip calls that are already late."""
+    """Call a node's periodic method on a fixed time grid; skip calls that are late."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -219,27 +219,27 @@ async def run_timer(node: Node, number: int, timer: Timer) -> None:
         await asyncio.sleep(due_s - now_s)
 
 
-async def run_keys(links: NodeTransport) -> None:
-    """Check once a second whether keys have changed."""
+async def run_key_reload(transport: NodeTransport) -> None:
+    """Reload changed keys, once a second."""
     while True:
         await asyncio.sleep(KEYS_PERIOD_S)
-        links.renew_keys()
+        transport.renew_keys()
 
 
 async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
-    """Publish the node's status once a second, and signal the launcher that the loop runs."""
+    """Publish the node's status and send a heartbeat to the launcher, once a second."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
-        node.status.publish(status_of(node, "running", process))
+        node.status.publish(make_status(node, "running", process))
         beat()
 
 
-def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
-    """Make the status message with rates, ages, drops and errors of every port.
+def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
+    """Make the status message of a node.
 
-    Degraded: an error, a rejection or a gap since the last status, gaps of `latest` topics
-    excepted.
+    The state is "degraded" after an error, a rejection or a gap (except on a `latest` topic) since
+    the last status.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -267,58 +267,58 @@ def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
 
 
 async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
-    """Build the node, connect it, and run it until `stop` is set or a task of it fails."""
+    """Build and connect a node, and run it until `stop` is set or one of its tasks fails."""
     class_ = node_class(config.type)
     log = structlog.get_logger().bind(node=config.name)
-    links = NodeTransport(config, log)
+    transport = NodeTransport(config, log)
     node = class_(
-        parameters_of(class_).model_validate(config.parameters),
+        find_parameters_type(class_).model_validate(config.parameters),
         name=config.name,
         clock=SystemClock(),
-        send=links.send,
+        send=transport.send,
         topics={port.port: port.topic for port in (*config.inputs, *config.outputs)},
         plan_hash=config.plan_hash,
     )
     process = psutil.Process()
     tasks: list[asyncio.Task[Any]] = []
     try:
-        links.open_outputs(node)
+        transport.open_outputs(node)
         await node.setup()
     except BaseException:
-        links.close()
+        transport.close()
         raise
     try:
-        links.open_inputs(node)
+        transport.open_inputs(node)
         tasks = [
             asyncio.create_task(run_timer(node, number, timer))
-            for number, timer in enumerate(timers_of(class_))
+            for number, timer in enumerate(find_timers(class_))
         ]
         heartbeat = Heartbeat(config.ready_fd)
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
-        if links.keys is not None:
-            tasks.append(asyncio.create_task(run_keys(links)))
-        # Without this the collector would scan the objects made by `setup` while the node runs.
+        if transport.keys is not None:
+            tasks.append(asyncio.create_task(run_key_reload(transport)))
+        # This excludes the objects made by `setup` from garbage collection while the node runs.
         gc.collect()
         gc.freeze()
         heartbeat.beat()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
-        node.status.publish(status_of(node, "stopping", process))
+        node.status.publish(make_status(node, "stopping", process))
     finally:
         await end_tasks([*tasks, *node.mailbox_tasks()])
         try:
             await node.close()
         finally:
-            links.close()
+            transport.close()
 
 
 async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
-    """Cancel tasks until they have ended.
+    """Cancel tasks repeatedly until they have ended.
 
-    A library within a handler can suppress a cancellation, as `wait_for` of Python 3.11 does when
-    its result arrives at the same moment.
+    A handler can suppress a cancellation: `wait_for` of Python 3.11 does so if its result arrives
+    at the same moment.
     """
     pending = {task for task in tasks if not task.done()}
     while pending:
@@ -328,9 +328,9 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """The pipe to the launcher: the first byte reports that the node is ready, others that it runs.
+    """Pipe to the launcher: the first byte reports that the node is ready, others that it runs.
 
-    fd: the pipe's end; None without a launcher.  Writing never blocks.
+    fd: write end of the pipe; None without a launcher.  Writing never blocks.
     """
 
     def __init__(self, fd: int | None) -> None:
@@ -340,7 +340,7 @@ class Heartbeat:
 
     def beat(self) -> None:
         if self._fd is not None:
-            # A full pipe holds enough beats.  If the launcher has ended, its lifeline ends this
+            # A full pipe contains enough bytes.  If the launcher has ended, its lifeline ends this
             # process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
@@ -349,13 +349,13 @@ class Heartbeat:
 async def run_until_signal(config: NodeConfig) -> None:
     """Run the node until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    # The kernel and the lifeline each send a signal when the launcher has ended.
+    # If the launcher ends, the kernel and the lifeline each send a signal.
     with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
         await run_node(config, stop)
 
 
 def main(config_path: str) -> int:
-    """Run a node's process and return its exit code."""
+    """Run a node from its configuration file, and return the exit code of the process."""
     config = NodeConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[
@@ -370,7 +370,9 @@ def main(config_path: str) -> int:
     try:
         uvloop.run(run_until_signal(config))
     except Exception as error:
-        # The last point that can log why the process ends; the launcher reads the exit code.
-        structlog.get_logger().error("node ends", node=config.name, error=str(error), exc_info=True)
+        # Nothing else logs why the process ends; the launcher reads the exit code.
+        structlog.get_logger().error(
+            "node failed", node=config.name, error=str(error), exc_info=True
+        )
         return 1
     return 0

@@ -1,4 +1,4 @@
-"""Signals that end a process, handled by its event loop."""
+"""Handle the signals that end a process in its event loop."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from contextlib import contextmanager
 def handle_signals(
     handler: Callable[[], object], *numbers: int, ignore_afterwards: bool = False
 ) -> Iterator[None]:
-    """Call `handler` in the running loop at each of these signals; then restore their actions.
+    """Call `handler` in the running loop for each of these signals, until the context ends.
 
-    ignore_afterwards: ignore them instead, for a process that ends next and has to tidy up.
+    ignore_afterwards: then ignore the signals instead of restoring their actions, for a process
+        that ends after its clean-up.
 
-    A loop that removes its handler of SIGINT installs Python's own, which raises an exception in
-    whatever runs.  So the signals are blocked until the former actions are back.
+    A loop that removes its handler of SIGINT installs Python's default, which raises an exception.
+    The signals are therefore blocked until the former actions are restored.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}
@@ -35,7 +36,7 @@ def handle_signals(
 
 @contextmanager
 def keyboard_interrupts() -> Iterator[None]:
-    """Let SIGINT raise KeyboardInterrupt meanwhile, for what has to be cleaned up after it."""
+    """Make SIGINT raise KeyboardInterrupt until the context ends."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

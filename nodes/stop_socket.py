@@ -1,8 +1,8 @@
-"""Take e-stops on a unix socket of a launcher or a node.
+"""Receive e-stops on a unix socket of a launcher or a node.
 
-Command-line tools share one endpoint of the topic `estop`, which one of them may occupy. Any number
-of them can connect to this socket at once. Each sends one packet and receives one. The module
-imports nothing that is slow to load.
+Only one command-line tool at a time can use their shared endpoint of the topic `estop`, but any
+number can connect to this socket. Each sends one packet and receives one. The module imports only
+light modules, so that these tools start quickly.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ Kind = Literal["launcher", "node"]
 REQUEST, ANSWER = b"stop ", b"stopped"
 MAX_REQUEST_BYTES = 4096
 MAX_CONNECTIONS = 32
-"""At more silent connections, the oldest is closed for a new one."""
+"""Maximum number of open connections; a further one closes the oldest."""
 
 _PEER = struct.Struct("3i")
 
 
 class StopSocket:
-    """Call `on_stop(reason)` for each e-stop, between `open` and `close`.
+    """Unix socket that calls `on_stop(reason)` for each received e-stop.
 
-    The directory of the run and the socket are closed to other users. A peer must be this user or
-    root as well.
+    Only this user and root may connect.
     """
 
     def __init__(
@@ -40,7 +39,7 @@ class StopSocket:
         self._connections: list[socket.socket] = []
 
     def open(self) -> None:
-        """Listen; needs a running loop. OSError for a path that is too long."""
+        """Listen in the running loop. Raises OSError if the path is too long."""
         self._path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
@@ -55,7 +54,7 @@ class StopSocket:
         self._loop.add_reader(listener.fileno(), self._accept, listener)
 
     def close(self) -> None:
-        """Stop listening and remove the socket's file; may be called twice."""
+        """Stop listening, and remove the socket's file; has no effect if it is closed."""
         if self._listener is None:
             return
         self._path.unlink(missing_ok=True)
@@ -71,7 +70,7 @@ class StopSocket:
         except BlockingIOError:
             return
         connection.setblocking(False)
-        _, user = peer_of(connection)
+        _, user = read_peer(connection)
         if user not in (os.getuid(), 0):
             connection.close()
             return
@@ -87,7 +86,7 @@ class StopSocket:
                 self._on_stop(request.removeprefix(REQUEST).decode(errors="replace"))
                 connection.send(ANSWER)
         except (BlockingIOError, ConnectionError):
-            # It has gone without waiting for the answer; a stop that it sent is engaged.
+            # The peer closed before the answer; the stop that it sent is engaged.
             pass
         finally:
             self._drop(connection)
@@ -98,8 +97,8 @@ class StopSocket:
         connection.close()
 
 
-def peer_of(connection: socket.socket) -> tuple[int, int]:
-    """Return process and user at the other end of a connected unix socket."""
+def read_peer(connection: socket.socket) -> tuple[int, int]:
+    """Return process ID and user ID of the peer of a unix socket."""
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
     process, user, _ = _PEER.unpack(packed)
     return process, user

@@ -193,7 +193,7 @@ async def test_another_user_stops_nothing(
 ) -> None:
     sockets.open("launcher", "launch")
     stranger = os.getuid() + 1
-    monkeypatch.setattr(stop_socket, "peer_of", lambda connection: (1, stranger))
+    monkeypatch.setattr(stop_socket, "read_peer", lambda connection: (1, stranger))
     attempts = await sockets.stop()
     assert [one.worked for one in attempts] == [False]
     assert sockets.reasons == []

@@ -27,7 +27,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.camera.devices import ReaderThread, open_reader
-from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, halves
+from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, split_side_by_side
 from flexsheet.nodes.camera.node import CameraParameters
 from flexsheet.nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
 from tests.waiting import DEADLINE_S
@@ -185,7 +185,7 @@ async def test_the_twins_pictures_are_left_alone_by_a_real_camera(
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        (lambda p: VideoSource(kind="video", left=p / "absent.avi"), "absent.avi: no such file"),
+        (lambda p: VideoSource(kind="video", left=p / "absent.avi"), "absent.avi: file not found"),
         (lambda p: VideoSource(kind="video", left=p / "text.avi"), "cannot be opened"),
         (lambda p: OpenCvSource(kind="opencv", left=str(p / "absent")), "cannot be opened"),
         (
@@ -213,13 +213,13 @@ def test_an_unreadable_image_is_named(scene: Scene, tmp_path: Path) -> None:
     for name in ("l.png", "r.png"):
         (tmp_path / name).write_text("no picture")
     source = ImagesSource(kind="images", left=str(tmp_path / "l*"), right=str(tmp_path / "r*"))
-    with pytest.raises(DeviceError, match=r"l\.png: not a picture"):
+    with pytest.raises(DeviceError, match=r"l\.png: cannot be read as an image"):
         open_reader(source, scene.camera, lambda: 0).read()
 
 
 def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
-    with pytest.raises(DeviceError, match="camera: side-by-side picture of odd width 161"):
-        halves(picture(0, 0, 161), "camera")
+    with pytest.raises(DeviceError, match="camera: side-by-side image of odd width 161"):
+        split_side_by_side(picture(0, 0, 161), "camera")
 
 
 class StutteringReader:

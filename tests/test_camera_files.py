@@ -90,7 +90,7 @@ def test_a_video_of_even_rate_has_its_frame_times(scene: Scene, tmp_path: Path) 
     pictures = read_all(VideoSource(kind="video", left=path), scene)
     assert times_ms(pictures) == pytest.approx([20.0 * n for n in range(FRAMES)], abs=1e-3)
     assert all(pair.skew_s == 0.0 for pair in pictures)
-    assert pictures[0].notes == ("times of the file",)
+    assert pictures[0].notes == ("frame times of the file",)
 
 
 @pytest.mark.parametrize("container", ["mkv", "mov"])
@@ -175,7 +175,7 @@ def test_a_video_without_frame_times_needs_a_rate(
     monkeypatch.setattr(cv2, "VideoCapture", TimelessVideo)
     reader = opened(VideoSource(kind="video", left=path), scene)
     reader.read()
-    with pytest.raises(DeviceError, match=r"bare\.h264: frame 1 at 0 ms.*give rate_hz"):
+    with pytest.raises(DeviceError, match=r"bare\.h264: frame 1 at 0 ms.*set rate_hz"):
         reader.read()
     timed = opened(VideoSource(kind="video", left=path, rate_hz=50.0), scene)
     pictures = [timed.read(), timed.read()]
@@ -206,13 +206,13 @@ def test_one_looping_pair_comes_at_the_given_rate(scene: Scene, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("t_ms\n1\n2\n", r"times\.csv: has no column t_s"),
-        ("", r"times\.csv: has no column t_s"),
-        ("t_s\n1\n", r"times\.csv: 1 times for 2 pairs"),
-        ("t_s\n1\nsoon\n", r"times\.csv, line 3: t_s is 'soon', not a number"),
-        ("t_s\n1\nnan\n", r"times\.csv, line 3: t_s is 'nan', not a number"),
-        ("x,t_s\n0,1\n0\n", r"times\.csv, line 3: t_s is None, not a number"),
-        ("t_s\n2\n2\n", r"times\.csv, line 3: t_s 2 is not after the one before it"),
+        ("t_ms\n1\n2\n", r"times\.csv: no column t_s"),
+        ("", r"times\.csv: no column t_s"),
+        ("t_s\n1\n", r"times\.csv: expected one row for each of 2 pairs, found 1"),
+        ("t_s\n1\nsoon\n", r"times\.csv, line 3: t_s: expected a number of seconds, found 'soon'"),
+        ("t_s\n1\nnan\n", r"times\.csv, line 3: t_s: expected a number of seconds, found 'nan'"),
+        ("x,t_s\n0,1\n0\n", r"times\.csv, line 3: t_s: expected a number of seconds, found None"),
+        ("t_s\n2\n2\n", r"times\.csv, line 3: t_s 2 is not after the previous one"),
     ],
 )
 def test_wrong_times_are_named(tmp_path: Path, text: str, said: str) -> None:
@@ -225,10 +225,10 @@ def test_wrong_times_are_named(tmp_path: Path, text: str, said: str) -> None:
 def test_absent_times_and_times_beside_a_rate_are_refused(scene: Scene, tmp_path: Path) -> None:
     patterns = write_images(tmp_path, 1)
     absent = ImagesSource(kind="images", times=tmp_path / "absent.csv", **patterns)
-    with pytest.raises(DeviceError, match=r"absent\.csv: no such file"):
+    with pytest.raises(DeviceError, match=r"absent\.csv: file not found"):
         opened(absent, scene)
     twice = absent.model_copy(update={"rate_hz": 50.0})
-    with pytest.raises(DeviceError, match="times and rate_hz are both given"):
+    with pytest.raises(DeviceError, match="times and rate_hz are both set"):
         opened(twice, scene)
 
 

@@ -32,7 +32,7 @@ from flexsheet.nodes.camera import live
 from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Region, Regions
 from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import OpenCvSource
-from flexsheet.nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
+from flexsheet.nodes.camera.stamps import MAX_IMPLAUSIBLE, SLACK, Pairing, StampCheck
 from tests.waiting import DEADLINE_S
 
 pytestmark = pytest.mark.alone
@@ -112,20 +112,20 @@ def test_stamps_of_another_clock_give_way_to_the_arrival(
     """Check one camera alone, since the two are compared by one kind of stamp."""
     left, right = cameras
     with reading(bag, scene) as reader:
-        for number in range(LAPSES):
+        for number in range(MAX_IMPLAUSIBLE):
             left.shoot(number * PERIOD_NS, number=number)
             right.shoot(number * PERIOD_NS, number=number, side=1, stamp_ns=stamp_ns)
         pictures = read(reader)
     assert "stamped on arrival" in pictures.notes
-    newest_ns = bag.base_ns + (LAPSES - 1) * PERIOD_NS
+    newest_ns = bag.base_ns + (MAX_IMPLAUSIBLE - 1) * PERIOD_NS
     assert pictures.exposure_ns == newest_ns + 8 * MS - 2 * MS
-    assert told(pictures.left) == told(pictures.right) - 5 == LAPSES - 1
+    assert told(pictures.left) == told(pictures.right) - 5 == MAX_IMPLAUSIBLE - 1
 
 
 def test_a_stated_delay_from_exposure_to_arrival(
     bag: CameraBag, scene: Scene, cameras: tuple[FakeCamera, FakeCamera]
 ) -> None:
-    """OpenCV knows no clock of a stream's: its stamps are not asked for."""
+    """OpenCV knows no clock of a stream's: its stamps are not requested."""
     bag.cameras = {"rtsp://left": cameras[0], "rtsp://right": cameras[1]}
     source = {"left": "rtsp://left", "right": "rtsp://right", "exposure_to_grab_s": 0.020}
     with reading(bag, scene, **source) as reader:
@@ -137,25 +137,25 @@ def test_a_stated_delay_from_exposure_to_arrival(
 
 @given(
     offset_ns=st.integers(-(10**19), 10**19),
-    jitter_ns=st.lists(st.integers(0, 15 * MS), min_size=LAPSES, max_size=30),
+    jitter_ns=st.lists(st.integers(0, 15 * MS), min_size=MAX_IMPLAUSIBLE, max_size=30),
 )
 def test_only_a_reading_of_our_clock_is_believed(offset_ns: int, jitter_ns: list[int]) -> None:
-    judge = StampJudge()
+    check = StampCheck()
     arrivals = [10**15 + n * PERIOD_NS + jitter for n, jitter in enumerate(jitter_ns)]
     stamps = [10**15 + n * PERIOD_NS - offset_ns for n in range(len(jitter_ns))]
-    good = [judge.plausible(s, a) for s, a in zip(stamps, arrivals, strict=True)]
+    good = [check.is_plausible(s, a) for s, a in zip(stamps, arrivals, strict=True)]
     if 0 <= offset_ns <= 900 * MS:
         assert all(good)
-        assert judge.believed
+        assert check.trusted
     if not -2 * 10**9 <= offset_ns <= 2 * 10**9:
         assert not any(good)
-        assert not judge.believed
+        assert not check.trusted
 
 
 def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
-    judge = StampJudge()
+    check = StampCheck()
     stamps = [100, 200, 200, 300, 0, 400]
-    assert [judge.plausible(s * MS, 1000 * MS) for s in stamps] == [
+    assert [check.is_plausible(s * MS, 1000 * MS) for s in stamps] == [
         True,
         True,
         False,
@@ -163,7 +163,7 @@ def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
         False,
         True,
     ]
-    assert judge.believed
+    assert check.trusted
 
 
 @settings(max_examples=200)
@@ -189,7 +189,7 @@ def test_frames_meet_their_own_partner(
     pairs = []
     for frame in sorted(moments, key=lambda frame: moments[frame]):
         queues[frame[0]].append(frame)
-        pair = pairing.take(queues["left"], queues["right"], lambda frame: moments[frame])
+        pair = pairing.pop_pair(queues["left"], queues["right"], lambda frame: moments[frame])
         if pair is not None:
             pairs.append(pair)
     waiting = len(queues["left"]) + len(queues["right"])
@@ -213,8 +213,8 @@ async def test_the_skew_is_published_and_too_much_is_refused(
         assert bench.sent[0][0].skew_s == pytest.approx(3e-3, abs=1e-6)
         left.shoot(PERIOD_NS)
         right.shoot(PERIOD_NS - 6 * MS)
-        await bench.until(lambda: bench.node.refused == 1)
-        assert "1 pairs refused: skew -6.0 ms, at most 4 ms wanted" in bench.node.note
+        await bench.until(lambda: bench.node.rejected == 1)
+        assert "1 pairs rejected: skew -6.0 ms, maximum 4 ms" in bench.node.note
         left.shoot(2 * PERIOD_NS)
         right.shoot(2 * PERIOD_NS + MS)
         await bench.until(lambda: len(bench.sent) == 2)
@@ -297,9 +297,9 @@ async def test_what_a_device_does_not_take_is_told_once(
         assert header.source_ns == pytest.approx(bag.base_ns - (3.9 + 2.0) / 2 * MS, abs=1000)
         assert bench.node.errors == 3
         for text in (
-            "0: exposure: asked for 40 units of 100 us, the device has 78",
-            "0: auto white balance: asked for 0 (off), the device has 1",
-            "2: rate: asked for 60 Hz, the device has 30 Hz",
+            "0: exposure: requested 40 units of 100 us, the device has 78",
+            "0: auto white balance: requested 0 (off), the device has 1",
+            "2: rate: requested 60 Hz, the device has 30 Hz",
         ):
             assert text in bench.node.note
         for fake in cameras:
@@ -318,7 +318,7 @@ def test_a_device_that_keeps_its_automatic_exposure_does_not_tell_it(
     for fake in cameras:
         fake.fixed |= {cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}
     with reading(bag, scene) as reader:
-        assert "0: auto exposure: asked for 1 (by hand), the device has 3" in reader.warnings
+        assert "0: auto exposure: requested 1 (by hand), the device has 3" in reader.warnings
         for fake in cameras:
             fake.shoot(0)
         assert read(reader).exposure_s == scene.camera.exposure_s
@@ -370,7 +370,7 @@ async def test_the_regions_come_out_with_their_origins(bag: CameraBag, scene: Sc
         assert (pair.left_origin_px, pair.right_origin_px) == ((32, 20), (16, 30))
         np.testing.assert_array_equal(pair.left, ramp[20:60, 32:96])
         np.testing.assert_array_equal(pair.right, ramp[30:80, 16:96])
-        assert "regions cut from what the device reads" in bench.node.note
+        assert "regions cropped from the device's region" in bench.node.note
         bag.empty()
 
 
@@ -385,7 +385,7 @@ async def test_a_camera_is_unplugged_and_comes_back(
         right.unplug()
         left.shots.put(None)
         await bench.until(lambda: "cannot be opened" in bench.node.note)
-        assert bench.node.note.startswith("no pictures: 2: cannot be opened")
+        assert bench.node.note.startswith("no images: 2: cannot be opened")
         assert all(capture.released.is_set() for capture in right.captures)
         tried = len(left.captures)
         await bench.until(lambda: len(left.captures) > tried)
@@ -408,7 +408,7 @@ def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
             fake.shoot(0)
         read(reader)
         left.shoot(PERIOD_NS)
-        with pytest.raises(DeviceError, match=r"^2: no picture for 0\.5 s: it hangs"):
+        with pytest.raises(DeviceError, match=r"^2: no image for 0\.5 s: check the device"):
             read(reader)
         left.shots.put(None)
         reader.close()
@@ -439,7 +439,7 @@ def test_two_cameras_that_never_meet_are_told_of(
             cameras[1].shoot((3 * number + 1) * PERIOD_NS)
         waiting.join(DEADLINE_S)
     assert told_of
-    assert "both give pictures, but none within half a period" in told_of[0]
+    assert "no two images within half a period" in told_of[0]
 
 
 def test_a_reader_that_waits_is_interrupted(

@@ -391,7 +391,7 @@ def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path:
     said = flexsheet("bag", "verify", "listner", recorded)
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
     said = flexsheet("bag", "verify", "recorder", recorded)
-    assert (said.code, "it wrote this bag" in said.err) == (1, True)
+    assert (said.code, "it recorded this bag" in said.err) == (1, True)
     bare = tmp_path / "bare.mcap"
     with BagWriter(bare):
         pass

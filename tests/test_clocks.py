@@ -22,7 +22,7 @@ from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import ClockOffset, ClockPing, Clocks, EStop, Fingertip
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.clock.node import ClockNode, ClockParameters
-from flexsheet.nodes.clock.offset import OtherClock, Sample, bounds, make_sample
+from flexsheet.nodes.clock.offset import OtherClock, Sample, compute_bounds, make_sample
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.test_messages_wire import HEADER as SOME_HEADER
@@ -135,7 +135,7 @@ def test_what_is_kept_of_a_clock_is_bounded() -> None:
     for number in range(5000):
         clock.add(Sample(number * S // 16, 0, MS + number % 7))
     assert len(clock.samples) <= 121
-    low, high = bounds(clock.samples, 5000 * S // 16, max_drift_ratio=5e-4)
+    low, high = compute_bounds(clock.samples, 5000 * S // 16, max_drift_ratio=5e-4)
     assert low < 0 < high
 
 

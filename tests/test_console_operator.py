@@ -193,10 +193,10 @@ async def test_own_display_messages_are_known_by_their_writer(
 
 
 async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench: Bench) -> None:
-    for name, note in (("tape", "records to a.mcap"), ("body", "meshes, 3 s left")):
+    for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)
-    assert "records to a.mcap" in bench.operator._page.record._words._shown
+    assert "recording to a.mcap" in bench.operator._page.record._words._shown
     assert "meshes, 3 s left" in bench.operator._page._state._shown
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.deploy_trial import HOSTS, PAGE, Stroke, judge_stroke, steps
+from benchmarks.deploy_trial import HOSTS, PAGE, Stroke, evaluate_stroke, steps
 from flexsheet.launch.commands.systemd import install
 from flexsheet.messages.bag import BagWriter
 from tests.doc_pages import ROOT
@@ -42,7 +42,7 @@ def test_a_bag_without_a_stroke_is_no_proof(tmp_path: Path) -> None:
     bag = tmp_path / "nothing.mcap"
     BagWriter(bag).close()
     with pytest.raises(ValueError, match="no stroke is in it"):
-        judge_stroke(bag)
+        evaluate_stroke(bag)
 
 
 def test_a_bag_that_the_service_cannot_write_is_said(

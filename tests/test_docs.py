@@ -10,7 +10,7 @@ import pytest
 from flexsheet.launch.plans.plan import load_graph
 from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
 from website.finish import NetworkError, finish
-from website.graph import LAB, TWIN, Picture
+from website.graph import LAB, TWIN, GraphDrawing
 from website.pages import generate
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
@@ -70,8 +70,8 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
     assert set(site_pages()) - linked <= {START}
 
 
-@pytest.mark.parametrize(("picture", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
-def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file: str) -> None:
+@pytest.mark.parametrize(("drawing", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
+def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
         (writer.name, port.topic, node.name)
@@ -79,14 +79,14 @@ def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file
         for port in node.inputs
         for writer in plan.writers.get(port.topic, ())
     }
-    drawn = {(a.writer, topic, a.reader) for a in picture.arrows for topic in a.topics}
+    drawn = {(a.writer, topic, a.reader) for a in drawing.arrows for topic in a.topics}
     assert drawn <= said
     left_out = {
         (writer, topic, reader)
         for writer, topic, reader in said - drawn
-        if {writer, reader} <= set(picture.boxes) - {"recorder"} and writer != reader
+        if {writer, reader} <= set(drawing.boxes) - {"recorder"} and writer != reader
     }
-    if picture is TWIN:  # it shows the twin's part only
+    if drawing is TWIN:  # it shows the twin's part only
         left_out = {link for link in left_out if "twin" in link[0] + link[2]}
     assert {topic for _, topic, _ in left_out} <= EVERYBODYS
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from benchmarks.image_correction import Bench
+from benchmarks.image_correction import CorrectionBench
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
@@ -46,8 +46,8 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def bench(scene: Scene) -> Bench:
-    return Bench(scene, stretch=1.05)
+def bench(scene: Scene) -> CorrectionBench:
+    return CorrectionBench(scene, stretch=1.05)
 
 
 def flat_sheet(world_from_sheet: np.ndarray, cells: int = 4) -> DeformedSheet:
@@ -204,11 +204,13 @@ EyeSituation = tuple[SheetPose, DeformedSheet]
 Sizes = Callable[[Image, float], Sequence[float]]
 
 
-def mean_mm(bench: Bench, correction: Correction, situation: EyeSituation, sizes: Sizes) -> float:
+def mean_mm(
+    bench: CorrectionBench, correction: Correction, situation: EyeSituation, sizes: Sizes
+) -> float:
     return float(1e3 * bench.size_errors(correction, *situation, sizes).mean())
 
 
-def test_row_of_figure_11(bench: Bench) -> None:
+def test_row_of_figure_11(bench: CorrectionBench) -> None:
     """At 50 degrees the uncorrected error is the paper's tens of mm; corrected, a tenth."""
     rolled = bench.situation(roll_sheet(bench.scene, np.radians(50.0)), None)
     assert 27.0 < mean_mm(bench, "none", rolled, tilt_sizes) < 34.0
@@ -217,7 +219,7 @@ def test_row_of_figure_11(bench: Bench) -> None:
     assert 20.0 < mean_mm(bench, "none", bench.situation(turn, None), tilt_sizes) < 28.0
 
 
-def test_row_of_figure_13(bench: Bench) -> None:
+def test_row_of_figure_13(bench: CorrectionBench) -> None:
     """Pushed by 50 mm, four triangles leave the paper's few millimetres of its ten and more."""
     pushed = bench.situation(*bench.pushed(0.05))
     corrections: tuple[Correction, ...] = ("none", "one_plane", "four_triangles", "two_pass")

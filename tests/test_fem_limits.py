@@ -8,13 +8,13 @@ import pytest
 from benchmarks.soft_body_limits import (
     CYLINDER,
     Body,
-    body_of,
+    count_inverted,
     cylinder,
     deepest_mm,
+    make_body,
+    make_sample,
+    make_scene,
     newton,
-    overturned,
-    scene_of,
-    site_of,
 )
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from flexsheet.nodes.models import rigid
@@ -24,23 +24,23 @@ ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 
 
 @pytest.fixture(scope="module")
 def body() -> Body:
-    return body_of(cylinder())
+    return make_body(cylinder())
 
 
 def test_a_skin_coarser_than_the_fingertip_is_refused() -> None:
     """It would answer with twice the force and more, and not know."""
     with pytest.raises(ValueError, match=r"skin_spacing_m: 0.005 .* finger.radius_m \(0.0045\)"):
-        body_of(cylinder(finger_m=0.0045))
+        make_body(cylinder(finger_m=0.0045))
 
 
 def test_an_incompressible_body_is_refused() -> None:
     with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* use 0.499"):
-        body_of(cylinder(nu=0.49995))
+        make_body(cylinder(nu=0.49995))
 
 
 def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
-    hanging = body_of(scene_of(CYLINDER, ENDS, height_m=0.02))
-    sample = site_of(hanging)
+    hanging = make_body(make_scene(CYLINDER, ENDS, height_m=0.02))
+    sample = make_sample(hanging)
     answers = [
         one.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.005))
         for one in (hanging, body)
@@ -50,7 +50,7 @@ def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
     assert deepest_mm(newton(hanging, sample, (0.002, 0.004))) == 4.0
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
     with pytest.raises(ValueError, match=r"object.support: .* at least three"):
-        body_of(scene_of(CYLINDER, point, height_m=0.02))
+        make_body(make_scene(CYLINDER, point, height_m=0.02))
 
 
 def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
@@ -66,4 +66,4 @@ def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
         fresh, _ = body.soft.respond(there, None)
         assert np.array_equal(answer.displacement, fresh.displacement)
         assert answer.in_range == fresh.in_range
-        assert overturned(body, answer.displacement) == 0
+        assert count_inverted(body, answer.displacement) == 0

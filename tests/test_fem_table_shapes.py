@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.soft_body_limits import Body, body_of, overturned, scene_of
+from benchmarks.soft_body_limits import Body, count_inverted, make_body, make_scene
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
@@ -20,8 +20,8 @@ from tests.soft_bodies import Here
 DEPTHS = (0.0015, 0.002, 0.003, 0.004)
 BASE = {"kind": "base", "height_m": 0.01}
 SCENES = {
-    "sphere": scene_of({"shape": "sphere", "radius_m": 0.025}, BASE, height_m=0.025),
-    "rounded_box": scene_of(
+    "sphere": make_scene({"shape": "sphere", "radius_m": 0.025}, BASE, height_m=0.025),
+    "rounded_box": make_scene(
         {"shape": "rounded_box", "size_m": [0.06, 0.05, 0.03], "edge_radius_m": 0.01},
         BASE,
         height_m=0.015,
@@ -35,7 +35,7 @@ def both(
 ) -> tuple[Body, SceneBody]:
     """The body by the linear method, and by a table of few sites and few, shallow depths."""
     scene = SCENES[request.param]
-    linear = body_of(scene, 0.0065)
+    linear = make_body(scene, 0.0065)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
         patch.setattr(snapshots, "APART_RATIO", 6.0)
@@ -85,4 +85,4 @@ def test_deeper_than_solved_is_flagged_and_bounded(both: tuple[Body, SceneBody])
         answer, _ = pushed(table, 0.001, 0.002, depth)
         assert answer.in_range == (depth < DEPTHS[-1] - END_SPAN_M)
         assert np.linalg.norm(answer.displacement, axis=1).max() < 1.2 * DEPTHS[-1]
-        assert overturned(linear, answer.displacement) == 0
+        assert count_inverted(linear, answer.displacement) == 0

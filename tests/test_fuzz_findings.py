@@ -17,7 +17,7 @@ import zstandard
 from ruamel.yaml.error import YAMLError
 
 from benchmarks import fuzz
-from benchmarks.fuzz_targets import MAGIC, Record, example, joined, records_of
+from benchmarks.fuzz_targets import MAGIC, Record, example, join_records, read_records
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.documents import BadInputError, parse_value, read_document
 from flexsheet.messages import wire
@@ -112,11 +112,11 @@ def test_a_header_of_many_small_values_is_refused_before_it_is_read() -> None:
 def small_bag(path: Path, *, compress: bool = True) -> list[Record]:
     with BagWriter(path, compress=compress) as bag:
         bag.write(TOPICS["estop"], EStop(engaged=True, reason="x"), HEADER, 1)
-    return records_of(path.read_bytes()[len(MAGIC) :])
+    return read_records(path.read_bytes()[len(MAGIC) :])
 
 
 def rewritten(path: Path, records: list[Record]) -> Path:
-    path.write_bytes(MAGIC + joined(records) + MAGIC)
+    path.write_bytes(MAGIC + join_records(records) + MAGIC)
     return path
 
 

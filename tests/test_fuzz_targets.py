@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from benchmarks.fuzz_targets import (
     TARGETS,
+    ExecutionMonitor,
     Finding,
-    Watch,
     bounded_memory,
     close_fake_arm,
     remove_launch_folder,
@@ -66,7 +66,7 @@ def test_valid_examples_are_understood(name: str) -> None:
 
 
 def test_what_executes_or_takes_too_much_is_found() -> None:
-    with pytest.raises(Finding, match=r"os\.system"), Watch.looks():
+    with pytest.raises(Finding, match=r"os\.system"), ExecutionMonitor.looks():
         __import__("os").system("true")
     with pytest.raises(Finding, match="MiB"), bounded_memory(-1):
         pass

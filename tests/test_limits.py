@@ -23,7 +23,7 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.limits import LimitedModel, max_of
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES, node_class
-from flexsheet.nodes.node import NodeParameters, parameters_of
+from flexsheet.nodes.node import NodeParameters, find_parameters_type
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted((ROOT / "launch" / "scenes").glob("*.yaml"))
@@ -57,7 +57,7 @@ def replaced(values: Any, key: Key, value: object) -> Any:
 SCENE_VALUES = {path.stem: YAML(typ="safe").load(path.read_text()) for path in SCENES}
 SCENE_NUMBERS = [(name, key) for name, one in SCENE_VALUES.items() for key in numbers_in(one)]
 PARAMETERS: dict[str, type[NodeParameters]] = {
-    name: parameters_of(node_class(name)) for name in NODES
+    name: find_parameters_type(node_class(name)) for name in NODES
 }
 PARAMETER_NUMBERS = [
     (name, field)

@@ -45,7 +45,7 @@ def test_the_register_map_is_written_between_its_marks() -> None:
     stale = f"# A page\n{registers_page.BEGIN}stale\n{registers_page.END}rest\n"
     assert "| 8–19 | `joints_rad` | float32 × 6 |" in registers_page.page(stale)
     assert "stale" not in registers_page.page(stale)
-    with pytest.raises(ValueError, match="needs the marks"):
+    with pytest.raises(ValueError, match="does not contain the marks"):
         registers_page.page("# A page")
 
 

@@ -32,7 +32,7 @@ from flexsheet.messages.types import (
     Status,
 )
 from flexsheet.nodes import node_class
-from flexsheet.nodes.node import parameters_of
+from flexsheet.nodes.node import find_parameters_type
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
@@ -49,7 +49,7 @@ TYPES: dict[str, type[Message]] = {
 def test_an_old_parameter_gets_an_error_that_names_the_new_one(
     tmp_path: Path, node_type: str, old: str, new: str
 ) -> None:
-    fields = parameters_of(node_class(node_type)).model_fields
+    fields = find_parameters_type(node_class(node_type)).model_fields
     assert new in fields
     assert old not in fields
     file = tmp_path / "old.yaml"

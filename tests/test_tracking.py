@@ -311,7 +311,7 @@ def test_a_track_is_carried_over_a_gap_and_then_lost() -> None:
     assert tracker.gate(long) is None
     lost = tracker.predict_at(long, np.array([0.0, 0.05]))
     assert (lost.velocity == 0).all()
-    assert (lost.ahead == lost.position).all()
+    assert (lost.path == lost.position).all()
     assert feed(tracker, steady, range(90, 93)) == ["unconfirmed", "unconfirmed", "ok"]
 
 
@@ -363,8 +363,8 @@ def test_a_late_point_mends_the_track(name: str) -> None:
         shuffled.update(frame * FRAME_NS, points[frame], NOISE)
     assert late == 2
     horizons_s = np.array([0.0, 0.05])
-    assert shuffled.predict_at(39 * FRAME_NS, horizons_s).ahead == pytest.approx(
-        in_order.predict_at(39 * FRAME_NS, horizons_s).ahead, abs=1e-12
+    assert shuffled.predict_at(39 * FRAME_NS, horizons_s).path == pytest.approx(
+        in_order.predict_at(39 * FRAME_NS, horizons_s).path, abs=1e-12
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import tracking_limits
 from benchmarks.tracking_bench import bench_scene
-from benchmarks.tracking_endurance import follow, tallied
+from benchmarks.tracking_endurance import evaluate_sequence, follow
 from benchmarks.tracking_limits import FAILURES, measure
 
 SIGMAS = 6.0
@@ -109,7 +109,7 @@ def test_in_a_crowd_no_other_mark_is_taken_for_the_finger() -> None:
     count = 0
     for seed, frames in ((2, 900), (3, 600)):
         seen, _ = asyncio.run(follow(seed, frames))
-        tally = tallied(seen, bench_scene(), seed)
+        tally = evaluate_sequence(seen, bench_scene(), seed)
         assert tally.wrong_footed == []
         assert max(tally.jumps_mm) < 1.5
         assert tally.valid > 0.4 * frames

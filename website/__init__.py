@@ -1,1 +1,1 @@
-"""What the site of the documentation needs beside its generator; see `make docs`."""
+"""Generate documentation pages from the code and finish the site; see `make docs`."""

@@ -1,4 +1,4 @@
-"""Write the arm control's states and transitions into docs/arms.md, between its marks."""
+"""Generate the arm control's states and transitions in docs/arms.md, between its marks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ END = "<!-- end of states -->\n"
 
 
 def page(text: str) -> str:
-    """Return the page with the states of the code; ValueError if a mark is missing."""
+    """Return the page with the generated block.  Raises ValueError if a mark is missing."""
     return replace_block(text, BEGIN, END, f"{_render_states()}\n{_render_transitions()}")
 
 

@@ -1,4 +1,4 @@
-"""Writes docs/cli.md: every command with its arguments, options and examples."""
+"""Generate docs/cli.md: all commands with arguments, options and examples."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ and files in your shell.  Meanings of errors: [errors.md](errors.md).
 """
 
 
-def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield all commands but hidden aliases, with the words that call them."""
+def commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the object of all commands, except hidden aliases."""
     group = group or get_command(app)
     for name, command in group.commands.items():
-        path = (*words, name)
+        path = (*prefix, name)
         if command.hidden:
             continue
         if not hasattr(command, "commands"):
@@ -40,11 +40,11 @@ def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[s
 
 
 def reference() -> str:
-    """Return the whole page."""
-    known = dict(commands())
-    links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in known)
+    """Return the page."""
+    by_name = dict(commands())
+    links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in by_name)
     sections = [INTRODUCTION, links + "\n"]
-    return "\n".join([*sections, *(_section(name, one) for name, one in known.items())])
+    return "\n".join([*sections, *(_section(name, one) for name, one in by_name.items())])
 
 
 def anchor(name: str) -> str:
@@ -54,7 +54,7 @@ def anchor(name: str) -> str:
 def _section(name: str, command: Any) -> str:
     calls = "\n".join(examples_in(command.epilog))
     rows = [
-        f"| {_name(parameter)} | {_words(parameter)} |"
+        f"| {_name(parameter)} | {_description(parameter)} |"
         for parameter in command.params
         if "completion" not in parameter.name and not getattr(parameter, "hidden", False)
     ]
@@ -71,14 +71,14 @@ def _name(parameter: Any) -> str:
     return f"`{options}{metavar}`"
 
 
-def _words(parameter: Any) -> str:
-    words = (parameter.help or "").replace("|", r"\|")
+def _description(parameter: Any) -> str:
+    text = (parameter.help or "").replace("|", r"\|")
     if parameter.required:
-        return f"{words} Required."
+        return f"{text} Required."
     if parameter.default in (None, False, "") or callable(parameter.default):
-        return words
-    # A file of the package lies elsewhere on each computer.
+        return text
+    # The path of a file of the package differs between computers.
     default = str(parameter.default)
     if "/launch/" in default:
         default = "launch/" + default.rpartition("/launch/")[2]
-    return f"{words} Default: `{default}`."
+    return f"{text} Default: `{default}`."

@@ -1,4 +1,4 @@
-"""Writes docs/errors.md from the classes of the errors and from the catalogue of notes."""
+"""Generate docs/errors.md from the error classes and the catalogue of notes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Notes of nodes are in the log of `flexsheet launch`, in the topic `status`
 
 
 def reference() -> str:
-    """Return the whole page."""
+    """Return the page."""
     errors = [entry for entry in entries() if entry.name]
     notes = [entry for entry in entries() if entry.phrase]
     return "\n".join(

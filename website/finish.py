@@ -1,7 +1,7 @@
-"""What is left to do when the site is built: `python -m website.finish site`.
+"""Finish the built site: `python -m website.finish site`.
 
-Pages link to files of the project, as to `../launch/lab.yaml`; on the site these links lead to
-copies.  And the generator has one script come from the network, which a script of ours replaces.
+Links to files of the project, such as `../launch/lab.yaml`, are changed to copies of these files.
+The only script from the network is replaced by a local one.
 """
 
 from __future__ import annotations
@@ -12,35 +12,37 @@ import sys
 from pathlib import Path
 
 COPIES = "project"
-OUTWARD = re.compile(r'href="((?:\.\./)+)([^"#]+)"')
-WORKERS_FOR_FILES = "https://unpkg.com/iframe-worker/shim"
-OURS = "search-from-files.js"
-FROM_THE_NETWORK = re.compile(r'(?:src|srcset)="https?://[^"]*"|<link[^>]*href="https?://[^"]*"')
+OUTWARD_LINK = re.compile(r'href="((?:\.\./)+)([^"#]+)"')
+WORKER_SHIM_URL = "https://unpkg.com/iframe-worker/shim"
+LOCAL_SHIM = "search-from-files.js"
+NETWORK_RESOURCE = re.compile(r'(?:src|srcset)="https?://[^"]*"|<link[^>]*href="https?://[^"]*"')
 
 
 class NetworkError(ValueError):
-    """A page that would load something from the network."""
+    """A page loads a resource from the network."""
 
 
 def finish(site: Path, project: Path) -> list[str]:
-    """Lead links out of the site to copies, and scripts to ours; the files that were copied.
+    """Copy linked files of the project into the site, correct the links, and return the files.
 
-    FileNotFoundError for a link to a file that the project does not have; NetworkError where a page
-    loads anything from elsewhere.
+    Raises FileNotFoundError for a link to a missing file, and NetworkError for a page that loads a
+    resource from the network.
     """
     copied: set[str] = set()
     for page in site.rglob("*.html"):
         up = "../" * (len(page.relative_to(site).parts) - 1)
 
-        def inward(link: re.Match[str], up: str = up) -> str:
+        def link_to_copy(link: re.Match[str], up: str = up) -> str:
             if len(link[1]) <= len(up):
                 return link[0]
             copied.add(link[2])
             return f'href="{up}{COPIES}/{link[2]}.txt"'
 
-        text = OUTWARD.sub(inward, page.read_text()).replace(WORKERS_FOR_FILES, up + OURS)
-        if found := FROM_THE_NETWORK.search(text):
-            raise NetworkError(f"{page}: {found[0]} comes from the network; put a copy into docs/")
+        text = OUTWARD_LINK.sub(link_to_copy, page.read_text()).replace(
+            WORKER_SHIM_URL, up + LOCAL_SHIM
+        )
+        if found := NETWORK_RESOURCE.search(text):
+            raise NetworkError(f"{page}: {found[0]} loads from the network; add a copy to docs/")
         page.write_text(text)
     for name in copied:
         copy = site / COPIES / f"{name}.txt"

@@ -1,6 +1,6 @@
-"""Draws the node graph as SVG.
+"""Draw the node graph as SVG.
 
-Positions of boxes and arrows are set by hand.  A test compares the arrows with the launch files.
+The positions of boxes and arrows are constants.  A test compares the arrows with the launch files.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-Place = tuple[float, float]
+Position = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
 """Size of a box, px."""
@@ -36,44 +36,47 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Arrow:
-    """Topics that a node writes and another reads, or a wire to a device: not a topic.
+    """Topics from one node to another, or a connection to a device (wire).
 
-    way: its corners, as SVG has them; the label stands at `label_at`.
+    path: points of the SVG polyline; label_at: position of the label.
     """
 
     writer: str
     reader: str
     topics: tuple[str, ...]
-    way: str
-    label_at: Place
+    path: str
+    label_at: Position
     wire: str = ""
-    both_ways: bool = False
+    is_bidirectional: bool = False
 
 
 @dataclass(frozen=True)
-class Picture:
-    """hosts: name to left, top, width, height.  boxes: nodes' middles.  devices: the same."""
+class GraphDrawing:
+    """Drawing of a graph.
+
+    hosts: left, top, width and height by name.  boxes, devices: centres by name.
+    """
 
     title: str
     size: tuple[int, int]
     hosts: dict[str, tuple[float, float, float, float]]
-    boxes: dict[str, Place]
-    devices: dict[str, Place]
+    boxes: dict[str, Position]
+    devices: dict[str, Position]
     arrows: Sequence[Arrow]
 
 
-def _arrow(writer: str, reader: str, topics: str, way: str, label_at: Place) -> Arrow:
-    return Arrow(writer, reader, tuple(topics.split(", ")), way, label_at)
+def _arrow(writer: str, reader: str, topics: str, path: str, label_at: Position) -> Arrow:
+    return Arrow(writer, reader, tuple(topics.split(", ")), path, label_at)
 
 
 def _wire(
-    writer: str, reader: str, what: str, way: str, label_at: Place, *, both: bool = True
+    writer: str, reader: str, what: str, path: str, label_at: Position, *, both: bool = True
 ) -> Arrow:
-    return Arrow(writer, reader, (), way, label_at, wire=what, both_ways=both)
+    return Arrow(writer, reader, (), path, label_at, wire=what, is_bidirectional=both)
 
 
-LAB = Picture(
-    title="Three computers: which node says what to which",
+LAB = GraphDrawing(
+    title="Three computers: nodes and topics",
     size=(960, 520),
     hosts={
         "main PC": (10, 10, 940, 290),
@@ -122,8 +125,8 @@ LAB = Picture(
     ),
 )
 
-TWIN = Picture(
-    title="The twin in place of finger, camera, arms and eye",
+TWIN = GraphDrawing(
+    title="The simulator in place of finger, camera, arms and eye",
     size=(960, 300),
     hosts={"this computer": (10, 10, 940, 280)},
     boxes={
@@ -160,43 +163,43 @@ TWIN = Picture(
     ),
 )
 
-PICTURES = {"graph.svg": LAB, "graph-twin.svg": TWIN}
+DRAWINGS = {"graph.svg": LAB, "graph-twin.svg": TWIN}
 
 
-def svg(picture: Picture) -> str:
-    """The picture as a file of its own, which follows light and dark."""
-    width, height = picture.size
+def svg(drawing: GraphDrawing) -> str:
+    """Return the drawing as an SVG file, for light and dark colour schemes."""
+    width, height = drawing.size
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" role="img" aria-label="{picture.title}">',
+        f'width="{width}" height="{height}" role="img" aria-label="{drawing.title}">',
         f"<style>{STYLE}</style>",
         '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
         'markerHeight="7" orient="auto-start-reverse"><path id="head" d="M0 0L8 4L0 8z"/>'
         "</marker></defs>",
     ]
-    for name, (left, top, wide, high) in picture.hosts.items():
+    for name, (left, top, w_px, h_px) in drawing.hosts.items():
         lines.append(
-            f'<rect class="host" x="{left}" y="{top}" width="{wide}" height="{high}" rx="8"/>'
+            f'<rect class="host" x="{left}" y="{top}" width="{w_px}" height="{h_px}" rx="8"/>'
         )
         lines.append(
             f'<text class="label" x="{left + 10}" y="{top + 18}" '
             f'style="text-anchor:start">{name}</text>'
         )
-    for arrow in picture.arrows:
-        start = ' marker-start="url(#tip)"' if arrow.both_ways else ""
+    for arrow in drawing.arrows:
+        start = ' marker-start="url(#tip)"' if arrow.is_bidirectional else ""
         kind = "arrow wire" if arrow.wire else "arrow"
         lines.append(
-            f'<polyline class="{kind}" points="{arrow.way}" marker-end="url(#tip)"{start}/>'
+            f'<polyline class="{kind}" points="{arrow.path}" marker-end="url(#tip)"{start}/>'
         )
-    for kind, places in (("box", picture.boxes), ("device", picture.devices)):
-        for name, (x, y) in places.items():
+    for kind, positions in (("box", drawing.boxes), ("device", drawing.devices)):
+        for name, (x, y) in positions.items():
             round_px = 5 if kind == "box" else HEIGHT // 2
             lines.append(
                 f'<rect class="{kind}" x="{x - WIDTH / 2:g}" y="{y - HEIGHT / 2:g}" '
                 f'width="{WIDTH}" height="{HEIGHT}" rx="{round_px}"/>'
             )
             lines.append(f'<text x="{x}" y="{y + 4.5}">{name}</text>')
-    for arrow in picture.arrows:
+    for arrow in drawing.arrows:
         (x, y), label = arrow.label_at, arrow.wire or ", ".join(arrow.topics)
         lines.append(f'<text class="label" x="{x}" y="{y}">{label}</text>')
     return "\n".join([*lines, "</svg>", ""])

@@ -1,7 +1,7 @@
-"""Formulas for the site: a Markdown extension that turns $...$ and $$...$$ into MathML.
+"""Markdown extension that converts the formulas $...$ and $$...$$ to MathML.
 
-Browsers draw MathML themselves, so a page needs no script and no font from elsewhere.  The same
-source is drawn by hosts of repositories, which know the dollar signs, too.
+Browsers render MathML without scripts or fonts from the network.  Repository hosts render the same
+source.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from markdown.extensions import Extension
 from markdown.inlinepatterns import InlineProcessor
 
 INLINE = r"(?<![\\$\w])\$(?=[^\s$])([^$\n]*[^\s$\\])\$(?![\w$])"
-"""A dollar sign that hugs its formula on both sides, so that prices and shells are left alone."""
+"""Inline formula: no space next to the dollar signs, to exclude prices and shell variables."""
 
 AFTER_CODE, BEFORE_ESCAPES = 190, 185
-"""Priorities of Python-Markdown: code spans come first, backslashes are still there."""
+"""Priorities of Python-Markdown: after code spans, before backslash escapes."""
 
 
 PRIME = re.compile(r"<msup>(<m[in]>[^<]*</m[in]>)<mi>&#x02032;</mi></msup>")
-"""A prime is drawn high already; raised once more it would stand above the line."""
+"""Superscript of a prime, which is a raised character already."""
 
 
 def mathml(formula: str, display: Literal["inline", "block"]) -> str:
-    """A formula of LaTeX."""
+    """Convert a LaTeX formula to MathML."""
     return PRIME.sub(r"<mrow>\1<mo>&#x02032;</mo></mrow>", convert(formula, display=display))
 
 
 class InlineFormula(InlineProcessor):
-    """$a^2$ within a line."""
+    """Processor of formulas within a line."""
 
     def handleMatch(self, m: re.Match[str], data: str) -> tuple[str, int, int]:
         return self.md.htmlStash.store(mathml(m.group(1), "inline")), m.start(0), m.end(0)
 
 
 class FormulaBlock(BlockProcessor):
-    """A paragraph that begins and ends with two dollar signs."""
+    """Processor of paragraphs that start and end with two dollar signs."""
 
     def test(self, parent: Element, block: str) -> bool:
         return block.startswith("$$") and block.rstrip().endswith("$$") and len(block.strip()) > 4
 
     def run(self, parent: Element, blocks: list[str]) -> None:
         formula = mathml(blocks.pop(0).strip().strip("$").strip(), "block")
-        place = SubElement(parent, "div", {"class": "formula"})
-        place.text = self.parser.md.htmlStash.store(formula)
+        element = SubElement(parent, "div", {"class": "formula"})
+        element.text = self.parser.md.htmlStash.store(formula)
 
 
 class MathMLExtension(Extension):
-    """Both of them."""
+    """Extension with both processors."""
 
     def extendMarkdown(self, md: Markdown) -> None:
         md.inlinePatterns.register(InlineFormula(INLINE, md), "mathml", BEFORE_ESCAPES)
@@ -60,5 +60,5 @@ class MathMLExtension(Extension):
 
 
 def makeExtension(**options: Any) -> MathMLExtension:
-    """By this name Python-Markdown finds an extension."""
+    """Create the extension; Python-Markdown calls this function by its name."""
     return MathMLExtension(**options)

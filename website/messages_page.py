@@ -1,4 +1,4 @@
-"""Writes docs/messages.md from the topic table and the message types."""
+"""Generate docs/messages.md from the topic table and the message types."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INTRODUCTION = """\
 
 <!-- Written by `make pages`; a test compares. -->
 
-What nodes say to one another.  Numbers are SI and radians; positions and directions are in the
+Messages between nodes.  Units are SI and radians; positions and directions are in the
 world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless
 a name says otherwise; `a_from_b` is a 4x4 transform.  The form on sockets and in bags is described
 in `messages/wire.py` and `messages/bag.py`; how long a message takes is in
@@ -27,29 +27,30 @@ in `messages/wire.py` and `messages/bag.py`; how long a message takes is in
 
 ## Topics
 
-`latest`: a subscriber gets the newest, older ones are dropped and counted.  `every`: all of them,
-in order; an overflow is counted and reported.  `latched`: as `every`, and a late subscriber first
-gets the last one sent.  Writers is "many" where any number of nodes may publish.
+`latest`: a subscriber gets the newest message; older ones are dropped and counted.  `every`: a
+subscriber gets all messages in order; an overflow is counted and reported.  `latched`: as `every`,
+and a late subscriber first gets the last message.  Writers: "many" if any number of nodes can
+publish.
 """
 
 HEADER_INTRODUCTION = """\
 ## The header
 
-Travels with every message.
+Each message has a header.
 """
 
 TYPES_INTRODUCTION = """\
 ## Types
 
-An array is written as element type and shape; equal names of lengths within one array are equal.
-Arrays never hold NaN or infinity.
+An array is described by element type and shape; equal names of lengths within one array are equal.
+Arrays never contain NaN or infinity.
 """
 
 
 def reference() -> str:
-    """Return the whole page."""
+    """Return the page."""
     types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
-    parts = list(dict.fromkeys(part for kind in types for part in parts_of(kind)))
+    parts = list(dict.fromkeys(part for kind in types for part in nested_models(kind)))
     sections = [INTRODUCTION + "\n" + _topic_table(), HEADER_INTRODUCTION + "\n" + _header_table()]
     sections.append(TYPES_INTRODUCTION)
     sections += [type_section(kind) for kind in types]
@@ -83,12 +84,12 @@ def _rate(topic: Topic) -> str:
 
 
 def _header_table() -> str:
-    """Return the table of the header's fields, described by its docstring."""
+    """Return the table of the header's fields, with descriptions from its docstring."""
     described: dict[str, str] = {}
     for line in inspect.cleandoc(Header.__doc__ or "").splitlines():
-        name, colon, words = line.partition(": ")
+        name, colon, text = line.partition(": ")
         if colon and name in Header.__slots__:
-            described[name] = words
+            described[name] = text
         elif described and line.strip():
             described[next(reversed(described))] += " " + line.strip()
     types = inspect.get_annotations(Header, eval_str=True)
@@ -109,7 +110,7 @@ def type_section(kind: type[BaseModel]) -> str:
 
 
 def _field_notes(field: FieldInfo) -> str:
-    """Bounds, default and description."""
+    """Return bounds, default and description of a field."""
     notes = [note for extra in _constraints(field) if (note := _constraint(extra))]
     if field.default_factory is not None:
         notes.append("empty by default")
@@ -142,13 +143,13 @@ def _constraint(extra: Any) -> str:
             return ""
 
 
-def parts_of(annotation: Any) -> Iterator[type[BaseModel]]:
+def nested_models(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield all models within a type, outer ones first, without the type itself."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for field in annotation.model_fields.values():
             for inner in _models_in(field.annotation):
                 yield inner
-                yield from parts_of(inner)
+                yield from nested_models(inner)
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

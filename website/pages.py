@@ -1,4 +1,4 @@
-"""Writes the pages and pictures of docs/ that are generated from the code.
+"""Write the pages and drawings of docs/ that are generated from the code.
 
 python -m website.pages [DOCS]
 """
@@ -16,15 +16,15 @@ from website import (
     parameters_page,
     registers_page,
 )
-from website.graph import PICTURES, svg
+from website.graph import DRAWINGS, svg
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
 def generate(docs: Path) -> dict[Path, str]:
-    """Return the contents of all generated files by their path relative to the folder of pages.
+    """Return the contents of all generated files by their path relative to `docs`.
 
-    docs: folder with arms.md and modbus.md, of which only a part is generated.
+    docs: folder with arms.md and modbus.md, which are generated in part.
     """
     return {
         Path("messages.md"): messages_page.reference(),
@@ -33,7 +33,7 @@ def generate(docs: Path) -> dict[Path, str]:
         Path("errors.md"): errors_page.reference(),
         Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
-        **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
+        **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
     }
 
 

@@ -1,4 +1,4 @@
-"""Write docs/parameters.md: the parameters of each node."""
+"""Generate docs/parameters.md: the parameters of each node."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pydantic import BaseModel
 
 from flexsheet.messages.field_types import field_type
 from flexsheet.nodes import NODES, node_class
-from flexsheet.nodes.node import parameters_of
-from website.messages_page import parts_of, type_section
+from flexsheet.nodes.node import find_parameters_type
+from website.messages_page import nested_models, type_section
 
 ROOT = Path(__file__).resolve().parent.parent
 UNITS = {
@@ -19,29 +19,29 @@ UNITS = {
     "_per_s": "1/s", "_n_per_m": "N/m", "_m2": "m²", "_hz": "Hz", "_rad": "rad", "_px": "px",
     "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
-"""Units by the ends of names, the longer ones first."""
+"""Units by suffix of the name; longer suffixes first."""
 
 INTRODUCTION = """\
 # Parameters
 
 <!-- Written by `make pages`; a test compares. -->
 
-What can be set of each node: in a launch file under `nodes: NAME: parameters:`, or on the command
-line by `--set NAME.PARAMETER=VALUE`.  Units are in the names.  `flexsheet node describe NODE`
-prints the same with ports and timers.
+Parameters of each node.  Set them in a launch file under `nodes: NAME: parameters:`, or on the
+command line by `--set NAME.PARAMETER=VALUE`.  Names contain the units.  The command
+`flexsheet node describe NODE` prints the parameters with ports and timers.
 """
 
 
 def reference() -> str:
-    """Return the whole page."""
-    kinds = [parameters_of(node_class(name)) for name in NODES]
-    parts = dict.fromkeys(part for kind in kinds for part in parts_of(kind))
+    """Return the page."""
+    kinds = [find_parameters_type(node_class(name)) for name in NODES]
+    parts = dict.fromkeys(part for kind in kinds for part in nested_models(kind))
     sections = [INTRODUCTION, *(_section(name) for name in NODES)]
     return "\n".join([*sections, "## Parts\n", *(type_section(part) for part in parts)])
 
 
 def unit(name: str) -> str:
-    """Return the unit at the end of a parameter's name; empty without one."""
+    """Return the unit from the suffix of a parameter's name; empty if there is none."""
     return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
 
 
@@ -51,7 +51,7 @@ def _section(name: str) -> str:
     rows = [
         f"| `{key}` | {field_type(field)} | {unit(key)} | {_default(field)} | "
         f"{field.description or ''} |"
-        for key, field in parameters_of(kind).model_fields.items()
+        for key, field in find_parameters_type(kind).model_fields.items()
     ]
     table = ["| parameter | type | unit | default | what |", "| --- | --- | --- | --- | --- |"]
     return f"## {name}\n\n{' '.join(about.split())}\n\n" + "\n".join([*table, *rows]) + "\n"

@@ -1,4 +1,4 @@
-"""Write the register map of the Modbus driver into docs/modbus.md, between its marks."""
+"""Generate the register map of the Modbus driver in docs/modbus.md, between its marks."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 
 
 def page(text: str) -> str:
-    """Return the page with the register map of the code; ValueError if a mark is missing."""
+    """Return the page with the generated block.  Raises ValueError if a mark is missing."""
     return replace_block(text, BEGIN, END, registers())
 
 
 def replace_block(text: str, begin: str, end: str, content: str) -> str:
-    """Return the text with `content` between two marks; ValueError if a mark is missing."""
+    """Replace the text between two marks.  Raises ValueError if a mark is missing."""
     before, first, rest = text.partition(begin)
     _, last, after = rest.partition(end)
     if not (first and last):
-        raise ValueError(f"the page needs the marks {begin.strip()} and {end.strip()}")
+        raise ValueError(f"the page does not contain the marks {begin.strip()} and {end.strip()}")
     return f"{before}{first}\n{content}\n{last}{after}"
 
 
 def registers() -> str:
-    """Both blocks and the fault bits."""
+    """Return the tables of both register blocks and of the fault bits."""
     bits = ["Fault bits:", "", "| bit | meaning |", "|---|---|"]
     bits += [f"| {bit} | {FAULT_TEXTS[fault]} |" for bit, fault in FAULT_BITS.items()]
     blocks = [

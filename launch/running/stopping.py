@@ -24,7 +24,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from flexsheet.launch.running.runs import live_runs
-from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, peer_of
+from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, read_peer
 
 CONTINUE_AFTER_S = 0.06
 KILL_AFTER_S = 0.15
@@ -120,7 +120,7 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
         if connection is None:
             note(StopPath(kind), name, StopOutcome.ABSENT)
         else:
-            process, _ = peer_of(connection)
+            process, _ = read_peer(connection)
             waiting.append(_Receiver(StopPath(kind), name, connection, process))
     try:
         for until_s, signalled in ((CONTINUE_AFTER_S, signal.SIGCONT), (KILL_AFTER_S, None)):

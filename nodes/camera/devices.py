@@ -1,4 +1,4 @@
-"""Open a source and read it in a thread of its own, to its end or in a loop."""
+"""Open a source and read it in a separate thread, to its end or in a loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexsheet.nodes.camera.image_pair import (
     Reader,
     Regions,
     check_size,
-    cut,
+    crop,
 )
 from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import AnySource, ImagesSource, OpenCvSource, VideoSource
@@ -26,30 +26,29 @@ MAX_RETRY_S = 30.0
 
 
 def open_reader(
-    source: AnySource, camera: StereoCamera, now: Now, wanted: Regions | None = None
+    source: AnySource, camera: StereoCamera, now: Now, requested: Regions | None = None
 ) -> Reader:
     """Open a source for a scene's camera; raises DeviceError.
 
-    wanted: the sensor regions that a device is asked to read; `image_pair.cut` does the rest.
+    requested: sensor regions that a device should read; it can read more.
     """
     if isinstance(source, OpenCvSource):
-        return CameraReader(source, camera, now, wanted)
+        return CameraReader(source, camera, now, requested)
     if isinstance(source, VideoSource):
         return VideoReader(source, camera.rate_hz)
     if isinstance(source, ImagesSource):
         return ImagesReader(source, camera)
-    raise DeviceError(f'source "{source.kind}" is not read from a device')
+    raise DeviceError(f'source "{source.kind}" has no device or files to open')
 
 
 class ReaderThread(threading.Thread):
-    """Open a source and read it to its end; report failures, and try again after a while.
+    """Thread that opens a source and reads it to its end; it reports failures and retries.
 
-    deliver(pictures, lost): called for each pair, with the number of frames lost so far.
-    fail(error): called for each DeviceError; waiting times double from `retry_s` to MAX_RETRY_S,
-    and start over once images arrive again.
-    warn(text): called at each opening for settings that the device does not accept.
-    finish(pairs): called when the images end.
-    regions: the parts of the images to deliver; None: all.
+    deliver(images, lost): called for each pair, with the total number of lost frames. fail(error):
+    called for each DeviceError.  The retry period doubles from `retry_s` to MAX_RETRY_S, until
+    images arrive again. warn(text): called at each opening for settings that the device does not
+    accept. finish(pairs): called at the end of the source. regions: regions to deliver; None for
+    the full images.
 
     All functions are called in this thread.
     """
@@ -78,7 +77,7 @@ class ReaderThread(threading.Thread):
         self._wait_s = retry_s
 
     def stop(self) -> None:
-        """Ask the thread to end after the image that it waits for."""
+        """Make the thread end after the current read."""
         self._stopping.set()
         reader = self._reader
         if reader is not None:
@@ -95,7 +94,7 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except Exception as error:  # drivers raise anything; report it and try again
+            except Exception as error:  # drivers raise various types; report and retry
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):
@@ -108,27 +107,27 @@ class ReaderThread(threading.Thread):
                 return
 
     def _read(self, reader: Reader) -> None:
-        """Deliver until the images end or the thread is to stop."""
+        """Deliver pairs until the source ends or the thread is stopped."""
         start_ns: int | None = None
         newest_ns: int | None = None
         while not self._stopping.is_set():
-            pictures = reader.read()
+            images = reader.read()
             if self._stopping.is_set():
                 return
-            if pictures is None:
+            if images is None:
                 self._finish(self._pairs)
                 return
-            check_size(pictures, self._camera, self.name)
+            check_size(images, self._camera, self.name)
             if self._regions is not None:
-                pictures = cut(pictures, self._regions)
+                images = crop(images, self._regions)
             if reader.paced:
                 if start_ns is None:
-                    start_ns = self._now() - pictures.exposure_ns
-                pictures = replace(pictures, exposure_ns=start_ns + pictures.exposure_ns)
-                self._stopping.wait(max(0.0, (pictures.exposure_ns - self._now()) * 1e-9))
+                    start_ns = self._now() - images.exposure_ns
+                images = replace(images, exposure_ns=start_ns + images.exposure_ns)
+                self._stopping.wait(max(0.0, (images.exposure_ns - self._now()) * 1e-9))
             elif reader.rate_hz is not None and newest_ns is not None:
-                between_s = (pictures.exposure_ns - newest_ns) * 1e-9
+                between_s = (images.exposure_ns - newest_ns) * 1e-9
                 self._lost += max(0, round(between_s * reader.rate_hz) - 1)
-            newest_ns = pictures.exposure_ns
+            newest_ns = images.exposure_ns
             self._pairs, self._wait_s = self._pairs + 1, self._retry_s
-            self._deliver(pictures, self._lost)
+            self._deliver(images, self._lost)

@@ -1,7 +1,7 @@
-"""Define what every reader of stereo images returns: grey pairs with their time, and the errors.
+"""Define the interface of readers of stereo images: grey pairs with their time, and errors.
 
-A reader is opened, read from in a thread that may block, and closed.  A `DeviceError` is a failure
-that may disappear at the next attempt; the end of the images is `None`.
+A reader is opened, read in a thread that may block, and closed.  After a `DeviceError` it can be
+opened again; at the end of the source, `read` returns None.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """Raised for a device or file that cannot be read; the message names it and what to do."""
+    """A device or file cannot be read."""
 
     code = "device"
     remedy = (
-        "Check the plug, the device's name and the calibration file. Another program may use the "
-        "camera."
+        "Check the cable, the device's name and the files in the launch file. Check that no other "
+        "program uses the camera."
     )
 
 
 class Region(NamedTuple):
-    """Hold a part of the sensor, in pixels; column and row of its first pixel count from zero."""
+    """Part of a sensor: column and row of its first pixel (from zero), width and height, px."""
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]
     width: Annotated[int, Field(gt=0)]
     height: Annotated[int, Field(gt=0)]
 
-    def holds(self, other: Region) -> bool:
+    def contains(self, other: Region) -> bool:
         return (
             self.column <= other.column
             and self.row <= other.row
@@ -54,19 +54,19 @@ class Region(NamedTuple):
 
 
 Regions = tuple[Region, Region]
-"""Regions of the left view and of the right."""
+"""Regions of the left and the right view."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImagePair:
-    """Hold a pair and its time: the mean of the middles of both exposures.
+    """Pair of images.
 
-    exposure_ns: on the clock that the reader was given; of a paced reader (files), the file's own
-        time from its beginning.
-    exposure_s: as reported by the device; None: not known.
-    skew_s: exposure of the right image minus that of the left.
-    regions: parts of the sensors that the images show; None: all.
-    notes: how they were taken, for display.
+    exposure_ns: mean of the middles of both exposures, on the reader's clock; for a paced reader
+        (files), time from the start of the file.
+    exposure_s: reported by the device; None if unknown.
+    skew_s: time of the right exposure minus that of the left.
+    regions: sensor regions of the images; None for full sensors.
+    notes: remarks for display.
     """
 
     left: Image
@@ -79,11 +79,11 @@ class ImagePair:
 
 
 class Reader(Protocol):
-    """Define what a reader of image pairs offers.
+    """Interface of readers of image pairs.
 
-    paced: images come as fast as they are read, and are to be shown by their own time.
-    rate_hz: of a device, for counting lost frames; files have none.
-    warnings: settings that the device does not accept; known once it is open.
+    paced: whether `read` returns immediately, so that the caller must wait for each pair's time.
+    rate_hz: rate of a device, for counting lost frames; None for files.
+    warnings: settings that the device does not accept.
     """
 
     paced: bool
@@ -95,27 +95,26 @@ class Reader(Protocol):
         ...
 
     def interrupt(self) -> None:
-        """Make a waiting `read`, and each that follows, return None soon; callable from any
-        thread."""
+        """Make the current `read`, and each that follows, return None soon; thread-safe."""
         ...
 
     def close(self) -> None: ...
 
 
 def make_stereo_message(
-    pictures: ImagePair, device: str, exposure_s: float, dropped_frames: int
+    images: ImagePair, device: str, exposure_s: float, dropped_frames: int
 ) -> StereoPair:
-    """Make the message of an image pair; exposure_s: used where the device does not report it."""
-    origins = [(region.column, region.row) for region in pictures.regions or ()] or [(0, 0)] * 2
+    """Make the message of an image pair; exposure_s: used if the device does not report it."""
+    origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
         device=device,
-        exposure_s=exposure_s if pictures.exposure_s is None else pictures.exposure_s,
-        skew_s=pictures.skew_s,
+        exposure_s=exposure_s if images.exposure_s is None else images.exposure_s,
+        skew_s=images.skew_s,
         dropped_frames=dropped_frames,
         left_origin_px=origins[0],
         right_origin_px=origins[1],
-        left=pictures.left,
-        right=pictures.right,
+        left=images.left,
+        right=images.right,
     )
 
 
@@ -136,75 +135,75 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
     )
 
 
-def skew_reason(skew_s: float, limit_s: float) -> str:
-    """Describe why a pair was rejected for its skew."""
+def describe_skew(skew_s: float, limit_s: float) -> str:
+    """Return the reason why a pair was rejected for its skew."""
     return (
-        f"skew {1e3 * skew_s:.1f} ms, at most {1e3 * limit_s:g} ms wanted; cameras that run freely "
-        "keep their skew until they are restarted, a common trigger has none"
+        f"skew {1e3 * skew_s:.1f} ms, maximum {1e3 * limit_s:g} ms: restart the cameras, or "
+        "connect a common trigger"
     )
 
 
-def gray(image: NDArray[Any]) -> Image:
-    """Convert a decoded image to grey (h, w): grey or luma first (h, w, 1 or 2), or
-    blue-green-red."""
+def convert_to_gray(image: NDArray[Any]) -> Image:
+    """Convert a decoded image to grey (h, w): from grey, luma first (h, w, 1 or 2), or BGR."""
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-def halves(image: Image, name: object) -> tuple[Image, Image]:
+def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
     """Split a side-by-side image (h, 2w) into both views; raises DeviceError for an odd width."""
     if image.shape[1] % 2:
         raise DeviceError(
-            f"{name}: side-by-side picture of odd width {image.shape[1]}; name the right device too"
+            f"{name}: side-by-side image of odd width {image.shape[1]} px; set `right` if "
+            "the views are separate"
         )
     middle = image.shape[1] // 2
     return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
 
 
-def check_size(pictures: ImagePair, camera: StereoCamera, name: object) -> None:
+def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
     """Raise DeviceError unless each view has the size of its region, or of the scene's camera."""
     whole = Region(0, 0, camera.width_px, camera.height_px)
-    regions = pictures.regions or (whole, whole)
-    views = (("left", pictures.left, regions[0]), ("right", pictures.right, regions[1]))
+    regions = images.regions or (whole, whole)
+    views = (("left", images.left, regions[0]), ("right", images.right, regions[1]))
     for side, image, region in views:
         if image.shape != (region.height, region.width):
-            wanted = (
+            expected = (
                 f"the scene's camera {camera.device} has {region.width}x{region.height} px"
-                if pictures.regions is None
+                if images.regions is None
                 else f"its region is {region}"
             )
             raise DeviceError(
-                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, {wanted}: correct "
+                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, {expected}: correct "
                 "the scene or the source"
             )
 
 
-def cut(pictures: ImagePair, wanted: Regions) -> ImagePair:
-    """Cut the wanted regions out of images that `check_size` has passed.
+def crop(images: ImagePair, regions: Regions) -> ImagePair:
+    """Crop images that `check_size` has accepted to sensor regions.
 
-    Raises DeviceError where the images do not show all of them.
+    Raises DeviceError if the images do not contain these regions.
     """
-    if pictures.regions == wanted:
-        return pictures
-    images = []
-    shown = pictures.regions
-    for index, (image, region) in enumerate(
-        zip((pictures.left, pictures.right), wanted, strict=True)
-    ):
-        has = Region(0, 0, image.shape[1], image.shape[0]) if shown is None else shown[index]
-        if not has.holds(region):
+    if images.regions == regions:
+        return images
+    parts = []
+    shown = images.regions
+    for index, (image, region) in enumerate(zip((images.left, images.right), regions, strict=True)):
+        available = Region(0, 0, image.shape[1], image.shape[0]) if shown is None else shown[index]
+        if not available.contains(region):
             side = ("left", "right")[index]
-            raise DeviceError(f"the {side} region is {region}, the picture only {has}: correct it")
-        row, column = region.row - has.row, region.column - has.column
+            raise DeviceError(
+                f"region.{side}: {region} is outside the image, which has {available}: correct it"
+            )
+        row, column = region.row - available.row, region.column - available.column
         part = image[row : row + region.height, column : column + region.width]
-        images.append(np.ascontiguousarray(part))
-    note = "regions cut from " + ("whole pictures" if shown is None else "what the device reads")
+        parts.append(np.ascontiguousarray(part))
+    note = "regions cropped from " + ("full images" if shown is None else "the device's region")
     return replace(
-        pictures, left=images[0], right=images[1], regions=wanted, notes=(*pictures.notes, note)
+        images, left=parts[0], right=parts[1], regions=regions, notes=(*images.notes, note)
     )
 
 
-def encode_png(picture: Image) -> bytes:
+def encode_png(image: Image) -> bytes:
     """Return an image as the bytes of a PNG file."""
-    return bytes(cv2.imencode(".png", picture)[1])
+    return bytes(cv2.imencode(".png", image)[1])

@@ -1,4 +1,4 @@
-"""Read live cameras, one thread each, so that each frame is stamped on arrival."""
+"""Read live cameras, with one thread each to stamp frames on arrival."""
 
 from __future__ import annotations
 
@@ -16,27 +16,23 @@ from flexsheet.nodes.camera.image_pair import (
     Now,
     Region,
     Regions,
-    gray,
-    halves,
+    convert_to_gray,
+    split_side_by_side,
 )
 from flexsheet.nodes.camera.settings import choose_backend, fix_settings, set_format, set_region
 from flexsheet.nodes.camera.sources import OpenCvSource
-from flexsheet.nodes.camera.stamps import Pairing, StampJudge
+from flexsheet.nodes.camera.stamps import Pairing, StampCheck
 
-WAITING = 4
-"""Number of frames that wait for their partner; a camera further ahead loses its oldest."""
-FIRST_S = 5.0
-"""The first frame may take longer than `silence_s`, since cameras then start their sensors."""
+MAX_WAITING_FRAMES = 4
+"""Maximum number of frames that wait for their partner; further ones replace the oldest."""
+FIRST_FRAME_S = 5.0
+"""Minimum timeout for the first frame, since the sensors then start."""
 RELEASE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """Hold one camera's image and the middle of its exposure, ns.
-
-    The middle is computed from the image's arrival or, where it is trusted, from the driver's
-    stamp.
-    """
+    """Image of one camera, and the middle of its exposure: by arrival and by the driver's stamp."""
 
     image: Image
     by_arrival_ns: int
@@ -44,21 +40,21 @@ class CapturedFrame:
 
 
 def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
-    """Open a device; raises DeviceError for what OpenCV cannot open."""
+    """Open a device, file or stream; raises DeviceError if OpenCV cannot open it."""
     capture = cv2.VideoCapture(device, api)
     if not capture.isOpened():
         capture.release()
         raise DeviceError(
-            f"{device!r}: cannot be opened: not there, in use, or not a camera or video"
+            f"{device!r}: cannot be opened: it is missing, in use, or no camera or video"
         )
     return capture
 
 
 class Stream(threading.Thread):
-    """Take one camera's frames as they arrive; notify `changed` of each, and of the end.
+    """Thread that reads one camera's frames, and notifies `changed` of each frame and of a failure.
 
-    The thread owns the capture and releases it: OpenCV crashes on a release during a grab, and a
-        grab may hang.
+    The thread releases the capture, because OpenCV crashes on a release during a grab, and a grab
+    can hang.
     """
 
     def __init__(
@@ -68,18 +64,18 @@ class Stream(threading.Thread):
         camera: StereoCamera,
         *,
         views: int,
-        wanted: Region | None,
+        requested: Region | None,
         now: Now,
         changed: threading.Condition,
     ) -> None:
         """Open and configure the device.  Raises DeviceError.
 
-        views: 2 where one image holds both views.
-        wanted: the region of the sensor to read.
+        views: 2 if one image contains both views.
+        requested: region of the sensor to read.
         """
         super().__init__(name=f"camera {device}", daemon=True)
         self.device = device
-        self.frames: deque[CapturedFrame] = deque(maxlen=WAITING)
+        self.frames: deque[CapturedFrame] = deque(maxlen=MAX_WAITING_FRAMES)
         self.count = 0
         self.failure: Exception | None = None
         self._now, self._changed = now, changed
@@ -88,13 +84,13 @@ class Stream(threading.Thread):
         self._capture = open_capture(device, backend.api if backend else cv2.CAP_ANY)
         try:
             set_format(self._capture, backend, camera, views, source.pixel_format or "")
-            self.region = wanted and set_region(self._capture, backend, wanted, camera)
+            self.region = requested and set_region(self._capture, backend, requested, camera)
             self.settings = fix_settings(self._capture, backend, camera, device)
         except cv2.error:
             self._capture.release()
             raise
         self.exposure_s = self.settings.exposure_s or camera.exposure_s
-        self._judge = StampJudge() if backend is not None and backend.clock else None
+        self._stamp_check = StampCheck() if backend is not None and backend.clock else None
         to_stamp_s, to_grab_s = (
             0.5 * self.exposure_s if delay_s is None else delay_s
             for delay_s in (source.exposure_to_stamp_s, source.exposure_to_grab_s)
@@ -102,12 +98,12 @@ class Stream(threading.Thread):
         self._to_stamp_ns, self._to_grab_ns = round(1e9 * to_stamp_s), round(1e9 * to_grab_s)
 
     @property
-    def believed(self) -> bool:
-        """Return whether the driver's stamps are trusted."""
-        return self._judge is not None and self._judge.believed
+    def trusts_stamps(self) -> bool:
+        """Return whether the driver's stamps are plausible."""
+        return self._stamp_check is not None and self._stamp_check.trusted
 
     def stop(self) -> None:
-        """Ask the thread to end after the frame that it waits for."""
+        """Make the thread end after the current frame."""
         self._stopping.set()
         if self.ident is None:
             self._capture.release()
@@ -129,50 +125,50 @@ class Stream(threading.Thread):
             self._capture.release()
 
     def _next(self) -> CapturedFrame | None:
-        """Return the next frame; None for one with an implausible stamp.  Raises DeviceError."""
+        """Return the next frame; None if its stamp is implausible.  Raises DeviceError."""
         grabbed = self._capture.grab()
         arrival_ns = self._now()
         stamp_ns = None
-        if grabbed and self._judge is not None and self._judge.believed:
+        if grabbed and self._stamp_check is not None and self._stamp_check.trusted:
             stamp_ns = round(1e6 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
-            if not self._judge.plausible(stamp_ns, arrival_ns):
-                if self._judge.believed:
+            if not self._stamp_check.is_plausible(stamp_ns, arrival_ns):
+                if self._stamp_check.trusted:
                     return None
                 stamp_ns = None
         image = self._capture.retrieve()[1] if grabbed else None
         if image is None:
-            raise DeviceError(f"{self.device!r}: gives no more pictures: unplugged, or at its end")
+            raise DeviceError(f"{self.device!r}: delivers no more images: unplugged, or at its end")
         by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
-        return CapturedFrame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
+        return CapturedFrame(convert_to_gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
 
 
 class CameraReader:
-    """Read two free-running cameras, or one that gives both views side by side.
+    """Reader of two free-running cameras, or of one with both views side by side.
 
-    The middle of an exposure is the driver's stamp minus `exposure_to_stamp_s`, if every camera's
-    driver gives trusted stamps.  Otherwise it is the arrival minus `exposure_to_grab_s`.
+    The middle of an exposure is the driver's stamp minus `exposure_to_stamp_s` if the stamps of all
+    drivers are plausible, else the arrival minus `exposure_to_grab_s`.
     """
 
     paced = False
 
     def __init__(
-        self, source: OpenCvSource, camera: StereoCamera, now: Now, wanted: Regions | None = None
+        self, source: OpenCvSource, camera: StereoCamera, now: Now, requested: Regions | None = None
     ) -> None:
         self._source, self._now = source, now
         self._changed = threading.Condition()
         self._streams: list[Stream] = []
         self._interrupted = False
         devices = [device for device in (source.left, source.right) if device is not None]
-        alone = len(devices) == 1
+        is_single = len(devices) == 1
         try:
             for index, device in enumerate(devices):
                 stream = Stream(
                     device,
                     source,
                     camera,
-                    views=2 if alone else 1,
-                    # An image that holds both views cannot begin at two positions.
-                    wanted=None if wanted is None or alone else wanted[index],
+                    views=2 if is_single else 1,
+                    # An image of both views cannot have two regions.
+                    requested=None if requested is None or is_single else requested[index],
                     now=now,
                     changed=self._changed,
                 )
@@ -190,7 +186,7 @@ class CameraReader:
             whole = Region(0, 0, camera.width_px, camera.height_px)
             left, right = (stream.region or whole for stream in self._streams)
             self._regions = left, right
-        self._wait_s = max(FIRST_S, source.silence_s)
+        self._wait_s = max(FIRST_FRAME_S, source.silence_s)
         for stream in self._streams:
             stream.start()
 
@@ -200,7 +196,7 @@ class CameraReader:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
             while not self._interrupted:
-                frames = self._take()
+                frames = self._pop_frames()
                 if frames is not None:
                     break
                 for stream in self._streams:
@@ -208,50 +204,50 @@ class CameraReader:
                         raise stream.failure
                 left_s = (limit_ns - self._now()) * 1e-9
                 if left_s <= 0.0:
-                    raise DeviceError(self._silence(counts))
+                    raise DeviceError(self._describe_silence(counts))
                 self._changed.wait(left_s)
             else:
                 return None
         self._wait_s = self._source.silence_s
-        return self._pictures(frames)
+        return self._make_pair(frames)
 
     def _by_stamp(self) -> bool:
-        """Return whether the drivers' stamps are used; both cameras need the same kind of stamp."""
-        return all(stream.believed for stream in self._streams)
+        """Return whether the drivers' stamps are used, for all cameras or none."""
+        return all(stream.trusts_stamps for stream in self._streams)
 
-    def _moment_ns(self, frame: CapturedFrame) -> int:
+    def _exposure_ns(self, frame: CapturedFrame) -> int:
         if frame.by_stamp_ns is not None and self._by_stamp():
             return frame.by_stamp_ns
         return frame.by_arrival_ns
 
-    def _take(self) -> tuple[CapturedFrame, ...] | None:
-        """Return the next pair, or the next image with both views; None until there is one."""
+    def _pop_frames(self) -> tuple[CapturedFrame, ...] | None:
+        """Remove and return the next pair, or the next frame with both views; None if none."""
         if len(self._streams) == 1:
             frames = self._streams[0].frames
             return (frames.popleft(),) if frames else None
         left, right = self._streams
-        return self._pairing.take(left.frames, right.frames, self._moment_ns)
+        return self._pairing.pop_pair(left.frames, right.frames, self._exposure_ns)
 
-    def _pictures(self, frames: tuple[CapturedFrame, ...]) -> ImagePair:
-        moments_ns = [self._moment_ns(frame) for frame in frames]
+    def _make_pair(self, frames: tuple[CapturedFrame, ...]) -> ImagePair:
+        exposures_ns = [self._exposure_ns(frame) for frame in frames]
         notes = ["stamped by the driver" if self._by_stamp() else "stamped on arrival"]
         if len(frames) == 1:
-            left, right = halves(frames[0].image, self._source.left)
+            left, right = split_side_by_side(frames[0].image, self._source.left)
         else:
             left, right = frames[0].image, frames[1].image
             notes.append(f"{self._pairing.unpaired} frames without a partner")
         return ImagePair(
             left,
             right,
-            sum(moments_ns) // len(moments_ns),
+            sum(exposures_ns) // len(exposures_ns),
             exposure_s=max(stream.exposure_s for stream in self._streams),
-            skew_s=(moments_ns[-1] - moments_ns[0]) * 1e-9,
+            skew_s=(exposures_ns[-1] - exposures_ns[0]) * 1e-9,
             regions=self._regions,
             notes=tuple(notes),
         )
 
-    def _silence(self, counts: list[int]) -> str:
-        """Describe why no pair arrived; counts: each camera's frames when the wait began."""
+    def _describe_silence(self, counts: list[int]) -> str:
+        """Return the reason why no pair arrived; counts: frames per camera at the start."""
         silent = [
             repr(stream.device)
             for stream, count in zip(self._streams, counts, strict=True)
@@ -259,12 +255,12 @@ class CameraReader:
         ]
         if silent:
             return (
-                f"{' and '.join(silent)}: no picture for {self._wait_s:g} s: it hangs, or its "
-                "cable or hub is overloaded"
+                f"{' and '.join(silent)}: no image for {self._wait_s:g} s: check the device, "
+                "its cable and its hub"
             )
         return (
-            f"{self._source.left!r} and {self._source.right!r}: both give pictures, but none "
-            "within half a period of another: do both run at one rate?"
+            f"{self._source.left!r} and {self._source.right!r}: no two images within half a period "
+            "of each other; set both cameras to the same rate"
         )
 
     def interrupt(self) -> None:
@@ -274,8 +270,7 @@ class CameraReader:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Close the cameras; one that hangs in a grab keeps its thread, which releases it after the
-        grab."""
+        """Close the cameras; one that hangs in a grab is released by its thread after the grab."""
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

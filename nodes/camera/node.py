@@ -18,10 +18,10 @@ from flexsheet.nodes.camera.image_pair import (
     ImagePair,
     Regions,
     check_size,
-    cut,
+    crop,
+    describe_skew,
     make_image_pair,
     make_stereo_message,
-    skew_reason,
 )
 from flexsheet.nodes.camera.region import ExplicitRegions, resolve_regions
 from flexsheet.nodes.camera.sources import AnySource, TwinSource
@@ -31,20 +31,22 @@ JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """Hold the source of the images, and which of them are published."""
+    """Parameters of the source of images, and of the images to publish."""
 
     source: AnySource = TwinSource()
-    retry_s: Positive = Field(default=1.0, description="first pause after a device failed")
+    retry_s: Positive = Field(
+        default=1.0, description="first delay before a failed device is reopened"
+    )
     max_skew_s: Positive | None = Field(
-        default=None, description="pairs further apart are refused; null: none"
+        default=None, description="maximum skew of a pair; null: no limit"
     )
     region: Literal["full", "finger"] | ExplicitRegions = Field(
-        default="full", description="part of each view to publish; finger: where one can be"
+        default="full", description="part of each view to publish; finger: the finger's volume"
     )
 
 
 class Camera(Node):
-    """Publish stereo pairs with the time of their exposure."""
+    """Node that publishes stereo pairs with the time of their exposure."""
 
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
@@ -57,17 +59,17 @@ class Camera(Node):
     camera: StereoCamera | None = None
     regions: Regions | None = None
     reader: ReaderThread | None = None
-    waiting: tuple[ImagePair, int] | None = None
+    newest: tuple[ImagePair, int] | None = None
     warned: tuple[str, ...] = ()
-    superseded = refused = 0
+    superseded = rejected = 0
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.source.kind == "twin":
-            return ""  # It passes on twin/stereo and opens no device.
+            return ""  # it forwards twin/stereo and opens no device
         return (
-            "it reads a device, which is not in the bag; with stereo recorded, "
-            "`bag verify triangulator` starts from what it read"
+            "it reads a device, which is not in the bag; `bag verify triangulator` replays a "
+            "recorded topic stereo"
         )
 
     async def close(self) -> None:
@@ -85,10 +87,10 @@ class Camera(Node):
         def later(call: Callable[..., None], *arguments: object) -> None:
             loop.call_soon_threadsafe(call, *arguments)
 
-        def deliver(pictures: ImagePair, lost: int) -> None:
-            if self.waiting is not None:
+        def deliver(images: ImagePair, lost: int) -> None:
+            if self.newest is not None:
                 self.superseded += 1
-            self.waiting = (pictures, lost)
+            self.newest = (images, lost)
             later(self._publish_newest, camera)
 
         self.reader = ReaderThread(
@@ -99,52 +101,52 @@ class Camera(Node):
             now=self.clock.now_ns,
             retry_s=self.parameters.retry_s,
             deliver=deliver,
-            fail=lambda error: later(self._tell_failure, error),
-            warn=lambda text: later(self._tell_warning, text),
+            fail=lambda error: later(self._report_failure, error),
+            warn=lambda text: later(self._report_warning, text),
             finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
         )
         self.reader.start()
 
-    def _tell_failure(self, error: DeviceError) -> None:
+    def _report_failure(self, error: DeviceError) -> None:
         self.report_error("source", error)
-        self.note = f"no pictures: {error}"
+        self.note = f"no images: {error}"
 
-    def _tell_warning(self, text: str) -> None:
-        """Report a warning once per scene, however often the device is opened."""
+    def _report_warning(self, text: str) -> None:
+        """Report a warning once per scene, even if the device is opened repeatedly."""
         if text not in self.warned:
             self.warned = (*self.warned, text)
             self.report_error("source", DeviceError(text))
 
     def _publish_newest(self, camera: StereoCamera) -> None:
-        waiting, self.waiting = self.waiting, None
-        if waiting is not None:
-            pictures, lost = waiting
-            self._publish(pictures, camera.device, camera.exposure_s, self.superseded + lost)
+        newest, self.newest = self.newest, None
+        if newest is not None:
+            images, lost = newest
+            self._publish(images, camera.device, camera.exposure_s, self.superseded + lost)
 
     def on_twin__stereo(self, pair: StereoPair, header: Header) -> None:
         if self.parameters.source.kind != "twin" or self.camera is None:
             return
-        pictures = make_image_pair(pair, header.source_ns)
-        check_size(pictures, self.camera, "twin/stereo")
+        images = make_image_pair(pair, header.source_ns)
+        check_size(images, self.camera, "twin/stereo")
         if self.regions is not None:
-            pictures = cut(pictures, self.regions)
-        self._publish(pictures, pair.device, pair.exposure_s, pair.dropped_frames)
+            images = crop(images, self.regions)
+        self._publish(images, pair.device, pair.exposure_s, pair.dropped_frames)
 
-    def _publish(self, pictures: ImagePair, device: str, exposure_s: float, lost: int) -> None:
+    def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
         """Publish a pair.
 
-        exposure_s: used where the device does not report it.
-        lost: number of lost frames, apart from rejected ones.
+        exposure_s: used if the device does not report it.
+        lost: number of lost frames, without rejected ones.
         """
         limit_s = self.parameters.max_skew_s
-        if limit_s is not None and abs(pictures.skew_s) > limit_s:
-            self.refused += 1
-            self.note = f"{self.refused} pairs refused: {skew_reason(pictures.skew_s, limit_s)}"
+        if limit_s is not None and abs(images.skew_s) > limit_s:
+            self.rejected += 1
+            self.note = f"{self.rejected} pairs rejected: {describe_skew(images.skew_s, limit_s)}"
             return
-        pair = make_stereo_message(pictures, device, exposure_s, lost + self.refused)
-        self.stereo.publish(pair, source_ns=pictures.exposure_ns)
-        facts = (device, f"{pair.dropped_frames} frames lost", *pictures.notes, *self.warned)
-        self.note = "; ".join(facts)
+        pair = make_stereo_message(images, device, exposure_s, lost + self.rejected)
+        self.stereo.publish(pair, source_ns=images.exposure_ns)
+        parts = (device, f"{pair.dropped_frames} frames lost", *images.notes, *self.warned)
+        self.note = "; ".join(parts)
 
     async def _stop_reading(self) -> None:
         reader, self.reader = self.reader, None
@@ -153,5 +155,5 @@ class Camera(Node):
         reader.stop()
         await asyncio.to_thread(reader.join, JOIN_S)
         if reader.is_alive():
-            self.log.error("a device does not answer; its thread stays", reader=reader.name)
-        self.waiting = None
+            self.log.error("device does not respond; its thread continues", reader=reader.name)
+        self.newest = None

@@ -1,4 +1,4 @@
-"""Compute the part of each sensor that can show the finger, by projecting its volume."""
+"""Compute the region of each sensor that can show the finger, by projecting its volume."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from flexsheet.nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Points along each edge of the volume; between two of them a lens bends its image only little."""
+"""Number of points along each edge of the volume; distortion between two of them is negligible."""
 MARGIN_PX = 16.0
-"""Margin for the marker's blur and for a calibration that differs from the scene's optics."""
+"""Margin for the marker's blur, and for differences between calibration and scene."""
 ALIGN_PX = (16, 2)
-"""Multiples of columns and rows at which sensors can begin a region."""
+"""Multiples of columns and rows at which a region can start."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """Regions as a launch file gives them: [column, row, width, height] in pixels for each view."""
+    """Regions in a launch file: [column, row, width, height] for each view, px."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -40,11 +40,11 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the part of a sensor that shows points (n, 3) of the camera's frame, m; None if none.
+    """Return the sensor region that shows points (n, 3) of the camera's frame, m; None if none.
 
-    Beyond the image's corners a lens's polynomial has no meaning and may fold back.  Points out
-    there are moved to the circle through the farthest corner, which changes nothing inside.  A
-    volume that extends behind the camera fills the image.
+    The distortion polynomial is invalid beyond the image's corners.  Points there are moved to the
+    circle through the farthest corner, which does not affect the image.  A volume that extends
+    behind the camera gives the full sensor.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:
@@ -73,8 +73,8 @@ def find_visible_region(
 def find_finger_regions(scene: Scene) -> Regions:
     """Return the region of each view that can show a fingertip.
 
-    It is the finger's volume, extended by the finger's radius and a margin.  Raises DeviceError for
-    a view that sees none of it.
+    The finger's volume is extended by the finger's radius and a margin.  Raises DeviceError if it
+    is outside a view.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -88,26 +88,26 @@ def find_finger_regions(scene: Scene) -> Regions:
         region = find_visible_region(points, lens, rig.width_px, rig.height_px)
         if region is None:
             raise DeviceError(
-                f"the {side} view shows nothing of finger.volume: correct it or "
-                f"camera.world_from_left in the scene {scene.name}, or read the region full"
+                f"the {side} view does not show finger.volume_min_m to volume_max_m: correct "
+                f"them or camera.world_from_left in scene {scene.name}, or set region: full"
             )
         found.append(region)
     return found[0], found[1]
 
 
-def resolve_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """Return the regions to publish; None: all of both sensors.  Raises DeviceError.
+def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
+    """Return the regions to publish; None for both full sensors.
 
-    asked: "full", "finger", or regions, which must lie on the sensor.
+    setting: "full", "finger", or regions.  Raises DeviceError for a region outside its sensor.
     """
-    if asked == "full":
+    if setting == "full":
         return None
-    if not isinstance(asked, ExplicitRegions):
+    if not isinstance(setting, ExplicitRegions):
         return find_finger_regions(scene)
     whole = Region(0, 0, scene.camera.width_px, scene.camera.height_px)
-    for side, region in (("left", asked.left), ("right", asked.right)):
-        if not whole.holds(region):
+    for side, region in (("left", setting.left), ("right", setting.right)):
+        if not whole.contains(region):
             raise DeviceError(
-                f"region.{side}: {region} is not on the sensor of {whole.width}x{whole.height} px"
+                f"region.{side}: {region} is outside the sensor of {whole.width}x{whole.height} px"
             )
-    return asked.left, asked.right
+    return setting.left, setting.right

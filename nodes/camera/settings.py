@@ -1,8 +1,8 @@
-"""Fix what a camera would adjust automatically: exposure, gain, white balance, focus, region.
+"""Set a camera's exposure, gain, white balance, focus and region to fixed values.
 
-Each setting is read back and compared.  A setting that the device does not accept gives a warning
-with property, requested value and the device's value.  Units differ between OpenCV's backends (its
-sources: modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp, cap_aravis.cpp).
+Each setting is read back.  A setting that the device does not accept gives a warning with property,
+requested and actual value.  Units differ between OpenCV's backends (see its sources
+modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp, cap_aravis.cpp).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_RATE_HZ = 10_000.0
 
 
 class Device(Protocol):
-    """Define the part of cv2.VideoCapture that is used here."""
+    """Interface of cv2.VideoCapture that is used here."""
 
     def get(self, property_id: int, /) -> float: ...
 
@@ -30,13 +30,13 @@ class Device(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """Hold the names and units of a camera's controls in one of OpenCV's backends.
+    """Properties and units of a camera's controls in one of OpenCV's backends.
 
-    exposure_unit_s: unit of CAP_PROP_EXPOSURE, and whether it takes integers.
+    exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether it is an integer.
     auto_exposure: property and its value for manual exposure.
-    autos: further automatic functions to switch off (0) where the device has them.
-    offsets: properties of the region's first column and row, None where OpenCV has none.
-    buffers: number of frames that the driver may hold.
+    autos: further automatic functions to switch off (0).
+    offsets: properties of the region's first column and row; None if OpenCV has none.
+    buffers: number of frame buffers of the driver.
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's stamp of that frame.
     """
 
@@ -51,8 +51,8 @@ class Backend:
 
 
 BACKENDS = {
-    # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us; V4L2_EXPOSURE_MANUAL is 1.  Two buffers: one that
-    # the driver fills while we hold the other.  With one, every second frame may find no room.
+    # V4L2_CID_EXPOSURE_ABSOLUTE has a unit of 100 us; V4L2_EXPOSURE_MANUAL is 1.  The driver fills
+    # one buffer while the other is read; with one buffer, it can drop every second frame.
     "v4l2": Backend(
         api=cv2.CAP_V4L2,
         exposure_unit_s=1e-4,
@@ -83,8 +83,8 @@ BACKENDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """Hold a device's settings: exposure (None: not known) and rate, and what it did not accept."""
+class DeviceSettings:
+    """Settings of a device; exposure_s: None if unknown; warnings: settings that it rejected."""
 
     exposure_s: float | None
     rate_hz: float
@@ -92,7 +92,7 @@ class Settings:
 
 
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
-    """Return the backend to open a device with; None: chosen by OpenCV, with unknown controls."""
+    """Return the backend to open a device with; None for OpenCV's choice, with unknown controls."""
     if api is None:
         api = "v4l2" if isinstance(device, int) or device.startswith("/dev/") else "any"
     return BACKENDS.get(api)
@@ -101,9 +101,9 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
 def set_format(
     capture: Device, backend: Backend | None, camera: StereoCamera, views: int, pixel_format: str
 ) -> None:
-    """Request the scene's size and rate; the images then show what the device gives.
+    """Request the scene's size and rate; the device can deliver others.
 
-    views: 2 where one image holds both views side by side.
+    views: 2 if one image contains both views side by side.
     pixel_format: "" for OpenCV's choice.
     """
     if backend is not None and backend.buffers is not None:
@@ -111,7 +111,7 @@ def set_format(
     if pixel_format:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*pixel_format))
     if backend is not None and backend.offsets is not None:
-        # A region of a previous use would bound the size.
+        # A region from a previous use limits the size.
         for offset in backend.offsets:
             capture.set(offset, 0.0)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, views * camera.width_px)
@@ -121,12 +121,12 @@ def set_format(
 
 def fix_settings(
     capture: Device, backend: Backend | None, camera: StereoCamera, device: object
-) -> Settings:
-    """Set the scene's exposure and gain, switch everything automatic off, and read all back."""
+) -> DeviceSettings:
+    """Set the scene's exposure and gain, switch automatic functions off, and verify all."""
     warnings: list[str] = []
 
-    def warn(what: str, asked: str, got: str) -> None:
-        warnings.append(f"{device}: {what}: asked for {asked}, the device has {got}")
+    def warn(what: str, requested: str, actual: str) -> None:
+        warnings.append(f"{device}: {what}: requested {requested}, the device has {actual}")
 
     rate_hz = capture.get(cv2.CAP_PROP_FPS)
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
@@ -134,63 +134,67 @@ def fix_settings(
     elif abs(rate_hz - camera.rate_hz) > RATE_TOLERANCE * camera.rate_hz:
         warn("rate", f"{camera.rate_hz:g} Hz", f"{rate_hz:g} Hz")
     if backend is None:
-        warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "no control that OpenCV can reach")
-        return Settings(None, rate_hz, tuple(warnings))
+        warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "no control that OpenCV supports")
+        return DeviceSettings(None, rate_hz, tuple(warnings))
 
     if backend.api == cv2.CAP_V4L2:
-        # Otherwise an environment variable makes OpenCV scale all controls to 0..1.
+        # Prevents that an environment variable makes OpenCV scale all controls to 0..1.
         capture.set(cv2.CAP_PROP_MODE, 0.0)
-    automatic, by_hand = backend.auto_exposure
-    capture.set(automatic, by_hand)
-    manual = capture.get(automatic) == by_hand
-    if not manual:
-        warn("auto exposure", f"{by_hand:g} (by hand)", f"{capture.get(automatic):g}")
+    automatic, manual_value = backend.auto_exposure
+    capture.set(automatic, manual_value)
+    is_manual = capture.get(automatic) == manual_value
+    if not is_manual:
+        warn("auto exposure", f"{manual_value:g} (manual)", f"{capture.get(automatic):g}")
     for what, property_id in backend.autos:
         if capture.get(property_id) > 0.0:
             capture.set(property_id, 0.0)
             if capture.get(property_id) > 0.0:
                 warn(what, "0 (off)", f"{capture.get(property_id):g}")
 
-    asked = camera.exposure_s / backend.exposure_unit_s
-    capture.set(cv2.CAP_PROP_EXPOSURE, max(1, round(asked)) if backend.whole_units else asked)
+    requested = camera.exposure_s / backend.exposure_unit_s
+    capture.set(
+        cv2.CAP_PROP_EXPOSURE, max(1, round(requested)) if backend.whole_units else requested
+    )
     got = capture.get(cv2.CAP_PROP_EXPOSURE)
     rounding = 0.5 if backend.whole_units else 0.0
-    if abs(got - asked) > max(EXPOSURE_TOLERANCE * asked, rounding):
+    if abs(got - requested) > max(EXPOSURE_TOLERANCE * requested, rounding):
         unit = f"units of {1e6 * backend.exposure_unit_s:g} us"
-        warn("exposure", f"{asked:g} {unit}", f"{got:g}")
+        warn("exposure", f"{requested:g} {unit}", f"{got:g}")
     if camera.gain is not None:
         capture.set(cv2.CAP_PROP_GAIN, camera.gain)
         gain = capture.get(cv2.CAP_PROP_GAIN)
         if abs(gain - camera.gain) > 0.5:
             warn("gain", f"{camera.gain:g}", f"{gain:g}")
-    known = manual and got > 0.0
-    return Settings(got * backend.exposure_unit_s if known else None, rate_hz, tuple(warnings))
+    is_known = is_manual and got > 0.0
+    return DeviceSettings(
+        got * backend.exposure_unit_s if is_known else None, rate_hz, tuple(warnings)
+    )
 
 
 def set_region(
-    capture: Device, backend: Backend | None, wanted: Region, camera: StereoCamera
+    capture: Device, backend: Backend | None, requested: Region, camera: StereoCamera
 ) -> Region | None:
-    """Make the device read a region of its sensor, and return what it reads; None: all of it.
+    """Set the device to a region of its sensor; return the actual one, or None for the full sensor.
 
-    A device that reads less than requested is set back to the full sensor.
+    If the device does not read all of the requested region, it is reset to the full sensor.
     """
     if backend is None or backend.offsets is None:
         return None
     column, row = backend.offsets
-    places = (column, row, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    properties = (column, row, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 
-    def bring(region: Region) -> Region:
-        # An offset is bounded by the size, and the size by the offset: begin where all is allowed.
+    def set_and_read(region: Region) -> Region:
+        # Offset and size limit each other: start with offset 0.
         capture.set(column, 0)
         capture.set(row, 0)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, region.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, region.height)
         capture.set(column, region.column)
         capture.set(row, region.row)
-        return Region(*(round(capture.get(place)) for place in places))
+        return Region(*(round(capture.get(each)) for each in properties))
 
-    reads = bring(wanted)
-    if reads.holds(wanted):
-        return reads
-    bring(Region(0, 0, camera.width_px, camera.height_px))
+    actual = set_and_read(requested)
+    if actual.contains(requested):
+        return actual
+    set_and_read(Region(0, 0, camera.width_px, camera.height_px))
     return None

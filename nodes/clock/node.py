@@ -13,20 +13,24 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.clock.offset import OtherClock, make_sample
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
-SILENT_NS = 2_000_000_000
-FORGOTTEN_NS = 60_000_000_000
+MAX_ECHO_AGE_NS = 2_000_000_000
+PEER_TIMEOUT_NS = 60_000_000_000
 
 
 class ClockParameters(NodeParameters):
-    """Hold the limits that the launch file gives under "clocks"."""
+    """Parameters of the clock node, from the launch file's key "clocks"."""
 
-    rate_hz: Positive = 8.0
-    max_offset_uncertainty_s: Positive = 0.005
-    max_drift_ratio: float = Field(default=5e-4, gt=0, lt=0.1)
+    rate_hz: Positive = Field(default=8.0, description="rate of the pings")
+    max_offset_uncertainty_s: Positive = Field(
+        default=0.005, description="maximum uncertainty of a clock offset that nodes use"
+    )
+    max_drift_ratio: float = Field(
+        default=5e-4, gt=0, lt=0.1, description="maximum relative drift between two clocks"
+    )
 
 
 class ClockNode(Node):
-    """Ping all others, answer them with the next ping, and publish the offsets on this host."""
+    """Node that exchanges pings with all other clock nodes, and publishes the clock offsets."""
 
     measures_clocks = True
     role: ClassVar[NodeRole | None] = NodeRole.CLOCK
@@ -36,21 +40,19 @@ class ClockNode(Node):
     clocks: Output[Clocks]
 
     async def setup(self) -> None:
-        self._heard: dict[str, ClockEcho] = {}
-        self._others: dict[str, OtherClock] = {}
+        self._echoes: dict[str, ClockEcho] = {}
+        self._peers: dict[str, OtherClock] = {}
 
     def on_clock_ping(self, ping: ClockPing, header: Header) -> None:
         if header.clock_id == self.clock.id:
             return
         received_ns = self.clock_ping.received_ns
-        other = self._others.setdefault(
-            header.clock_id, OtherClock(self.parameters.max_drift_ratio)
-        )
-        self._heard[header.clock_id] = ClockEcho(
+        other = self._peers.setdefault(header.clock_id, OtherClock(self.parameters.max_drift_ratio))
+        self._echoes[header.clock_id] = ClockEcho(
             clock_id=header.clock_id, sent_ns=header.publish_ns, received_ns=received_ns
         )
         for echo in ping.echoes:
-            if echo.clock_id == self.clock.id and received_ns - echo.sent_ns < 2 * SILENT_NS:
+            if echo.clock_id == self.clock.id and received_ns - echo.sent_ns < 2 * MAX_ECHO_AGE_NS:
                 sample = make_sample(
                     echo.sent_ns,
                     echo.received_ns,
@@ -64,12 +66,14 @@ class ClockNode(Node):
     @periodic("rate_hz")
     def ping(self) -> None:
         now_ns = self.clock.now_ns()
-        for clock_id, echo in list(self._heard.items()):
-            if echo.received_ns < now_ns - FORGOTTEN_NS:
-                del self._heard[clock_id], self._others[clock_id]
-        echoes = [one for one in self._heard.values() if one.received_ns > now_ns - SILENT_NS]
+        for clock_id, echo in list(self._echoes.items()):
+            if echo.received_ns < now_ns - PEER_TIMEOUT_NS:
+                del self._echoes[clock_id], self._peers[clock_id]
+        echoes = [
+            one for one in self._echoes.values() if one.received_ns > now_ns - MAX_ECHO_AGE_NS
+        ]
         self.clock_ping_out.publish(ClockPing(echoes=tuple(echoes)))
-        offsets = tuple(self._offset(clock_id, now_ns) for clock_id in self._others)
+        offsets = tuple(self._offset(clock_id, now_ns) for clock_id in self._peers)
         self.clocks.publish(
             Clocks(
                 max_offset_uncertainty_s=self.parameters.max_offset_uncertainty_s,
@@ -84,7 +88,7 @@ class ClockNode(Node):
         )
 
     def _offset(self, clock_id: str, now_ns: int) -> ClockOffset | None:
-        other = self._others[clock_id]
+        other = self._peers[clock_id]
         found = other.estimate(now_ns)
         if found is None:
             return None

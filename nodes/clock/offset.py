@@ -1,11 +1,12 @@
-"""Estimate the offset of another clock from pings: guaranteed bounds, and a best estimate within.
+"""Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping gives four stamps: sent (t1, own), received (t2, other), answered (t3, other), received back
-    (t4, own).  No message arrives before it was sent.  The other clock minus ours was therefore at
-    most t2 - t1 at t1, and at least t3 - t4 at t4; the clock rates bound its change in between.
-    (Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting intervals.)
-    Nothing else is assumed of the network: neither equal delays in both directions, nor how delays
-    vary.
+A ping has four stamps: sent (t1, own), received (t2, other), answered (t3, other), received back
+(t4, own).  A message arrives after it was sent.  The other clock minus ours is therefore at most t2
+- t1 at t1, and at least t3 - t4 at t4; the maximum drift bounds its change in between.  No further
+assumption is made about the network's delays.
+
+Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting
+intervals.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ FIT_SPAN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Hold the other clock minus ours at `at_ns` of ours: within `half_ns` of `offset_ns`."""
+    """Offset from one ping: the other clock minus ours at our `at_ns`, offset_ns +- half_ns."""
 
     at_ns: int
     offset_ns: int
@@ -30,10 +31,9 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """Hold the other clock minus ours at `at_ns` of ours, certainly within `half_ns` of
-    `offset_ns`.
+    """Estimate of the other clock minus ours at our `at_ns`, with the bounds offset_ns +- half_ns.
 
-    drift_ratio: rate at which the other clock gains on ours, best estimate.
+    drift_ratio: estimated rate of change of the offset.
     """
 
     at_ns: int
@@ -43,24 +43,25 @@ class OffsetEstimate:
 
 
 def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
-    """Make a ping's sample, stamps in ns as in the module's text; None for an impossible one.
+    """Make the sample of a ping from its stamps (see the module's docstring), ns.
 
-    max_drift_ratio: maximum rate at which one clock may gain on the other.
+    Return None for inconsistent stamps.  max_drift_ratio: maximum relative drift of the clocks.
     """
-    away_ns, there_ns = t4 - t1, t3 - t2
-    moved_ns = max_drift_ratio * away_ns
-    delay_ns = away_ns - there_ns
-    if away_ns < 0 or there_ns < 0 or delay_ns < -moved_ns:
+    round_trip_ns, remote_ns = t4 - t1, t3 - t2
+    drift_ns = max_drift_ratio * round_trip_ns
+    delay_ns = round_trip_ns - remote_ns
+    if round_trip_ns < 0 or remote_ns < 0 or delay_ns < -drift_ns:
         return None
-    # Twice the offset, which keeps integers.
-    twice = (t2 - t1) + (t3 - t4)
-    return Sample((t1 + t4) // 2, twice // 2, int(max(0, delay_ns) / 2 + moved_ns / 2) + 1)
+    doubled_offset_ns = (t2 - t1) + (t3 - t4)
+    return Sample(
+        (t1 + t4) // 2, doubled_offset_ns // 2, int(max(0, delay_ns) / 2 + drift_ns / 2) + 1
+    )
 
 
-def bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
-    """Return the bounds of the offset (ns) at `at_ns`: each sample's bounds, widened by its age.
+def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
+    """Return the bounds of the offset (ns) at `at_ns`, from all samples and the maximum drift.
 
-    The lower bound exceeds the upper one where the samples contradict each other.
+    The lower bound exceeds the upper one if the samples are inconsistent.
     """
     low = max(
         one.offset_ns - one.half_ns - int(max_drift_ratio * abs(at_ns - one.at_ns)) - 1
@@ -74,10 +75,10 @@ def bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tupl
 
 
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
-    """Fit a line through samples: offset (ns, at the newest one, less its own) and slope.
+    """Fit a line to samples: offset at the newest one, relative to its own (ns), and slope.
 
-    Least squares, weighted by the inverse square of the bounds, so that pings without queueing
-    decide. Slope and offset are 0 while the samples span less than FIT_SPAN_NS.
+    The least squares are weighted by the inverse square of the bounds, which favours pings without
+    queueing.  Offset and slope are 0 if the samples span less than FIT_SPAN_NS.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -96,11 +97,11 @@ def fit_drift(samples: list[Sample]) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class OtherClock:
-    """Hold the samples of one other clock: the best of each half second, over the last minute.
+    """Samples of one other clock over the last minute: the best of each half second.
 
-    max_drift_ratio: maximum rate at which one clock may gain on the other.
-    resets: how often the samples contradicted each other (a clock was stepped, a machine slept) and
-        were deleted.
+    max_drift_ratio: maximum relative drift of the clocks.
+    resets: number of deletions of all samples, after an inconsistent one (for example by a clock
+        step).
     """
 
     max_drift_ratio: float
@@ -108,14 +109,14 @@ class OtherClock:
     resets: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Store a sample if it is the best of its half second."""
+        """Add a sample if it is the best of its half second."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return
         while samples and samples[0].at_ns < sample.at_ns - WINDOW_NS:
             samples.pop(0)
         if samples:
-            low, high = bounds(samples, sample.at_ns, max_drift_ratio=self.max_drift_ratio)
+            low, high = compute_bounds(samples, sample.at_ns, max_drift_ratio=self.max_drift_ratio)
             if sample.offset_ns - sample.half_ns > high or sample.offset_ns + sample.half_ns < low:
                 self.resets += 1
                 samples.clear()
@@ -126,10 +127,10 @@ class OtherClock:
         samples.append(sample)
 
     def estimate(self, at_ns: int) -> OffsetEstimate | None:
-        """Estimate the other clock at `at_ns` of ours; None before the first sample."""
+        """Estimate the offset at our `at_ns`; None before the first sample."""
         if not self.samples:
             return None
-        low, high = bounds(self.samples, at_ns, max_drift_ratio=self.max_drift_ratio)
+        low, high = compute_bounds(self.samples, at_ns, max_drift_ratio=self.max_drift_ratio)
         newest = self.samples[-1]
         fitted, slope = fit_drift(self.samples)
         slope = min(max(slope, -self.max_drift_ratio), self.max_drift_ratio)

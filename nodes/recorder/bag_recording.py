@@ -22,17 +22,17 @@ from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 RETRY_NS = 5_000_000_000
-"""Pause after an error of the disk before the next attempt."""
+"""Time after a disk error before the next attempt."""
 
 
 class BagRecording:
-    """Write messages to a bag while recording is requested.
+    """Recording of messages to bags while it is requested.
 
-    A bag ends while there is still room for its index.  When twice that room is free again, another
-    bag begins with the last messages of all latched topics.  Errors of the disk are passed to
-    `on_error` and never raised while messages are written.
+    A bag ends at `keep_free_bytes`, which leave space for its index.  When twice as much is free
+    again, another bag starts with the last messages of all latched topics.  Disk errors during
+    writing are passed to `on_error`, not raised.
 
-    note: state of the recording, one line.  lost: messages that no bag holds since the last bag.
+    note: state of the recording, one line.  lost: number of lost messages since the last bag.
     """
 
     def __init__(
@@ -52,28 +52,28 @@ class BagRecording:
         self._retry_ns = 0
         self.requested = False
         self.lost = 0
-        self.note = "waits for a request to record"
+        self.note = "waiting for a request to record"
 
     @property
     def path(self) -> Path | None:
-        """The bag that is being written; None: none."""
+        """Return the current bag; None if there is none."""
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
-        """Begin a bag named after the present time; BagError, OSError."""
+        """Start a bag named after the current time.  Raises BagError or OSError."""
         self.requested, self.lost = True, 0
-        # The time of day is used for the name of the bag and for people only.
+        # The time of day is only used for the bag's name.
         now = datetime.now(UTC)
         self._path = Path(now.astimezone().strftime(str(self._parameters.bag)))
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BagError(f"{self._path.parent}: cannot be made: {error.strerror}") from error
-        self._begin_bag()
+            raise BagError(f"{self._path.parent}: cannot be created: {error.strerror}") from error
+        self._start_bag()
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Begin a bag, or end the present one; an error of the disk is passed to `on_error`."""
+        """Start a bag, or end the current one; a disk error is passed to `on_error`."""
         try:
             if requested and not self.requested:
                 self.start()
@@ -86,25 +86,25 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag while there is room for its index, or begin another if there is room."""
+        """End the bag at a low free space, or start another one at a sufficient free space."""
         if not self.requested:
             return
-        free, keep = free_bytes(self._path.parent), self._parameters.keep_free_bytes
-        if self._bag is not None and free < keep:
-            self._end_bag(OSError(f"{free >> 20} MiB are free at {self._path.parent}"))
-        elif self._bag is None and free >= 2 * keep and self._clock.now_ns() >= self._retry_ns:
+        free, minimum = free_bytes(self._path.parent), self._parameters.keep_free_bytes
+        if self._bag is not None and free < minimum:
+            self._end_bag(OSError(f"only {free >> 20} MiB free at {self._path.parent}"))
+        elif self._bag is None and free >= 2 * minimum and self._clock.now_ns() >= self._retry_ns:
             lost, self.lost = self.lost, 0
             try:
-                self._begin_bag(lost_messages=str(lost))
+                self._start_bag(lost_messages=str(lost))
             except (BagError, OSError) as error:
                 self.lost += lost
                 self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
-        """Write a message, and return whether it is lost: requested, but in no bag.
+        """Write a message, and return whether it is lost because no bag is open.
 
-        The last message of each writer of a latched topic is stored for the next bag.  Requests to
-        record are not: they hold for one bag.
+        The last message of each writer of a latched topic is stored for the next bag, except
+        requests to record.
         """
         is_request = self._parameters.start_paused and topic.message is Recording
         if topic.delivery is Delivery.LATCHED and not is_request:
@@ -121,11 +121,11 @@ class BagRecording:
         return self.requested
 
     def close(self) -> None:
-        """Close the bag; BagError if the disk did not take everything."""
+        """Close the bag.  Raises BagError if it could not be written completely."""
         if self._bag is not None:
             self._bag.close()
 
-    def _begin_bag(self, **more: str) -> None:
+    def _start_bag(self, **more: str) -> None:
         recording = {
             "clock_id": self._clock.id,
             "started_ns": str(self._clock.now_ns()),
@@ -139,16 +139,16 @@ class BagRecording:
         for topic, frames, header in self._latched.values():
             bag.write_frames(topic, frames, header, self._clock.now_ns())
         bag.flush()
-        self.note = f"records to {bag.path}"
+        self.note = f"recording to {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
-        """Close the bag as it is, and report why it ends."""
+        """Close the bag after an error, and report the error."""
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
         self.note = f"NOT RECORDING: {error}"
         self._on_error(error)
         if bag is not None:
-            # The error of the disk is reported already, and a cut bag can be read.
+            # The disk error is already reported, and a truncated bag can be read.
             with suppress(BagError):
                 bag.close()
             if bag.messages == 0:
@@ -156,10 +156,7 @@ class BagRecording:
 
 
 def free_path(path: Path) -> Path:
-    """Return `path`, or the first of its names with -2, -3, ... that does not exist.
-
-    A restarted recorder therefore never overwrites a bag.
-    """
+    """Return a path that does not exist: `path`, or one with the suffix -2, -3, ..."""
     if not path.exists():
         return path
     for number in count(2):
@@ -172,7 +169,7 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a new bag at a free path, with the attached files; BagError, OSError."""
+    """Open a bag at a free path, with attached files.  Raises BagError or OSError."""
     bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
     try:
         for file in attach:

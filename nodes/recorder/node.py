@@ -1,4 +1,4 @@
-"""Record topics to a bag: the bytes of the wire, and what is needed to decode them."""
+"""Record topics to a bag: the encoded messages and the schemas to decode them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 
 class Recorder(Node):
-    """Write every message that arrives; an existing bag is never overwritten.
+    """Node that writes received messages to a bag; an existing bag is never overwritten.
 
-    When the disk is full, the graph continues without a recording.  Messages that no bag holds are
-    counted as dropped, and the note gives the reason; see `BagRecording`.
+    If the disk is full, the graph continues without a recording.  Lost messages are counted as
+    dropped, and the note contains the reason; see `BagRecording`.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RECORDER
@@ -30,15 +30,15 @@ class Recorder(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it wrote this bag"
+        return "it recorded this bag"
 
     @classmethod
     def further_inputs(
         cls, parameters: RecorderParameters, written: Sequence[Topic]
     ) -> Sequence[str]:
-        wanted = parameters.topics or [topic.name for topic in written if topic.logged]
+        topics = parameters.topics or [topic.name for topic in written if topic.logged]
         requests = ("recording",) if parameters.start_paused else ()
-        return list(dict.fromkeys((*wanted, *parameters.include, *requests)))
+        return list(dict.fromkeys((*topics, *parameters.include, *requests)))
 
     async def setup(self) -> None:
         compress = self.parameters.compress
@@ -59,12 +59,12 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full, and begin another when there is room."""
+        """End the bag before the disk is full, and start another one at sufficient free space."""
         self._recording.check_disk()
         self.note = self._recording.note
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Write the frames of a message, undecoded; replaces the call of a handler."""
+        """Write the undecoded frames of a message."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         if self.parameters.start_paused and source.topic.message is Recording:

@@ -14,7 +14,7 @@ RUN_FILES = tuple(
 
 
 class RecorderParameters(NodeParameters):
-    """Select the topics to record and the bag to write."""
+    """Parameters of the recorder: topics to record and bag to write."""
 
     bag: Path = Field(
         description="file to write; %Y%m%d-%H%M%S and similar codes become the start time"
@@ -23,23 +23,23 @@ class RecorderParameters(NodeParameters):
         default=(), description="topics to record; empty: all that are logged by default"
     )
     include: tuple[str, ...] = Field(
-        default=(), description="topics to record besides those, for example stereo"
+        default=(), description="further topics to record, for example stereo"
     )
     compress: bool | None = Field(
         default=None,
-        description="compress the bag; null: unless it holds images, which are slow to compress",
+        description="compress the bag; null: unless it contains images, which are slow to compress",
     )
     start_paused: bool = Field(
         default=False,
-        description="record only while a `recording` message requests it, each time to a new bag",
+        description="record only on request by the topic `recording`, each time to a new bag",
     )
     keep_free_bytes: int = Field(
         default=256 << 20,
         ge=0,
-        description="free space of the disk below which the bag is ended, with its index; with "
-        "twice as much free again, another bag begins",
+        description="minimum free space of the disk, below which the bag is ended; another bag "
+        "starts at twice as much",
     )
-    watch_hz: float = Field(default=2.0, gt=0.0, description="rate of the check of the disk")
+    watch_hz: float = Field(default=2.0, gt=0.0, description="rate of the check of the free space")
     attach: tuple[Path, ...] = Field(
         default=RUN_FILES, description="files to store in the bag; @run is the directory of the run"
     )

@@ -1,7 +1,4 @@
-"""Benchmark the triangulator's method families: time, accuracy and limits.
-
-The time is that of one image pair, as in the node; the error is that of many.
-"""
+"""Benchmark the triangulator's method families: time per image pair, and error over many pairs."""
 
 from __future__ import annotations
 
@@ -30,8 +27,7 @@ Image = NDArray[np.uint8]
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)
 BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
-"""Baselines of the rigs.  The smallest is a tenth of the scene's: rays to a point at half a metre
-are nearly parallel."""
+"""Baselines of the rigs.  The smallest, a tenth of the scene's, gives nearly parallel rays."""
 
 MAX_NOISE_PX = 0.1
 """Maximum noise of a marker method within its range."""
@@ -40,8 +36,9 @@ MAX_NOISE_PX = 0.1
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
     """Yield trials with points in slabs of the finger's volume, by pixel noise and baseline.
 
-    In range are a marker's noise and at least the scene's baseline.  The scene requires its own
-    baseline, which replaces the nearest, and the noise that its tolerance leaves to the marker.
+    The scene's baseline replaces the nearest of BASELINES_M.  Trials in range have at least this
+    baseline, and at most MAX_NOISE_PX; those in the scene's range have its baseline, and the noise
+    that its tolerance allows.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
@@ -94,7 +91,7 @@ def _triangulation_trial(
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
     def error_mm(_: Floats) -> float:
-        """Return the root mean square error; a lost point counts as being at the camera."""
+        """Return the root mean square error, mm; the error of a lost point is its depth."""
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
         away = np.linalg.norm(points - truth, axis=1)
         depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
@@ -127,7 +124,7 @@ RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""Half the width of the slope under a marker."""
+"""Half the width of the sloped ground under a marker."""
 
 MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
@@ -136,13 +133,16 @@ MARKER_CASES = (
 )
 """Radius (px), noise (multiples of the sensor's), motion in the exposure (px), ground slope (levels
 per px).  A marker of 3 mm radius has 3.2 px at half a metre, 6 px at 0.27 m and 1.6 px at 1 m.  At
-1 m/s it moves by 4 px in 4 ms.  A finger lit from its side slopes by 2 or 3 levels per px."""
+1 m/s it moves by 4 px in 4 ms.  A finger lit from the side has a gradient of 2 or 3 levels per
+px."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnDisc:
-    """Draw a disc: centre, radius, motion and standard deviation of the blur in px; levels of
-    marker and ground; the ground's slope along y in levels per px."""
+    """Synthetic disc: centre, radius, motion and blur (standard deviation), px; levels.
+
+    slope: gradient of the ground along y, levels per px.
+    """
 
     centre: Floats
     radius_px: float
@@ -153,7 +153,7 @@ class DrawnDisc:
     slope: float = 0.0
 
     def levels(self) -> Floats:
-        """Render the image without noise by counting rays, not by the fit's formula for an edge."""
+        """Render the image without noise by supersampling, independent of the fit's edge model."""
         fine = (np.arange(IMAGE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
         x, y = fine[None, :] - self.centre[0], fine[:, None] - self.centre[1]
         steps = 1 + int(4.0 * np.linalg.norm(self.motion))
@@ -176,11 +176,10 @@ def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Ima
 
 
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
-    """Return the Cramer-Rao bound on a disc's centre, px per axis, with all other parameters
-    unknown.
+    """Return the Cramer-Rao bound on a disc's centre, px per axis; all parameters are unknown.
 
-    The slopes are central differences.  The information that the levels carry about the noise is
-    neglected, as is rounding.
+    The derivatives are central differences.  Rounding, and the dependence of the noise on the
+    levels, are neglected.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -205,8 +204,7 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
-    """Return the cases at the sheet, at rest and at the scene's speed, lit from front and side, as
-    in `MARKER_CASES`."""
+    """Return the cases at the sheet, at rest and at the scene's speed; see `MARKER_CASES`."""
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
     radius_px = round(MARKER_RADIUS_M * px_per_m, 2)
@@ -218,13 +216,13 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
 
 
 def _marker_trials(scene: Scene) -> Iterator[Trial]:
-    """Yield trials with discs all over the pixel grid, moving in all directions.
+    """Yield trials with discs at random subpixel positions, moving in random directions.
 
-    Their noise is a multiple of the scene's sensor noise, which the fit assumes.
+    The noise is a multiple of the scene's sensor noise, which the fit assumes.
     """
-    asked = _scene_cases(scene)
+    scene_cases = _scene_cases(scene)
     sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
-    for radius_px, level, motion_px, slope in dict.fromkeys((*asked, *MARKER_CASES)):
+    for radius_px, level, motion_px, slope in dict.fromkeys((*scene_cases, *MARKER_CASES)):
         noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
         random = np.random.default_rng(1)
         centres = IMAGE_PX // 2 + random.uniform(-0.5, 0.5, (MARKER_IMAGES, 2))
@@ -244,7 +242,7 @@ def _marker_trials(scene: Scene) -> Iterator[Trial]:
         }
         for name in MARKER_METHODS:
             in_range = radius_px >= 3.0 and level <= 2.0 and motion_px <= 4.0
-            in_scene = (radius_px, level, motion_px, slope) in asked
+            in_scene = (radius_px, level, motion_px, slope) in scene_cases
             yield _marker_trial(
                 name,
                 case,
@@ -275,8 +273,7 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, appearance, sensor)
 
     def error_px(_: list[Marker]) -> float:
-        """Return the error per axis; a marker that is missed or not alone counts as the image's
-        size."""
+        """Return the rms error per axis, px; the image's size unless one marker is found."""
         found = [markers_in(image) for image in images]
         off = [
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))
@@ -296,8 +293,7 @@ def _marker_trial(
 
 
 def _marker_tolerance_px(scene: Scene) -> float:
-    """Return the marker noise, px, that moves a fingertip at the screen's centre by the scene's
-    tolerance."""
+    """Return the marker noise, px, that gives the scene's tolerance at the screen's centre."""
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
     one_px = measure(
@@ -309,7 +305,7 @@ def _marker_tolerance_px(scene: Scene) -> float:
         right_covariance=np.eye(2),
     )
     if one_px is None:
-        raise ValueError("scene: camera: the screen's centre is not in front of both cameras")
+        raise ValueError("scene: camera: the screen's centre must be in front of both cameras")
     return scene.tolerances.fingertip_m / one_px.deviation_m
 
 

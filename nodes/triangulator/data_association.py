@@ -1,10 +1,10 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-A marker outside the finger's gate is clutter.  Clutter has a track of its own, so that it is not
-taken for the finger while the finger is occluded, or after both were merged in the images.  The
-most likely assignment of markers to tracks, by position and brightness, is a global nearest
-neighbour (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation).
-Where another assignment is about as likely, a marker is ambiguous and no fingertip is reported.
+A marker outside the finger's gate is clutter.  Clutter is tracked separately, so that it is not
+confused with the finger during an occlusion or after both were merged in the images.  The most
+likely assignment of markers to tracks, by position and brightness, is a global nearest neighbour
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation).  If another
+assignment is about as likely, a marker is ambiguous and no fingertip is reported.
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
-"""Status of a track that is not the finger's: it may be the finger; it may be the finger or
-clutter; it is clutter."""
+"""Status of a track beside the finger's.
+
+tentative: may be the finger.  ambiguous: finger or clutter.  clutter: certainly not the finger.
+"""
 
 POSITION_SIGMA_M = 0.0005
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
 STUDENT_T_DOF = 2.0
-"""Scales of a marker's residual from constant velocity, per axis: of its position and acceleration.
-Residuals are heavy-tailed: Student's t with STUDENT_T_DOF degrees of freedom."""
+"""Scales of a marker's residual from constant velocity per axis: position and acceleration.
+Residuals follow Student's t distribution with STUDENT_T_DOF degrees of freedom."""
 
 MERGE_DISTANCE_M = 0.002
-"""Markers closer than this are one marker, detected twice."""
+"""Minimum distance of two markers; closer ones are one marker, detected twice."""
 
 MAX_POSITION_SIGMA_M = 0.1
-"""Bound of the predicted position error: a marker unseen for long may be anywhere in the volume."""
+"""Upper bound of the predicted position error."""
 
 MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
 INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
 POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
 """Standard deviations of appearance, relative to the level of a marker and of its surroundings.
-The minimum holds from image to image, the initial value for a new track, and the population value
-between different markers.  The surroundings vary more: the finger's marker always has skin around
-it, other markers have not."""
+The minimum is that from image to image, the initial value that of a new track, and the population
+value that between different markers."""
 
 APPEARANCE_TIME_CONSTANT_S = 0.2
 APPEARANCE_VARIANCE_TIME_CONSTANT_S = 3.0
@@ -56,47 +57,45 @@ NEW_TRACK_COST = 6.0 * math.log(MAX_POSITION_SIGMA_M) + 2.0 * float(
     np.log(POPULATION_APPEARANCE_SIGMA).sum()
 )
 INFEASIBLE_COST = 1e9
-"""Costs of a new track, see `_association_cost`, and of an infeasible assignment."""
+"""Costs of a new track (see `_association_cost`) and of an infeasible assignment."""
 
 AMBIGUITY_MARGIN = 9.0
 """Difference in cost below which two assignments are ambiguous: 3 sigma."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""Squared appearance distance beyond which markers differ; a larger one carries no more
-information: 4 sigma."""
+"""Upper bound of the squared appearance distance; markers beyond it differ: 4 sigma."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05
 """Time constant of a clutter track's velocity."""
 
 CLUTTER_SEARCH_PERIOD_S = 0.1
-"""Period of the search of the whole images while the finger is tracked."""
+"""Period of the search of the full images while the finger is tracked."""
 
 LATE_GATE_M = 0.03
-"""A lone marker in a late image belongs to the finger if it is this close to the finger."""
+"""Maximum distance from the finger of its marker in a late image."""
 
 STATIONARY_RADIUS_M = 3e-4
 STATIONARY_TIME_S = 1.5
-"""A finger never stays within STATIONARY_RADIUS_M for this long."""
+"""Minimum time that a stationary marker stays within STATIONARY_RADIUS_M; a finger never does."""
 
 TRACK_TIMEOUT_S = 1.0
 STATIONARY_TRACK_TIMEOUT_S = 10.0
-"""Times after which an unseen track is deleted: a moving one and a stationary one."""
+"""Times after which a track without detections is deleted: a moving one and a stationary one."""
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1
-"""A tentative track with fewer hits than MIN_HITS is deleted sooner."""
+"""Timeout of a tentative track with fewer than MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
-"""An ambiguous marker that is the only one in view for this long is the finger's."""
+"""Time after which the only marker in view, if ambiguous, is assigned to the finger."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""After the finger was unseen for this long, moving clutter becomes ambiguous."""
+"""Time without the finger after which moving clutter becomes ambiguous."""
 
 
 @dataclass(slots=True)
 class Track:
-    """Hold a marker's last state: position (3,) m, velocity (3,) m/s, appearance (2,) and its
-    variance."""
+    """Track of a marker: position (3,) m, velocity (3,) m/s, appearance (2,) and its variance."""
 
     point: Floats
     velocity: Floats
@@ -111,11 +110,11 @@ class Track:
         return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)
 
     def appearance_distance_sq(self, appearance: Floats) -> float:
-        """Return the squared Mahalanobis distance between another appearance (2,) and this one."""
+        """Return the squared Mahalanobis distance of an appearance (2,) from the track's."""
         return float((np.square(appearance - self.appearance) / self.appearance_variance).sum())
 
     def update_appearance(self, appearance: Floats, at_ns: int) -> None:
-        """Average a new appearance (2,) into the mean, and its deviation into the variance."""
+        """Add an appearance (2,) to the exponential averages of the mean and the variance."""
         since_s, residual = (at_ns - self.at_ns) * 1e-9, appearance - self.appearance
         self.appearance = (
             self.appearance - math.expm1(-since_s / APPEARANCE_TIME_CONSTANT_S) * residual
@@ -129,11 +128,11 @@ class Track:
 
 @dataclass(slots=True)
 class ClutterTrack(Track):
-    """Hold a track that is not the finger's.
+    """Track of a marker that is not the finger's.
 
-    stationary_point, stationary_since_ns: the point (3,) m that the marker has stayed within
-        STATIONARY_RADIUS_M of, and since when.
-    sole_since_ns: since when it is the only marker in view.
+    stationary_point, stationary_since_ns: centre (3,) m of the ball of STATIONARY_RADIUS_M that the
+        marker has not left, and the time since then.
+    sole_since_ns: time since which it is the only marker in view.
     """
 
     stationary_point: Floats
@@ -158,7 +157,7 @@ class ClutterTrack(Track):
 
     @property
     def is_stationary(self) -> bool:
-        """Return whether the marker was stationary when it was last seen."""
+        """Return whether the marker was stationary at its last detection."""
         return (self.at_ns - self.stationary_since_ns) * 1e-9 >= STATIONARY_TIME_S
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
@@ -167,7 +166,7 @@ class ClutterTrack(Track):
         return Track.predict(self, at_ns)
 
     def update(self, marker: Candidate, at_ns: int, *, is_sole: bool) -> None:
-        """Add a detection, the only one of its image pair if `is_sole`."""
+        """Update the track by a detection; is_sole: it is the only one of its image pair."""
         since_s = (at_ns - self.at_ns) * 1e-9
         weight = 1.0 if self.hits == 1 else -math.expm1(-since_s / VELOCITY_TIME_CONSTANT_S)
         velocity = (marker.point - self.point) / since_s
@@ -180,7 +179,7 @@ class ClutterTrack(Track):
             self.sole_since_ns = at_ns
 
     def is_alive(self, at_ns: int) -> bool:
-        """Return whether the track has neither timed out nor a time in the future."""
+        """Return whether the track's last detection is neither too old nor in the future."""
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
             timeout_s = STATIONARY_TRACK_TIMEOUT_S
@@ -190,7 +189,7 @@ class ClutterTrack(Track):
 
 
 class DataAssociation:
-    """Decide which marker is the finger's, and track the clutter beside it."""
+    """Selector of the finger's marker that also tracks the clutter."""
 
     def __init__(self) -> None:
         self.clutter_tracks: list[ClutterTrack] = []
@@ -201,8 +200,7 @@ class DataAssociation:
     def select_finger(
         self, at_ns: int, detection: StereoDetection, tracker: Tracker
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-        """Return the reason and the point of the finger in an image pair, and update the
-        tracker."""
+        """Update the tracker from an image pair; return the reason and the finger's point."""
         if tracker.is_late(at_ns):
             return self._associate_late(at_ns, detection, tracker)
         if tracker.gate(at_ns) is not None:
@@ -221,14 +219,14 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger in an image pair that is older than the newest one.
 
-        Clutter of that time is not stored, so that only the gate around the finger decides.
-        Several late pairs in a row restart the track, since the clock has stepped back.
+        Only the distance from the finger decides, since past clutter is not stored.  Several late
+        pairs in a row restart the track, since the clock has stepped back.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
-            here = self._finger.point
+            centre = self._finger.point
             markers = tuple(
-                marker for marker in markers if math.dist(marker.point, here) < LATE_GATE_M
+                marker for marker in markers if math.dist(marker.point, centre) < LATE_GATE_M
             )
         if detection.reason not in ("ok", "two_markers") or len(markers) != 1:
             return detection.reason, detection.measured
@@ -240,11 +238,11 @@ class DataAssociation:
         return result, marker.measured
 
     def is_clutter_search_due(self, at_ns: int) -> bool:
-        """Return whether the last search is too long ago or in the future after a clock step."""
+        """Return whether the full images are due to be searched for clutter."""
         return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
 
     def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:
-        """Update the clutter tracks from the whole images in which the finger was just found."""
+        """Update the clutter tracks from the full images in which the finger was just found."""
         self._clutter_searched_ns = at_ns
         seen = [one.point for one in self.clutter_tracks if one.at_ns == at_ns]
         if self._finger is not None:
@@ -259,7 +257,7 @@ class DataAssociation:
                 track.status = "clutter"
 
     def _update_finger(self, at_ns: int, marker: Candidate, tracker: Tracker) -> None:
-        """Store the marker that the tracker has accepted as the finger's."""
+        """Update the finger's track with the marker that the tracker has accepted."""
         assert tracker.estimate is not None
         if self._finger is None:
             self._finger = ClutterTrack.of(marker, at_ns)
@@ -273,7 +271,7 @@ class DataAssociation:
     def _continue_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker of a tracked finger, or why there is none."""
+        """Return the marker of a tracked finger, or the reason if there is none."""
         tracks = self._associate(at_ns, [*detection.markers, *detection.clutter], self._finger)
         near = tracks[: len(detection.markers)]
         finger_markers = [
@@ -281,7 +279,7 @@ class DataAssociation:
         ]
         for track in tracks if finger_markers else tracks[len(near) :]:
             if track is not None and track.status == "tentative":
-                # While the finger is not in view, it is only known that this marker is outside the
+                # Without the finger in view, it is only certain that the marker is outside the
                 # gate.
                 track.status = "clutter" if finger_markers else "ambiguous"
         if detection.reason not in ("ok", "two_markers"):
@@ -294,14 +292,12 @@ class DataAssociation:
     def _initiate_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker that a track may begin with, or why there is none."""
+        """Return the marker that may start a track, or the reason if there is none."""
         markers = [*detection.markers, *detection.clutter]
-        succeeded = any(track is self._successor for track in self.clutter_tracks)
-        tracks = self._associate(at_ns, markers, None if succeeded else self._finger)
+        has_successor = any(track is self._successor for track in self.clutter_tracks)
+        tracks = self._associate(at_ns, markers, None if has_successor else self._finger)
         for index, marker in enumerate(markers):
-            if (
-                tracks[index] is None
-            ):  # the finger was lost here; it is one of the tracks from now on
+            if tracks[index] is None:  # the lost finger's marker becomes a separate track
                 self._successor = tracks[index] = ClutterTrack.of(marker, at_ns)
                 self.clutter_tracks.append(self._successor)
         best = self._select_candidate(at_ns)
@@ -314,14 +310,14 @@ class DataAssociation:
         return "no_marker" if is_all_clutter else "two_markers"
 
     def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
-        """Return the track that takes over from the lost finger; None if that is ambiguous."""
+        """Return the track that continues the lost finger's; None if it is ambiguous."""
         finger = self._finger
-        unseen_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
+        absence_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
         candidates: list[tuple[float, ClutterTrack]] = []
         for track in self.clutter_tracks:
             if (
                 track.status == "clutter"
-                and unseen_s > CLUTTER_RELEASE_TIME_S
+                and absence_s > CLUTTER_RELEASE_TIME_S
                 and not track.is_stationary
             ):
                 track.status = "ambiguous"
@@ -349,7 +345,7 @@ class DataAssociation:
     def _associate(
         self, at_ns: int, markers: Sequence[Candidate], finger: Track | None
     ) -> list[ClutterTrack | None]:
-        """Assign the markers of an image pair to tracks; None stands for the finger."""
+        """Assign the markers of an image pair to tracks; None is the finger's."""
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
         if not markers:
             return []
@@ -386,9 +382,8 @@ class DataAssociation:
 
 
 def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
-    """Return twice the negative log likelihood, up to a constant, that a marker belongs to a
-    track."""
-    if one.at_ns == at_ns:  # another marker of the same image pair has updated it
+    """Return twice the negative log likelihood of a marker in a track, up to a constant."""
+    if one.at_ns == at_ns:  # it was already updated by this image pair
         return INFEASIBLE_COST
     point, sigma_m = one.predict(at_ns)
     residual = math.dist(marker.point, point) / sigma_m
@@ -400,8 +395,7 @@ def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the markers (rows) that may equally belong to the finger (a column) and to another
-    track."""
+    """Return the markers (rows) whose assignment to the finger (a column) is ambiguous."""
     finger_row = next((row for row, column in enumerate(columns) if column == finger), None)
     ambiguous = set[int]()
     for row, column in enumerate(columns):

@@ -1,4 +1,4 @@
-"""Filter measured points into the finger's position, and predict where it will be.
+"""Estimate the finger's position from measured points, and predict it.
 
 Each method is a filter with four functions on an immutable estimate.  `initialize` makes it from
 one measurement, and `update` adds a later one.  `moments` gives position, velocity and their
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 ADAPTATION_THRESHOLD = 6.0
-"""Mean square of the normalised innovation up to which a motion counts as steady."""
+"""Maximum mean square of the normalised innovation in steady motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Hold a filter's state (n,) and its estimated error covariance (n, n) at one time."""
+    """State (n,) of a filter at one time, and its error covariance (n, n)."""
 
     at_ns: int
     state: Floats
@@ -32,7 +32,7 @@ class Estimate:
 
 
 class Filter(Protocol):
-    """Define what a tracking method offers."""
+    """Interface of a tracking method."""
 
     def initialize(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
         """Return the estimate after one measured point."""
@@ -45,18 +45,17 @@ class Filter(Protocol):
         ...
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-        """Return position (3,), velocity (3,) and their covariance (6, 6) at the estimate's
-        time."""
+        """Return position (3,), velocity (3,) and their joint covariance (6, 6)."""
         ...
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
-        """Return positions (n, 3) at times (n,) s after the estimate's."""
+        """Predict positions (n, 3) at times (n,) s after the estimate."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Unfiltered:
-    """Report the last measured point, and predict that the finger stays there."""
+    """Method without a filter: the last measured point, constant in predictions."""
 
     max_speed_m_per_s: float
 
@@ -78,7 +77,7 @@ class Unfiltered:
 
 @dataclass(frozen=True, slots=True)
 class OneEuro:
-    """Filter by a low-pass whose cut-off rises with speed (Casiez, Roussel, Vogel, CHI 2012).
+    """Low-pass filter whose cut-off rises with speed (Casiez, Roussel, Vogel, CHI 2012).
 
     The state is (smoothed position, smoothed velocity, last measured point).  Predictions assume
     that the smoothed velocity stays constant.
@@ -128,15 +127,15 @@ def _with_unknown_velocity(position_covariance: Floats, max_speed: float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Tremor:
-    """Model physiological tremor: band-limited noise, as lightly damped oscillators side by side.
+    """Model of physiological tremor: band-limited noise of parallel, lightly damped oscillators.
 
-    amplitude_m: standard deviation per axis, of all modes together.
+    amplitude_m: standard deviation per axis, sum of all modes.
     band_hz: frequency band that the modes share.
     modes: number of oscillators.
     damping: damping ratio of each oscillator.
 
-    A few noise-driven modes stand for the band, as the grid of frequencies does in the multiple
-    Fourier linear combiner (Veluvolu, Ang, Sensors 11, 2011).  They predict as well.
+    The modes sample the band, as in the multiple Fourier linear combiner (Veluvolu, Ang, Sensors
+    11, 2011).
     """
 
     amplitude_m: float
@@ -146,19 +145,19 @@ class Tremor:
 
     @property
     def size(self) -> int:
-        """Number of states per axis: position and velocity of each mode in turn."""
+        """Return the number of states per axis: position and velocity of each mode in turn."""
         return 2 * self.modes
 
     @property
     def _natural(self) -> Floats:
-        """Natural frequencies (modes,) rad/s, at the centres of equal parts of the band."""
+        """Return natural frequencies (modes,) rad/s, at the centres of equal parts of the band."""
         low, high = self.band_hz
         fractions = (np.arange(self.modes) + 0.5) / self.modes
         return np.asarray(2.0 * np.pi * (low + fractions * (high - low)))
 
     @property
     def stationary(self) -> Floats:
-        """Stationary covariance (size, size) of the state."""
+        """Return the stationary covariance (size, size) of the state."""
         variance = self.amplitude_m**2 / self.modes
         return np.diag(np.stack([np.ones(self.modes), self._natural**2], axis=1).ravel()) * variance
 
@@ -175,8 +174,7 @@ class Tremor:
         return result
 
     def displacements(self, horizons_s: Floats) -> Floats:
-        """Return the contribution (n, size) of each state to the displacement after times (n,)
-        s."""
+        """Return the weight (n, size) of each state in the displacement after times (n,) s."""
         stays, sine, _ = self._oscillator_response(horizons_s)
         return np.stack([stays, sine], axis=2).reshape(len(horizons_s), self.size)
 
@@ -184,7 +182,7 @@ class Tremor:
         """Return the response of the modes after times (n,) s.
 
         The first two arrays (n, modes) are the contributions of initial displacement and velocity.
-        The third (modes,) holds the decay rates in 1/s.
+        The third (modes,) contains the decay rates, 1/s.
         """
         natural = self._natural
         decay, swing = self.damping * natural, natural * np.sqrt(1.0 - self.damping**2)
@@ -196,23 +194,22 @@ class Tremor:
 
 @dataclass(frozen=True, slots=True)
 class Kalman:
-    """Filter a hand's motion by a Kalman filter: white noise in the `order`-th derivative, plus
-    tremor.
+    """Kalman filter of a finger's motion: white noise in the `order`-th derivative, plus tremor.
 
     order: 2 assumes constant velocity, 3 constant acceleration, apart from the noise.
     acceleration_decay_per_s: rate at which an acceleration decays (Singer, IEEE Trans. Aerospace
-        and Electronic Systems 6, 1970), since no hand keeps one for long.  0 keeps it.
+        and Electronic Systems 6, 1970); 0 for constant acceleration.
     noise: root of the noise's spectral density in steady motion, m/s^order per root hertz.
     max_noise: bound up to which the noise grows with the innovation of a point off the steady
         motion (adaptive process noise: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
         Tracking and Navigation, section 11.2).
     max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger, which set the initial
         covariance.
-    tremor: model of the tremor in the state; None leaves it out.
+    tremor: model of the tremor in the state; None for no such states.
     unmodelled_tremor_m: standard deviation of a tremor outside the state.  It adds to the
         measurement noise and to the covariance of the finger's position.
 
-    The state holds, each (3,): position, velocity, acceleration if order is 3, then each mode's
+    The state contains, each (3,): position, velocity, acceleration if order is 3, then each mode's
     displacement and velocity.
     """
 
@@ -260,12 +257,12 @@ class Kalman:
             full[rows, rows] += extra * np.kron(_white_noise(self.order, dt), np.eye(3))
             spread = observed @ full @ observed.T + covariance
         gain = np.linalg.solve(spread, observed @ full).T
-        keep = np.eye(len(state)) - gain @ observed
-        full = keep @ full @ keep.T + gain @ covariance @ gain.T
+        residual_gain = np.eye(len(state)) - gain @ observed
+        full = residual_gain @ full @ residual_gain.T + gain @ covariance @ gain.T
         return Estimate(at_ns, state + gain @ innovation, 0.5 * (full + full.T))
 
     def _propagate(self, before: Estimate, dt: float) -> tuple[Floats, Floats]:
-        """Return state and covariance dt later, for a steady motion."""
+        """Propagate state and covariance by dt, for a steady motion."""
         axis = self._transition(dt)
         step = np.kron(axis, np.eye(3))
         noise = np.zeros_like(axis)
@@ -288,11 +285,10 @@ class Kalman:
         return axis
 
     def _adapted_noise(self, innovation: Floats, dt: float) -> float:
-        """Return the noise that explains an innovation (3,): |v|^2 is 3 times its variance over
-        dt."""
+        """Return the noise for which the expected |innovation|^2 after dt is the given one."""
         variance = _white_noise(self.order, dt)[0, 0]
-        wanted = float(np.linalg.norm(innovation)) / np.sqrt(3.0 * variance)
-        return float(min(max(wanted, self.noise), self.max_noise))
+        noise = float(np.linalg.norm(innovation)) / np.sqrt(3.0 * variance)
+        return float(min(max(noise, self.noise), self.max_noise))
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
         pick = np.zeros((6, len(estimate.state)))
@@ -305,10 +301,10 @@ class Kalman:
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
         axes = estimate.state.reshape(-1, 3)
-        carried = [
+        transitions = [
             _integration(self.order, float(t), self.acceleration_decay_per_s)[0] for t in horizons_s
         ]
-        points = np.stack(carried) @ axes[: self.order]
+        points = np.stack(transitions) @ axes[: self.order]
         if self.tremor:
             points += self.tremor.displacements(horizons_s) @ axes[self.order :]
         return np.asarray(points)
@@ -321,17 +317,17 @@ def _integration(order: int, dt: float, acceleration_decay_per_s: float) -> Floa
     rate = acceleration_decay_per_s
     if rate * dt < 1e-6:
         return np.array([[1.0, dt, 0.5 * dt * dt], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    left, gone = math.exp(-rate * dt), -math.expm1(-rate * dt)
+    decay, loss = math.exp(-rate * dt), -math.expm1(-rate * dt)
     return np.array(
-        [[1.0, dt, (rate * dt - gone) / rate**2], [0.0, 1.0, gone / rate], [0.0, 0.0, left]]
+        [[1.0, dt, (rate * dt - loss) / rate**2], [0.0, 1.0, loss / rate], [0.0, 0.0, decay]]
     )
 
 
 def _white_noise(order: int, dt: float) -> Floats:
-    """Return the covariance (order, order) that unit white noise leaves in a chain of integrators.
+    """Return the covariance (order, order) of a chain of integrators driven by unit white noise.
 
-    Source: Bar-Shalom, Li, Kirubarajan, sections 6.2.2 and 6.2.3.  The decay of the acceleration
-        changes it by a fraction of the order of rate times dt, which is neglected.
+    Source: Bar-Shalom, Li, Kirubarajan, sections 6.2.2 and 6.2.3.  The decay of the acceleration,
+    a relative change of the order of rate times dt, is neglected.
     """
     if order == 2:
         return np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
@@ -345,7 +341,7 @@ def _white_noise(order: int, dt: float) -> Floats:
 
 
 TREMOR_SIGMA_M = 3.5e-5
-"""Standard deviation per axis of the tremor of a finger that is held out or moves slowly."""
+"""Standard deviation per axis of the tremor of a finger that rests in the air or moves slowly."""
 
 TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "none": Unfiltered,
@@ -365,5 +361,5 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
         3, 0.08, 10.0, max_speed, acceleration_decay_per_s=10.0, tremor=Tremor(TREMOR_SIGMA_M)
     ),
 }
-"""Filters by name, made for a finger's maximum speed (m/s).  Their noises predict a wandering,
-trembling hand best over 20-50 ms without lag in reaches and taps (`flexsheet chart tracking`)."""
+"""Constructors of filters by name; the argument is a finger's maximum speed, m/s.  The noise values
+are tuned for predictions over 20-50 ms (`flexsheet chart tracking`)."""

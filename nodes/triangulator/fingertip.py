@@ -41,47 +41,44 @@ SIZE_SIGMA = 0.2
 """Standard deviation of the logarithm of a blob's radius over the marker's at that depth."""
 
 HEIGHT_SIGMA = 0.25
-"""Standard deviation of the log ratio of a marker's heights in both views: lenses and angles
-differ."""
+"""Standard deviation of the log ratio of a marker's heights in both views."""
 
 MISFIT_SIGMA_PX = 0.5
 """Standard deviation of the distance between a marker's rays before its centres are refined."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""Maximum log ratio of sizes: a marker's blob has 0.55 to 1.8 times the expected size."""
+"""Maximum log ratio of a blob's size to the expected one: 0.55 to 1.8 times the size."""
 
 SIZE_SIGMAS = 3.5
 MARKER_SIZE_SIGMA = 0.035
-"""Bound on a refined marker's size, in standard deviations, and the deviation of real markers,
-which adds to the method's own.  A marker beyond it is partly occluded or merges with a light."""
+"""Bound on a refined marker's size deviation, in standard deviations, and the relative standard
+deviation of real markers.  A marker beyond the bound is partly occluded or merged with a light."""
 
 STEREO_SIZE_SIGMAS = 4.5
 MAX_MOTION_DIFFERENCE_PX = 2.5
-"""Bounds on the differences between both views, in size (standard deviations) and in motion.  The
-distance hardly changes during an exposure.  A marker beyond them is partly occluded in one view, or
-merges with a light there."""
+"""Bounds on the differences between both views, in size (standard deviations) and in motion.  A
+marker beyond them is partly occluded in one view, or merged with a light there."""
 
 WINDOW_MARGIN_PX = 5
-"""Margin of a window around the marker, so that it includes the surroundings."""
+"""Width of the surroundings that a search window includes around the marker."""
 
 GATE_RADIUS_SIGMAS = 4.0
-"""The radius of a gate stands for this many standard deviations of the expected position."""
+"""Radius of a gate in standard deviations of the expected position."""
 
 AMBIGUITY_MARGIN = 9.0
-"""A match is unique when every other one costs this much more, in squared standard deviations: 3 of
-them in one quantity, or less in several."""
+"""Minimum cost difference of a unique match to every other, in squared standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """Hold how markers are detected, refined and triangulated.
+    """Settings of the detection, refinement and triangulation of markers.
 
     blob_filter: criteria of a blob.
     refine, triangulate: the methods.
-    max_reprojection_px: a pair with a larger reprojection error is not of one point.
-    noise_px: standard deviation of a marker's centre; None takes the method's own estimate.
-    marker_radius_m: true radius, which gives the expected size at each depth.
-    max_deviation_m: a point with a larger standard deviation is rejected.
+    max_reprojection_px: maximum reprojection error of a pair.
+    noise_px: standard deviation of a marker's centre; None for the method's estimate.
+    marker_radius_m: true radius of the marker.
+    max_deviation_m: maximum standard deviation of a point.
     sensor: noise of the pixels.
     """
 
@@ -97,13 +94,13 @@ class DetectorConfig:
 
 @dataclass(frozen=True, slots=True)
 class BlobPair:
-    """Hold a blob of the left and one of the right image that may be one marker.
+    """Pair of blobs, left and right, that may be one marker.
 
-    depth_m: distance from the left camera to where their rays meet.
+    depth_m: depth of the intersection of their rays in the left camera's frame.
     gate_fraction: distance from the gate's centre over its radius; 0 without a gate.
-    cost: mismatch between the two, with a marker's appearance and with the gate, in squared
-        standard deviations.
-    rejection_reason: why the pair is not a marker in the volume; None if it may be one.
+    cost: mismatch of rays, sizes, heights and distance from the gate's centre, in squared standard
+        deviations.
+    rejection_reason: None if the pair may be a marker in the volume.
     """
 
     left: Blob
@@ -116,9 +113,9 @@ class BlobPair:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Hold a detection that may be the finger's marker.
+    """Detection that may be the finger's marker.
 
-    appearance: (2,) logarithms of its level and of its surroundings' level, the mean of both views.
+    appearance: (2,) logarithms of its level and of its surroundings' level, mean of both views.
     """
 
     measured: TriangulatedPoint
@@ -126,17 +123,17 @@ class Candidate:
 
     @property
     def point(self) -> Floats:
-        """World position (3,), m."""
+        """Return the world position (3,), m."""
         return self.measured.point_world
 
 
 @dataclass(frozen=True, slots=True)
 class StereoDetection:
-    """Hold what was detected in an image pair.
+    """Detections in an image pair.
 
-    reason, measured: as `detect` returns them.
-    markers: all inside the gate, the most likely first.
-    others: those outside the gate.
+    reason, measured: result of `detect`.
+    markers: candidates inside the gate, sorted by cost.
+    clutter: candidates outside the gate.
     """
 
     reason: FingertipReason
@@ -147,7 +144,7 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """Hold the inputs of one call of `detect`: both views, and what is known beforehand."""
+    """Arguments of `detect`."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -168,16 +165,14 @@ def detect(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Locate the marker in an image pair, or tell why that is impossible.
+    """Detect the marker in an image pair; return the reason ("ok" if valid) and the point.
 
     left, right: images (height, width).
-    volume: minimum and maximum corner of the box where a fingertip can be, world frame, m.
-    gate: where the fingertip is expected.  Only the gate is searched, since no other light can be
-        the finger.  None searches both images, and then only one pair of blobs may look like a
-        marker.
+    volume: minimum and maximum corner of the finger's volume, world frame, m.
+    gate: region to search.  None searches both images, which must then contain one marker only.
     left_origin_px, right_origin_px: column and row of the sensor where each image begins.
 
-    The result holds a point wherever two rays meet, even if the reason is not "ok".
+    The point is also given for other reasons than "ok" if two rays meet.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
@@ -196,9 +191,9 @@ def detect_all(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> StereoDetection:
-    """Detect the fingertip as `detect` does, and all other markers.
+    """Detect the fingertip, see `detect`, and all other markers.
 
-    Where the fingertip is not found inside its gate, the whole images are searched for the others.
+    If the fingertip is not found inside its gate, the full images are searched for other markers.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
@@ -210,7 +205,7 @@ def detect_all(
 
 
 def _finite_gate(gate: Gate | None) -> Gate | None:
-    """Ignore a gate whose centre is not finite."""
+    """Return the gate; None if its centre is not finite."""
     return gate if gate is not None and np.isfinite(gate.point).all() else None
 
 
@@ -224,8 +219,7 @@ def _detect_in(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the part of each image that the gate covers; None twice without a gate or outside a
-    view."""
+    """Return the window of the gate in each image; None twice without a gate or outside a view."""
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
@@ -252,7 +246,7 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 
 
 def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
-    """Return whether an image, or its part inside the gate, is overexposed."""
+    """Return whether an image or its search window is overexposed."""
     return any(
         is_overexposed(image) or is_overexposed(image, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -262,7 +256,7 @@ def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Detect markers in one window of each image, or in whole images."""
+    """Detect markers in one window of each image, or in the full images (None)."""
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -293,9 +287,9 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Match all pairs of blobs whose rays meet in front of the cameras.
+    """Make all pairs of blobs whose rays meet in front of the cameras, with their costs.
 
-    The rays of a marker meet in the volume, at a depth that agrees with its size.
+    A pair outside the volume, or with a depth that contradicts its size, gets a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
@@ -339,10 +333,10 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """Hold a pair whose blobs were refined.
+    """Pair with refined markers.
 
-    rejection_reason: why it is not a marker; None if it is one.
-    cost: of the pair and of the refined sizes, in squared standard deviations.
+    rejection_reason: None for a valid marker.
+    cost: sum for the pair and for the refined sizes, in squared standard deviations.
     """
 
     pair: BlobPair
@@ -352,28 +346,28 @@ class RefinedPair:
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
-    """Select the marker among one or more pairs that may be one.
+    """Select the marker among one or more pairs.
 
-    Of several that match about equally well, only those remain that are discs after refinement.
+    Of pairs with about the same cost, only those that are discs after refinement remain.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
-    sound = sorted(
+    valid = sorted(
         (one for one in rivals if one.rejection_reason is None), key=lambda one: one.cost
     )
     markers = _unique_candidates(inputs, refined)
-    if not sound:
+    if not valid:
         return StereoDetection(
             rivals[0].rejection_reason or "merged", _triangulate(inputs, rivals[0].markers), markers
         )
-    if len(sound) > 1 and sound[1].cost < sound[0].cost + AMBIGUITY_MARGIN:
-        return StereoDetection("two_markers", _triangulate(inputs, sound[0].markers), markers)
-    reason, measured = _validate(inputs, _triangulate(inputs, sound[0].markers))
+    if len(valid) > 1 and valid[1].cost < valid[0].cost + AMBIGUITY_MARGIN:
+        return StereoDetection("two_markers", _triangulate(inputs, valid[0].markers), markers)
+    reason, measured = _validate(inputs, _triangulate(inputs, valid[0].markers))
     return StereoDetection(reason, measured, markers)
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine pairs, and sort them by cost."""
+    """Refine pairs, sorted by their cost before the refinement."""
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -386,22 +380,22 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the unique markers among refined pairs, the best first.
+    """Return the unique markers among refined pairs, sorted by cost.
 
-    Blobs of two markers may match crosswise.  A pair is dropped when better pairs have both its
-    blobs, or when a clearly better pair has one of them.
+    A pair is dropped if pairs with lower cost contain both its blobs, or if one with much lower
+    cost contains one of them.  Such pairs arise when blobs of two markers match crosswise.
     """
-    kept: list[RefinedPair] = []
+    unique: list[RefinedPair] = []
     for one in sorted(
         (one for one in refined if one.rejection_reason is None), key=lambda one: one.cost
     ):
-        left = [other for other in kept if other.pair.left is one.pair.left]
-        right = [other for other in kept if other.pair.right is one.pair.right]
-        clearly = any(other.cost + AMBIGUITY_MARGIN <= one.cost for other in left + right)
-        if not clearly and not (left and right):
-            kept.append(one)
+        left = [other for other in unique if other.pair.left is one.pair.left]
+        right = [other for other in unique if other.pair.right is one.pair.right]
+        is_much_worse = any(other.cost + AMBIGUITY_MARGIN <= one.cost for other in left + right)
+        if not is_much_worse and not (left and right):
+            unique.append(one)
     found = []
-    for one in kept:
+    for one in unique:
         reason, measured = _validate(inputs, _triangulate(inputs, one.markers))
         if reason == "ok" and measured is not None:
             found.append(Candidate(measured, _appearance(one.pair)))
@@ -427,8 +421,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return why a refined pair is rejected: by either marker, its size, or differences between
-    views."""
+    """Return the rejection reason of a refined pair; None for a valid marker."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason
@@ -465,7 +458,7 @@ def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) ->
 
 
 def _focal_px(geometry: StereoGeometry) -> float:
-    """Return the mean focal length of both cameras, which are nearly equal."""
+    """Return the mean focal length of both cameras, px."""
     return 0.5 * float(geometry.matrices[0][0, 0] + geometry.matrices[1][0, 0])
 
 
@@ -477,9 +470,9 @@ def _triangulate(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> TriangulatedPoint | None:
     """Triangulate two refined markers."""
-    given, hidden = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
+    noise_px, occlusion = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
     left, right = (
-        (marker.covariance if given is None else given**2 * np.eye(2)) + hidden
+        (marker.covariance if noise_px is None else noise_px**2 * np.eye(2)) + occlusion
         for marker in markers
     )
     return measure(
@@ -493,23 +486,20 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Return the variance of a centre that follows from the size difference between both views.
+    """Return the variance of a centre from partial occlusion, by the size difference of both views.
 
-    An occluder that hides a sliver of a disc moves its centre by half the sliver's width, and
-    shrinks it by as much.  Random errors of the method's radii are subtracted.
+    An occluder that covers a strip of a disc shifts its centre by half the strip's width, and
+    reduces the radius by the same amount.  The variance of the method's radii is subtracted.
     """
     one, other = markers
-    chance = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
-    return max((one.radius - other.radius) ** 2 - chance**2, 0.0)
+    noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
+    return max((one.radius - other.radius) ** 2 - noise_px**2, 0.0)
 
 
 def _validate(
     inputs: DetectionInput, measured: TriangulatedPoint | None
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Return whether a measurement is a fingertip's, as its reason.
-
-    A point that is too uncertain is rejected, since nearly parallel rays meet anywhere.
-    """
+    """Check reprojection error, uncertainty and volume; return the reason and the point."""
     config = inputs.config
     if (
         measured is None

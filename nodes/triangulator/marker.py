@@ -2,7 +2,7 @@
 
 Pixel coordinates have their origin at the centre of the top left pixel, x to the right, y down.  A
 marker is a small bright disc, blurred by its motion during the exposure.  `detect_blobs` finds all
-bright blobs of about its size, then a method refines the relevant ones.
+bright blobs of about its size, then a method refines the likely ones.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""Side of the square whose mean a blob is compared with."""
+"""Side of the square around a pixel whose mean is the local threshold."""
 
 SURROUND_PX = 3
 """Width of the border around a blob; its outermost pixels are the surroundings."""
 
 SURROUND_RANK = 0.75
-"""Quantile of the surrounding pixels that counts as their level.  A marker on a finger has the
-finger on one side and darkness on the other, and the finger must not count as marker."""
+"""Quantile of the surrounding pixels that is used as their level.  It separates the marker from a
+bright finger on one side, with darkness on the other."""
 
 SKIRT_FRACTION = 0.1
-"""Light below this fraction of the marker's height above its surroundings is excluded as noise."""
+"""Lower bound of the light, as a fraction of the marker's height; light below it is noise."""
 
 MAX_REGIONS = 64
-"""Only the largest regions of an image are searched if there are more bright ones."""
+"""Maximum number of bright regions to search; the largest are searched."""
 
 WHITE_LEVEL = 250
 WHITE_FRACTION = 0.2
@@ -46,14 +46,14 @@ WHITE_FRACTION = 0.2
 
 @dataclass(frozen=True, slots=True)
 class BlobFilter:
-    """Hold the criteria of a marker.
+    """Criteria of a marker.
 
     min_contrast: levels of its brightest pixel above its surroundings.
     min_area_px, max_area_px: number of pixels brighter than half that contrast.
     window_half_px: half the side of the smallest search window around an expected position.
     max_motion_px: maximum motion during an exposure.
-    max_blur: maximum standard deviation of the edge, as a fraction of the radius; beyond it the
-        marker is out of focus.
+    max_blur: maximum standard deviation of the edge of a marker in focus, as a fraction of the
+        radius.
     max_misfit: maximum residual of a disc, root mean square, as a fraction of the marker's height.
     """
 
@@ -68,13 +68,12 @@ class BlobFilter:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Hold a bright blob that may be a marker, in pixels of the image that was searched.
+    """Bright blob that may be a marker, in pixels of the searched image.
 
     centre: centroid of its light.
-    radius: of a disc of its area at half height.
+    radius: of a disc of the same area at half height.
     motion: (x, y) displacement during the exposure, from its second moments.
-    spread: smallest second moment of its light over that of a uniform disc of its radius; 1 for a
-        sharp disc.
+    spread: smallest second moment of its light, relative to that of a uniform disc of its radius.
     peak, surround: levels of its brightest pixel and of its surroundings.
     window: its pixels and their surroundings.
     """
@@ -89,12 +88,12 @@ class Blob:
 
     @property
     def blur(self) -> float:
-        """Standard deviation of its edge, px, estimated from the spread beyond a sharp disc's."""
+        """Return the standard deviation of its edge, px, estimated from the spread."""
         return min(max(0.5 * self.radius * math.sqrt(max(self.spread - 0.85, 0.0)), 0.6), 3.0)
 
     @property
     def height(self) -> float:
-        """Levels above its surroundings."""
+        """Return the number of levels of the peak above the surroundings."""
         return self.peak - self.surround
 
 
@@ -103,14 +102,14 @@ MarkerRejection = Literal["merged", "blurred"]
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """Hold a refined marker: centre (2,) px with covariance (2, 2) px^2.
+    """Refined marker: centre (2,) px with covariance (2, 2) px^2.
 
     radius: of the disc, px.
     radius_deviation: standard deviation of the radius by the method, as a fraction of it.
     blur: standard deviation of its edge, px.
-    motion: (x, y) px during the exposure, or its reverse.
+    motion: (x, y) px during the exposure, of unknown sign.
     height: levels above its surroundings.
-    rejection_reason: why it is not a marker; None if it is one.
+    rejection_reason: None for a valid marker.
     """
 
     centre: Floats
@@ -124,12 +123,11 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
-"""Function that refines the i-th blob, found in the i-th image."""
+"""Function that refines blobs; blob i is of image i."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
-    """Return the window around a pixel in an image of `shape` (height, width); None if outside
-    it."""
+    """Return the window around a pixel of an image (height, width); None outside the image."""
     x, y = pixel.tolist()
     if not abs(x) + abs(y) < 1e6:  # also rejects NaN
         return None
@@ -141,7 +139,7 @@ def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window
 
 
 def is_overexposed(image: Image, window: Window | None = None) -> bool:
-    """Return whether too large a fraction of an image, or of a window of it, is white."""
+    """Return whether an image, or a window of it, contains too many white pixels."""
     part = image if window is None else image[window]
     white = cv2.threshold(part, WHITE_LEVEL - 1, 1, cv2.THRESH_BINARY)[1]
     return bool(cv2.countNonZero(white) > WHITE_FRACTION * part.size)
@@ -150,10 +148,9 @@ def is_overexposed(image: Image, window: Window | None = None) -> bool:
 def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = None) -> list[Blob]:
     """Detect all blobs in an image, or in a window of it, that may be a marker.
 
-    Bright regions stand out from their neighbourhood's mean.  In each, a blob is what exceeds half
-    the height over the surroundings, so that a marker is found on a bright finger and beside a
-    brighter light.  A blob at the border is dropped, since its centre would be wrong, as is one too
-    small or too large.
+    Bright regions exceed their neighbourhood's mean.  In each region, blobs are the pixels above
+    half the height over the surroundings.  This finds a marker on a bright finger and beside a
+    brighter light.  Blobs at the border are dropped, because their centre would be wrong.
     """
     top, left = (0, 0) if window is None else (window[0].start, window[1].start)
     part = image if window is None else image[window]
@@ -170,40 +167,41 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
         regions = sorted(regions, key=len)[-MAX_REGIONS:]
     blobs = []
     for region in regions:
-        if _pixels_in(region) >= blob_filter.min_area_px:
-            blobs += _blobs_in(part, cv2.boundingRect(region), blob_filter, (top, left))
+        if _count_pixels(region) >= blob_filter.min_area_px:
+            blobs += _detect_in_box(part, cv2.boundingRect(region), blob_filter, (top, left))
     return blobs
 
 
-def _pixels_in(outline: cv2.typing.MatLike) -> float:
-    """Count the pixels within an outline of pixel centres, the outline included (Pick's
-    theorem)."""
+def _count_pixels(outline: cv2.typing.MatLike) -> float:
+    """Return the number of pixels within and on an outline of pixel centres (Pick's theorem)."""
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 
-def _blobs_in(
+def _detect_in_box(
     part: Image, box: Sequence[int], blob_filter: BlobFilter, origin: tuple[int, int]
 ) -> list[Blob]:
-    """Detect the blobs in a box (x, y, width, height) of an image; `origin` is its first row,
-    column."""
-    rows, columns = _around(box)
+    """Detect the blobs in a box (x, y, width, height) of an image part.
+
+    origin: first row and column of the part.
+    """
+    rows, columns = _add_border(box)
     cut = part[rows, columns]
-    surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
+    surround, peak = _surround_level(cut), cv2.minMaxLoc(cut)[1]
     if peak - surround < blob_filter.min_contrast:
         return []
     half = cv2.threshold(cut, 0.5 * (surround + peak), 255, cv2.THRESH_BINARY)[1]
     blobs = []
     for outline in cv2.findContours(half, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-        area = _pixels_in(outline)
+        area = _count_pixels(outline)
         if not blob_filter.min_area_px <= area <= blob_filter.max_area_px:
             continue
         x, y, width, height = cv2.boundingRect(outline)
         x, y = x + columns.start, y + rows.start
         if x == 0 or y == 0 or x + width == part.shape[1] or y + height == part.shape[0]:
             continue
-        window = _around((x, y, width, height))
+        window = _add_border((x, y, width, height))
         cut = part[window]
-        surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
+        surround, peak = _surround_level(cut), cv2.minMaxLoc(cut)[1]
         if peak - surround >= blob_filter.min_contrast:
             blobs.append(
                 _make_blob(cut, window, area=area, surround=surround, peak=peak, origin=origin)
@@ -211,8 +209,8 @@ def _blobs_in(
     return blobs
 
 
-def _around(box: Sequence[int]) -> Window:
-    """Return rows and columns of a box (x, y, width, height) with its surroundings."""
+def _add_border(box: Sequence[int]) -> Window:
+    """Return the rows and columns of a box (x, y, width, height) with its surroundings."""
     x, y, width, height = box
     return (
         slice(max(y - SURROUND_PX, 0), y + height + SURROUND_PX),
@@ -220,7 +218,7 @@ def _around(box: Sequence[int]) -> Window:
     )
 
 
-def _surround(cut: Image) -> float:
+def _surround_level(cut: Image) -> float:
     """Return the level of a cut-out's outermost pixels."""
     border = np.concatenate((cut[0], cut[-1], cut[:, 0], cut[:, -1]))
     border.sort()
@@ -236,7 +234,10 @@ def _make_blob(
     peak: float,
     origin: tuple[int, int],
 ) -> Blob:
-    """Make the blob of `area` pixels in a window of an image part that begins at `origin`."""
+    """Make the blob of `area` pixels in a window of an image part.
+
+    origin: first row and column of the part.
+    """
     rows, columns = window
     found = _light_moments(cut, surround, peak)
     light = found["m00"]
@@ -262,24 +263,24 @@ def _make_blob(
 
 
 def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]:
-    """Return the moments of the light above the skirt, whose weights fall to zero at its border."""
+    """Return the moments of the light above the noise threshold (skirt)."""
     skirt = surround + SKIRT_FRACTION * (peak - surround)
     return cv2.moments(np.maximum(cut - np.float32(skirt), np.float32(0.0)))
 
 
 SHARP_PX = 1.2
-"""Blur of an edge, one standard deviation, that any lens in focus may have."""
+"""Maximum blur of an edge in focus, one standard deviation."""
 
 MAX_SPREAD = 1.7
-"""A blob whose light spreads wider than this relative to its area is too blurred to be a disc."""
+"""Maximum spread of a blob that is sharp enough to be a disc."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystematicError:
-    """Hold a method's errors apart from pixel noise, one standard deviation per axis.
+    """Systematic errors of a method, one standard deviation per axis.
 
-    still_px: error by the pixel grid and uneven ground.
-    moving: further error, as a fraction of the motion during the exposure.
+    still_px: error from the pixel grid and uneven ground.
+    moving: additional error, as a fraction of the motion during the exposure.
     """
 
     still_px: float
@@ -294,14 +295,14 @@ class SystematicError:
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
 BY_WEIGHTED_CENTROID = SystematicError(still_px=0.03, moving=0.012)
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""Chosen so that simulated errors, normalised by the stated covariance, have unit variance
+"""Systematic errors for which simulated errors, normalised by the covariance, have unit variance
 (`tests/test_marker.py`)."""
 
 
 def moments(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Return the centre of the area brighter than half the marker's height, unweighted."""
+    """Refine blobs to the unweighted centroid of the pixels above half the marker's height."""
     markers = []
     for image, blob in zip(images, blobs, strict=True):
         level = 0.5 * (blob.surround + blob.peak)
@@ -314,11 +315,11 @@ def moments(
 def weighted_centroid(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Return the centroid of the marker's light.
+    """Refine blobs to the centroid of the marker's light.
 
-    A pixel on the marker's edge counts by its lit fraction, which removes most of the pixel grid's
-    error.  The weight falls to zero at the skirt, so that no pixel jumps in or out.  The noise of
-    each pixel moves the centre by its distance from it over all the light.
+    A pixel on the edge is weighted by its lit fraction, which removes most of the pixel grid's
+    error.  The weight is continuous at the noise threshold (skirt).  The noise of each pixel
+    changes the centre by the pixel's distance from it, divided by the total light.
     """
     markers = []
     for image, blob in zip(images, blobs, strict=True):
@@ -350,7 +351,7 @@ def _marker_from_moments(
     blob_filter: BlobFilter,
     systematic: SystematicError,
 ) -> Marker:
-    """Make a marker from the moments of its window; only the spread of its light can reject it."""
+    """Make a marker from the moments of its window; reject it by spread or motion."""
     rows, columns = blob.window
     rejection_reason: MarkerRejection | None = None
     if blob.spread > MAX_SPREAD:
@@ -374,7 +375,7 @@ def _marker_from_moments(
 def subpixel_fit(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Fit a motion-blurred disc by maximum likelihood, see `nodes.triangulator.subpixel`."""
+    """Refine blobs by a maximum-likelihood fit of a motion-blurred disc; see `subpixel`."""
     starts = [
         DiscStart(blob.centre, blob.radius, blob.blur, blob.peak, blob.surround, blob.motion)
         for blob in blobs

@@ -33,7 +33,7 @@ PREDICTION_STEP_S = 0.01
 
 
 class Triangulator(Node):
-    """Detect the fingertip in each stereo pair, and track it."""
+    """Node that detects the fingertip in each stereo pair and tracks it."""
 
     parameters: TriangulatorParameters
     scene: Input[Scene]
@@ -82,7 +82,7 @@ class Triangulator(Node):
             track_timeout_s=p.track_timeout_s,
             confirm_frames=p.confirm_frames,
         )
-        self._begin(self.epoch)
+        self._restart(self.epoch)
 
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
@@ -90,7 +90,7 @@ class Triangulator(Node):
         check_images(pair, self.geometry)
         at_ns = header.source_ns
         if header.epoch != self.epoch:  # the camera has restarted, and its clock with it
-            self._begin(header.epoch)
+            self._restart(header.epoch)
         detect_pair = partial(
             detect_all,
             pair.left,
@@ -117,7 +117,7 @@ class Triangulator(Node):
             self.association.track_clutter(at_ns, detect_pair(gate=None))
         self._note()
 
-    def _begin(self, epoch: int) -> None:
+    def _restart(self, epoch: int) -> None:
         self.epoch = epoch
         self.tracker = Tracker(self.filter, self.tracking)
         self.association = DataAssociation()
@@ -138,7 +138,7 @@ class Triangulator(Node):
             position_world_m=track.position,
             velocity_world_m_per_s=track.velocity,
             covariance=track.covariance,
-            predicted_path_world_m=track.ahead,
+            predicted_path_world_m=track.path,
             prediction_step_s=PREDICTION_STEP_S,
             measured_world_m=track.position if measured is None else measured.point_world,
             reprojection_px=0.0 if measured is None else measured.reprojection_px,

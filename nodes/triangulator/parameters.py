@@ -13,7 +13,7 @@ from flexsheet.nodes.parameter_marks import CameraCalibrationFile
 
 
 class TriangulatorParameters(NodeParameters):
-    """Hold how the marker is detected, triangulated and tracked."""
+    """Parameters of the detection, triangulation and tracking of the marker."""
 
     calibration: CameraCalibrationFile | None = Field(
         default=None,
@@ -52,12 +52,12 @@ class TriangulatorParameters(NodeParameters):
         description="filter of the fingertip; auto takes the scene's method, else singer_tremor",
     )
     max_acceleration_m_per_s2: Positive = Field(
-        default=60.0, description="maximum acceleration of a finger; points beyond it are rejected"
+        default=60.0, description="maximum acceleration of a finger; faster points are rejected"
     )
     track_timeout_s: Positive = Field(
-        default=0.1, description="time without a point after which the track is lost"
+        default=0.1, description="maximum time without a point before the track is lost"
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
-        default=3, description="number of consistent points that begin a track"
+        default=3, description="number of consecutive consistent points that start a track"
     )
     prediction_horizon_s: Positive = Field(default=0.12, description="length of the predicted path")

@@ -30,7 +30,7 @@ def compensate_skew(
     velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
 
     To first order, a finger with velocity v is measured with the error M v, M = s (A_r J_r - 1/2).
-    J_r is the Jacobian of the right pixel, and A_r the part of the triangulation that takes it.
+    J_r is the Jacobian of the right pixel, and A_r the derivative of the point by that pixel.
     The error is mostly in depth: speed times skew times depth over baseline.  The uncertainty of v
     adds to the covariance.
     """
@@ -59,7 +59,7 @@ def compensate_detection_skew(
     velocity: Floats,
     velocity_covariance: Floats,
 ) -> StereoDetection:
-    """Compensate all detections, each as if it were the finger; see `compensate_skew`."""
+    """Compensate the skew of all detections with the finger's velocity; see `compensate_skew`."""
 
     def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:
         return compensate_skew(measured, geometry, skew_s, velocity, velocity_covariance)

@@ -1,17 +1,18 @@
 """Estimate a marker's centre by maximum likelihood: fit a motion-blurred disc to its pixels.
 
-The image of a marker is a uniform disc, blurred by the lens and the pixel's area, smeared by its
-motion during the exposure, on ground that may slope.  The level at a distance d outside its edge is
+The image of a marker is a uniform disc on a background with a constant gradient (ground).  The
+lens, the pixel's area and the motion during the exposure blur it.  The level at a distance d
+outside its edge is
 
     level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur),
 
 with Phi the normal cumulative distribution.  A Gauss-Newton method fits all parameters at once,
 with each pixel weighted by its noise.  The inverse of the Fisher information is the covariance of
-the result: the Cramer-Rao bound, if images follow the model.  Otherwise the residuals show it, and
-their odd part widens the covariance.
+the result, which is the Cramer-Rao bound for images that follow the model.  For other images, the
+odd part of the residuals increases the covariance.
 
-Centre and slopes change the image oddly, all other parameters evenly.  A wrong radius, blur, level
-or motion therefore affects the stated certainty of the centre, but does not move it.
+The image's derivatives by centre and slopes are odd functions about the centre, all others even.  A
+wrong radius, blur, level or motion therefore changes the covariance, but not the centre.
 """
 
 from __future__ import annotations
@@ -30,41 +31,41 @@ Image = NDArray[np.uint8]
 X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
 STILL_PARAMETERS = 8
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-"""Parameters that change the image oddly about the disc's centre."""
+"""Parameters whose image derivative is odd about the disc's centre."""
 
 WHITE = 255
 MARGIN_PX = 3.0
 MIN_MARGIN_PX = 1.25
 MARGIN_PER_MOTION = 0.5
-"""Width of the surroundings in the fit: enough to estimate the ground, and short of the finger's
-edge.  That edge comes nearer by the motion, and is not a uniform slope."""
+"""Width of the surroundings in the fit: enough to estimate the ground, without the finger's edge,
+which is not a uniform slope.  Motion brings that edge nearer."""
 
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""Inverse prior variances of the start.  They are so small that they only count where pixels carry
-no information, as for the level of a saturated marker."""
+"""Inverse prior variances of the start.  They only matter where pixels carry no information, as for
+the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
 """Bounds of radius and blur, px."""
 
 MOTION_STEP_PX = 1.8
-"""Maximum step of the sum over the motion; the blur closes the gaps."""
+"""Maximum step of the sum over the motion."""
 
 MIN_MOTION_PX = 2.0
-"""A shorter motion cannot be distinguished from blur and is not fitted."""
+"""Minimum motion to fit; a shorter one cannot be distinguished from blur."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""Steps of centre, radius and blur that end the iteration.  Such a step leaves an error of its
-square over the blur, less than a thousandth of a pixel."""
+"""Maximum last steps of centre, radius and blur.  The remaining error is the step's square over the
+blur, less than a thousandth of a pixel."""
 
 MAX_STEP_PX = 0.7
 MAX_SHIFT_PX = 2.0
-"""Bounds on one step, and on the centre's distance from its start; beyond, it is another disc."""
+"""Bounds on one step, and on the centre's distance from its start."""
 
 MIN_VARIANCE_RATIO = 0.7
 """Lower bound on the noise estimated from residuals, as a fraction of the sensor model's."""
@@ -72,7 +73,7 @@ MIN_VARIANCE_RATIO = 0.7
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
-    """Hold a sensor's noise: the variance of a level L is read_levels^2 + L / photons_per_level."""
+    """Noise of a sensor: the variance of a level L is read_levels^2 + L / photons_per_level."""
 
     read_levels: float = 1.5
     photons_per_level: float = 40.0
@@ -80,7 +81,7 @@ class PixelNoise:
 
 @dataclass(frozen=True, slots=True)
 class DiscStart:
-    """Hold the start of a fit: centre (x, y), radius, blur and motion (x, y) in px; both levels."""
+    """Start of a fit: centre (x, y), radius, blur and motion (x, y) in px; both levels."""
 
     centre: tuple[float, float]
     radius: float
@@ -92,13 +93,13 @@ class DiscStart:
 
 @dataclass(frozen=True, slots=True)
 class DiscFit:
-    """Hold a fitted disc.
+    """Fitted disc.
 
     centre: (2,) px with covariance (2, 2) px^2.
     radius, blur, motion: px; motion is (x, y).
     height: levels between ground and marker.
     misfit: root mean square of the residuals beyond noise, as a fraction of the height.
-    converged: false where the fit did not converge to a disc.
+    converged: whether the fit converged to a disc.
     """
 
     centre: Floats
@@ -114,28 +115,27 @@ class DiscFit:
 def fit_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one disc in each image (height, width), all at once, since each NumPy call has a fixed
-    cost.
+    """Fit one disc in each image (height, width), all in the same array operations.
 
-    Pixels outside the image and outside the disc's surroundings are excluded.  A white pixel counts
-    only while the model is darker.
+    Pixels outside the image and outside the disc's surroundings are excluded.  A white pixel is
+    used only while the model is darker.
     """
     if not starts:
         return []
-    seen = _detect_in(images, starts, noise)
+    cutouts = _cut_out_discs(images, starts, noise)
     start = np.array(
         [
             (x, y, one.radius, one.blur, one.marker, one.ground, 0.0, 0.0, *one.motion)
-            for one, (x, y) in zip(starts, seen.offsets, strict=True)
+            for one, (x, y) in zip(starts, cutouts.offsets, strict=True)
         ]
     )
     if max(math.hypot(*one.motion) for one in starts) < MIN_MOTION_PX:
         start = start[:, :STILL_PARAMETERS]
-    solved = _solve(seen, start)
+    solved = _solve(cutouts, start)
     covariances = np.linalg.inv(solved.information)[:, :RADIUS, :RADIUS]
     shifts = np.abs(solved.found - start)[:, :RADIUS].max(axis=1).tolist()
     return [
-        _validate(
+        _make_fit(
             parameters,
             corner,
             covariance,
@@ -144,7 +144,7 @@ def fit_discs(
         )
         for parameters, corner, covariance, fitness, shift in zip(
             solved.found.tolist(),
-            seen.corners,
+            cutouts.corners,
             covariances,
             _fit_residuals(solved),
             shifts,
@@ -155,14 +155,14 @@ def fit_discs(
 
 @dataclass(frozen=True, slots=True)
 class DiscSolution:
-    """Hold the result of the Gauss-Newton iteration, and the residuals of its last image.
+    """Result of the Gauss-Newton iteration, and the residuals of its last image.
 
     found: (n, parameters) after the last step.
     residuals: (n, s s).
     weights: (n, s s), zero for excluded pixels.
     information: (n, parameters, parameters).
-    gains: (n, parameters), by which the last step reduced the weighted squares of the residuals, to
-        first order.
+    gains: (n, parameters), first-order reduction of the weighted squared residuals by the last
+        step.
     """
 
     found: Floats
@@ -173,19 +173,19 @@ class DiscSolution:
     converged: bool
 
 
-def _solve(seen: DiscCutouts, start: Floats) -> DiscSolution:
+def _solve(cutouts: DiscCutouts, start: Floats) -> DiscSolution:
     """Return the most likely parameters (n, parameters) of the discs."""
-    believed = PRIOR_WEIGHTS[: start.shape[1]]
-    prior = np.diag(believed)
-    found, converged, used = start.copy(), False, seen.weights
+    prior_weights = PRIOR_WEIGHTS[: start.shape[1]]
+    prior = np.diag(prior_weights)
+    found, converged, used = start.copy(), False, cutouts.weights
     for _ in range(ITERATIONS):
-        model, slopes = _render_disc(found, seen.x, seen.y)
-        residuals = seen.levels - model
-        if seen.white is not None:
-            used = np.where(seen.white & (residuals < 0), 0.0, seen.weights)
+        model, slopes = _render_disc(found, cutouts.x, cutouts.y)
+        residuals = cutouts.levels - model
+        if cutouts.white is not None:
+            used = np.where(cutouts.white & (residuals < 0), 0.0, cutouts.weights)
         weighted = slopes * used[:, None]
         information = weighted @ slopes.transpose(0, 2, 1) + prior
-        gradient = (weighted @ residuals[:, :, None])[:, :, 0] - believed * (found - start)
+        gradient = (weighted @ residuals[:, :, None])[:, :, 0] - prior_weights * (found - start)
         step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
         shape = step[:, : BLUR + 1]
         np.maximum(np.minimum(shape, MAX_STEP_PX), -MAX_STEP_PX, out=shape)
@@ -199,11 +199,10 @@ def _solve(seen: DiscCutouts, start: Floats) -> DiscSolution:
 
 
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
-    """Return for each fit: weighted squares of the residuals, number of pixels, sum of weights,
-    variance ratio.
+    """Return per fit: weighted squared residuals, number of pixels, sum of weights, variance ratio.
 
-    The variance ratio is the noise that the odd part of the residuals shows, over the sensor's.
-    Only that part, the difference of pixels mirrored about the centre, can have moved the centre.
+    The variance ratio is the variance of the odd part of the residuals over the sensor's.  Only
+    this part, the difference of pixels mirrored about the centre, affects the centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -226,13 +225,13 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 
 @dataclass(frozen=True, slots=True)
 class DiscCutouts:
-    """Hold square cut-outs of n images, s pixels a side, each around the start of a disc.
+    """Square cut-outs of n images, s x s pixels, each around the start of a disc.
 
     corners: column and row of each cut-out's first pixel, the origin of its coordinates.
     offsets: starting centres in these coordinates.
     levels, weights: (n, s s).
     x, y: coordinates (n, 1, s) and (n, s, 1).
-    white: (n, s s) where a pixel is saturated; None where none is.
+    white: (n, s s), whether a pixel is saturated; None if no pixel is.
     """
 
     corners: list[tuple[int, int]]
@@ -244,7 +243,7 @@ class DiscCutouts:
     white: NDArray[np.bool_] | None
 
 
-def _detect_in(
+def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
     """Cut out the pixels of the fits; outside the image their weight is zero."""
@@ -272,19 +271,19 @@ def _detect_in(
         rows = slice(max(top, 0), max(top + side, 0))
         columns = slice(max(left, 0), max(left + side, 0))
         part = image[rows, columns]
-        place = (
+        inside = (
             slice(rows.start - top, rows.start - top + part.shape[0]),
             slice(columns.start - left, columns.start - left + part.shape[1]),
         )
-        levels[i][place] = part
+        levels[i][inside] = part
         dx, dy = x - centre[0], y - centre[1]
         if length > MIN_MOTION_PX:
             along = (dx * one.motion[0] + dy * one.motion[1]) / length**2
             along = np.minimum(np.maximum(along, -0.5), 0.5)
             dx, dy = dx - along * one.motion[0], dy - along * one.motion[1]
         near = dx * dx + dy * dy < reaches[i] ** 2
-        weights[i][place] = (near / (noise.read_levels**2 + levels[i] / noise.photons_per_level))[
-            place
+        weights[i][inside] = (near / (noise.read_levels**2 + levels[i] / noise.photons_per_level))[
+            inside
         ]
         white = white or int(part.max(initial=0)) >= WHITE
     flat = levels.reshape(count, side * side)
@@ -300,9 +299,9 @@ def _detect_in(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return levels (n, s s) of discs and their slopes (n, parameters, s s).
+    """Render discs: levels (n, s s) and their derivatives (n, parameters, s s).
 
-    x: (1, 1, s), y: (1, s, 1).  A moving disc is summed at k positions: (n, k, s, s).
+    x: (1, 1, s), y: (1, s, 1).  A moving disc is the mean over k positions: (n, k, s, s).
     """
     count, parameters = found.shape
     moving = parameters > STILL_PARAMETERS
@@ -338,14 +337,14 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         slopes[:, MOTION_X:] *= height[:, None]
     slopes[:, :MARKER] *= height[:, None]
     slopes[:, MARKER] = coverage
-    left = np.subtract(1.0, coverage, out=slopes[:, GROUND])
-    np.multiply(left, dx, out=slopes[:, SLOPE_X])
-    np.multiply(left, dy, out=slopes[:, SLOPE_Y])
+    uncovered = np.subtract(1.0, coverage, out=slopes[:, GROUND])
+    np.multiply(uncovered, dx, out=slopes[:, SLOPE_X])
+    np.multiply(uncovered, dy, out=slopes[:, SLOPE_Y])
     levels = ground + coverage * height
     return levels.reshape(count, side * side), slopes.reshape(count, parameters, side * side)
 
 
-def _validate(
+def _make_fit(
     found: list[float],
     corner: tuple[int, int],
     covariance: Floats,
@@ -353,9 +352,9 @@ def _validate(
     *,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of a fit, its covariance widened by residuals beyond noise.
+    """Make the result of a fit; residuals beyond noise increase its covariance.
 
-    fitness: as `_fit_residuals` returns it.
+    fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness
     x, y, radius, blur, marker, ground, _, _, *motion = found
@@ -364,7 +363,7 @@ def _validate(
     return DiscFit(
         centre=np.array([corner[0] + x, corner[1] + y]),
         covariance=covariance * max(ratio, MIN_VARIANCE_RATIO),
-        # A blurred round edge appears to lie blur^2 / 2 radius further in.
+        # Blur shifts a round edge inwards by blur^2 / 2 radius.
         radius=radius + 0.5 * blur * blur / radius,
         blur=blur,
         motion=(motion[0], motion[1]) if motion else (0.0, 0.0),

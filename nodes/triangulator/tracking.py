@@ -16,22 +16,24 @@ from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
 Floats = NDArray[np.float64]
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
-"""Result for a measured point: it is in the track; it is faster than a finger; it may begin a
-track, or came late and corrected the track."""
+"""Result for a measured point.
+
+ok: added to the track.  too_fast: faster than a finger.  unconfirmed: may start a track, or arrived
+late and corrected the track.
+"""
 
 GATE_SIGMAS = 5.0
-"""Errors of measurement and prediction that the gate allows beyond a finger's motion."""
+"""Size of the gate beyond a finger's motion, in standard deviations of the errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """Hold a finger's limits of motion, and when a track begins and ends.
+    """Settings of the tracker.
 
     max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger; faster points are rejected.
-    track_timeout_s: the track is lost after this long without a point.
-    confirm_frames: consecutive points that must agree before they begin a track, or replace one
-        that they contradict.
-    history_s: age up to which a late point can still be inserted.
+    track_timeout_s: maximum time without a point before the track is lost.
+    confirm_frames: number of consecutive consistent points that start or replace a track.
+    history_s: maximum age of a late point that can be inserted.
     """
 
     max_speed_m_per_s: float
@@ -43,7 +45,7 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """Hold a measured point (3,) m with its covariance (3, 3) m^2."""
+    """Measured point (3,) m with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
@@ -58,7 +60,7 @@ class PositionMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Hold a ball around the predicted point (3,) m that contains the finger."""
+    """Ball around the predicted point (3,) m in which the finger is expected."""
 
     point: Floats
     radius_m: float
@@ -71,7 +73,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class TrackPrediction:
-    """Hold the finger's state at one time, and its predicted path (n, 3) m.
+    """State of the finger at one time, and its predicted path (n, 3) m.
 
     covariance: (6, 6) of position (3,) m and velocity (3,) m/s.
     """
@@ -79,7 +81,7 @@ class TrackPrediction:
     position: Floats
     velocity: Floats
     covariance: Floats
-    ahead: Floats
+    path: Floats
 
 
 INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
@@ -87,7 +89,7 @@ INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
 
 
 class Tracker:
-    """Track one finger, and gate the points that enter the track."""
+    """Tracker of one finger that gates the measured points."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
@@ -97,11 +99,11 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Newest estimate, which remains when the track is lost."""
+        """Return the newest estimate, also after the track is lost; None before the first point."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Return whether a point of that time is older than the newest one."""
+        """Return whether a point at `at_ns` is not newer than the newest one."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
@@ -112,16 +114,16 @@ class Tracker:
         return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
     def gate(self, at_ns: int) -> Gate | None:
-        """Return where the finger can be at a time after the newest point.
+        """Return the gate at a time after the newest point.
 
-        None without a track, and for times before its newest point.
+        Return None without a track and for times before its newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
         return self._gate_after(*self._history[-1], at_ns)
 
     def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
-        """Return where the finger can be at a time after one of the track's points."""
+        """Return the gate at a time after one of the track's points."""
         dt = (at_ns - estimate.at_ns) * 1e-9
         point = self.filter.predict(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]
@@ -136,8 +138,10 @@ class Tracker:
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict the finger from a time not before the newest point; a lost one stays where it was
-        lost."""
+        """Predict the finger from a time not before the newest point.
+
+        A lost finger is predicted to stay at its last position.
+        """
         estimate = self.estimate
         if estimate is None:
             return TrackPrediction(
@@ -160,8 +164,7 @@ class Tracker:
         return velocity, covariance[3:, 3:]
 
     def update(self, at_ns: int, measured: Floats, covariance: Floats) -> GateResult:
-        """Add a measured point (3,) with its covariance (3, 3) to the track, if the gate allows
-        it."""
+        """Add a measured point (3,), covariance (3, 3), to the track if the gate accepts it."""
         measurement = PositionMeasurement(at_ns, measured, covariance)
         if self.is_late(at_ns):
             return self._insert_late(measurement)
@@ -195,19 +198,18 @@ class Tracker:
         self._history.append((measurement, estimate))
 
     def _extend_tentative_track(
-        self, measurement: PositionMeasurement, refusal: GateResult
+        self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point outside the track to the tentative track, which replaces the track once
-        confirmed."""
+        """Add a point to the tentative track, which replaces the track once it is confirmed."""
         self._tentative_track = self._consistent_run(self._tentative_track, measurement)
         if len(self._tentative_track) < self.settings.confirm_frames:
-            return refusal
-        return self._begin(self._tentative_track)
+            return unconfirmed_result
+        return self._restart_with(self._tentative_track)
 
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Return the consecutive points that one finger can have passed, up to this one."""
+        """Append a point to consecutive points, or restart them if one finger cannot reach it."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
@@ -216,7 +218,7 @@ class Tracker:
         )
         return [*previous, measurement] if follows else [measurement]
 
-    def _begin(self, measurements: list[PositionMeasurement]) -> GateResult:
+    def _restart_with(self, measurements: list[PositionMeasurement]) -> GateResult:
         self._history, self._tentative_track, self._late = [], [], []
         for measurement in measurements:
             self._append(measurement)
@@ -231,7 +233,7 @@ class Tracker:
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:
-            return self._begin(self._late)
+            return self._restart_with(self._late)
         index = sum(entry[0].at_ns < measurement.at_ns for entry in self._history)
         later = [entry[0] for entry in self._history[index:]]
         fits = (
@@ -248,7 +250,7 @@ class Tracker:
         return "unconfirmed"
 
     def _is_missing_between(self, previous: int, after: int) -> bool:
-        """Return whether a point is missing between two points of the track, by their times."""
+        """Return whether a point is missing between two points of the track."""
         times_ns = np.array([entry[0].at_ns for entry in self._history])
         usual_ns = float(np.median(np.diff(times_ns)))
         return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns

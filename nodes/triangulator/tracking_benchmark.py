@@ -15,7 +15,7 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, meas
 
 Floats = NDArray[np.float64]
 TruePath = Callable[[float], Floats]
-"""True fingertip (3,) m in the world at a time (s)."""
+"""Function that returns the true fingertip (3,) m in the world at a time, s."""
 
 MARKER_NOISE_PX = 0.01
 """Noise of a marker's centre by the subpixel fit, at half a metre (`flexsheet chart marker`)."""
@@ -26,15 +26,17 @@ HORIZONS_S = (0.0, 0.02, 0.05)
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""Factor over the scene's speed, which allows for unsteadiness and starts."""
+"""Factor on the scene's speed that allows for tremor and acceleration."""
 WITHOUT_VELOCITY = ("none",)
-"""Methods whose range is a resting finger; without a horizon they also hold for a moving one."""
+"""Methods whose range is a resting finger; without a horizon it includes a moving one."""
 
 
 @dataclass(frozen=True, slots=True)
 class TruePathCase:
-    """Hold a finger's true path from time 0 on, and whether it rests apart from its
-    unsteadiness."""
+    """True path of a finger from time 0.
+
+    resting: whether the finger moves only by tremor.
+    """
 
     path: TruePath
     duration_s: float
@@ -42,7 +44,7 @@ class TruePathCase:
 
     @property
     def speed_m_per_s(self) -> float:
-        """Speed (m/s) that the path exceeds for a tenth of the time."""
+        """Return the speed that the path exceeds for a tenth of the time, m/s."""
         times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
         points = np.array([self.path(float(time)) for time in times])
         distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -51,8 +53,10 @@ class TruePathCase:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """Hold times (n,) ns, measured points (n, 3), covariances (n, 3, 3) and the truth (n, 3) by
-    horizon."""
+    """Measured path: times (n,) ns, points (n, 3), covariances (n, 3, 3).
+
+    truth: true points (n, 3) by prediction horizon.
+    """
 
     times_ns: NDArray[np.int64]
     points: Floats
@@ -60,8 +64,8 @@ class MeasuredPath:
     truth: Mapping[float, Floats]
 
 
-def measured(scene: Scene, motion: TruePathCase, *, seed: int) -> MeasuredPath:
-    """Measure a path with the scene's rig: triangulate markers with noise."""
+def measure_path(scene: Scene, motion: TruePathCase, *, seed: int) -> MeasuredPath:
+    """Simulate the measurement of a path with the scene's rig: triangulate markers with noise."""
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
     covariance_px = MARKER_NOISE_PX**2 * np.eye(2)
@@ -90,7 +94,7 @@ def measured(scene: Scene, motion: TruePathCase, *, seed: int) -> MeasuredPath:
 
 
 def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Floats:
-    """Return, after each measurement, the filter's prediction at the horizon."""
+    """Return the filter's prediction (n, 3) at the horizon after each measurement."""
     horizons, predicted = np.array([horizon_s]), np.empty_like(seen.points)
     estimate: Estimate | None = None
     for i, at_ns in enumerate(seen.times_ns.tolist()):
@@ -109,7 +113,7 @@ def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]])
 
     def trials(scene: Scene) -> Iterator[Trial]:
         for name, motion in motions(scene).items():
-            seen = measured(scene, motion, seed=1)
+            seen = measure_path(scene, motion, seed=1)
             in_scene = (
                 motion.resting
                 or motion.speed_m_per_s <= SPEED_MARGIN * scene.working_range.speed_m_per_s
@@ -125,7 +129,7 @@ def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]])
     return Family(
         name="tracking",
         unit="mm",
-        reference="true finger at the moment of use",
+        reference="true finger position at the time of use",
         methods=tuple(TRACKING_METHODS),
         trials=trials,
         tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
@@ -135,8 +139,7 @@ def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]])
 def _trial(
     scene: Scene, method: str, case: Case, seen: MeasuredPath, horizon_s: float, *, in_range: bool
 ) -> Trial:
-    """Make a trial that times one update with its prediction, and rates the path after its
-    warm-up."""
+    """Make a trial that times one update with its prediction; its error excludes the warm-up."""
     filter_ = TRACKING_METHODS[method](scene.finger.max_speed_m_per_s)
     middle = len(seen.times_ns) // 2
     before = filter_.initialize(

@@ -1,8 +1,8 @@
 """Triangulate a marker from two images, with its covariance.
 
 The methods take undistorted normalized coordinates (n, 2) of both views and `right_from_left`.
-They return points (n, 3) in the left camera's frame, m.  Where the rays are parallel the point is
-at infinity: its elements are infinite or NaN, which the caller must reject.
+They return points (n, 3) in the left camera's frame, m.  Parallel rays give infinite or NaN
+elements, which the caller must reject.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""Minimum slope of the distortion; below it the lens model folds the image over."""
+"""Minimum slope of the distortion; below it the lens model maps two rays to one pixel."""
 
 MIN_SINE = 1e-6
-"""Minimum sine of the angle between two rays; such points are far outside any volume."""
+"""Minimum sine of the angle between two rays."""
 
 MAX_DISTANCE_M = 1e4
-"""Points farther away are at infinity: their rays are parallel up to rounding."""
+"""Maximum distance of a point; beyond it the rays are parallel up to rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class StereoGeometry:
-    """Hold a rig as arrays: matrices 3x3, distortions (5,), transforms 4x4."""
+    """Geometry of a stereo rig: camera matrices 3x3, distortions (5,), transforms 4x4."""
 
     device: str
     width_px: int
@@ -52,7 +52,7 @@ class StereoGeometry:
     def of(
         scene_camera: StereoCamera, calibration: StereoCalibration | None = None
     ) -> StereoGeometry:
-        """Make the scene's rig, with the optics of a calibration file if one is given.
+        """Make the geometry of the scene's rig, with the optics of a calibration if one is given.
 
         The rig's pose always comes from the scene.  Raises CalibrationMismatchError.
         """
@@ -75,8 +75,7 @@ class StereoGeometry:
         )
 
     def project(self, points_world: Floats) -> tuple[Floats, Floats]:
-        """Return left and right pixels (..., 2) of world points (..., 3) in front of both
-        cameras."""
+        """Project world points (..., 3), in front of both cameras, to pixels (..., 2)."""
         in_left = rigid.apply(self.left_from_world, points_world)
         in_right = rigid.apply(self.right_from_left, in_left)
         return (
@@ -85,7 +84,7 @@ class StereoGeometry:
         )
 
     def normalize(self, left_px: Floats, right_px: Floats) -> tuple[Floats, Floats]:
-        """Return undistorted normalized coordinates (..., 2) of pixels in both views."""
+        """Convert pixels of both views to undistorted normalized coordinates (..., 2)."""
         return (
             camera.normalize(left_px, self.matrices[0], self.distortions[0]),
             camera.normalize(right_px, self.matrices[1], self.distortions[1]),
@@ -97,17 +96,17 @@ def _matrix(lens: Lens) -> Floats:
 
 
 class ImageMismatchError(FlexsheetError, ValueError):
-    """Raised for images of another device, or larger than the sensor of the scene's camera."""
+    """The images are of another device, or larger than the sensor of the scene's camera."""
 
     code = "image-mismatch"
-    remedy = "Name in the scene the camera that took the images."
+    remedy = "Set the camera in the scene to the one that took the images."
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
-    """Raise ImageMismatchError unless the images are of that rig, whole or cropped."""
+    """Raise ImageMismatchError unless the images are of that rig, full or cropped."""
     if pair.device != geometry.device:
         raise ImageMismatchError(
-            f'images of device "{pair.device}"; the scene\'s camera is "{geometry.device}"'
+            f'images of device "{pair.device}"; expected the scene\'s camera "{geometry.device}"'
         )
     views = (("left", pair.left, pair.left_origin_px), ("right", pair.right, pair.right_origin_px))
     for side, image, (column, row) in views:
@@ -122,7 +121,7 @@ def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ClosestApproach:
-    """Find the closest approach of single rays, with the rig as plain numbers.
+    """Solver for the closest approach of two rays, with the rig as plain numbers.
 
     rotation_rows: rows of the rotation left_from_right.
     origin: of the right camera in the left camera's frame, m.
@@ -144,7 +143,7 @@ class ClosestApproach:
     ) -> tuple[Floats, float] | None:
         """Return the midpoint (3,) of the shortest segment between two rays, and its length, m.
 
-        None where the rays are parallel or the segment lies behind a camera.
+        Return None if the rays are parallel or the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
         bx, by, bz = (row[0] * right[0] + row[1] * right[1] + row[2] for row in self.rotation_rows)
@@ -184,7 +183,7 @@ def project_with_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the pixel (2,) of a point (3,) in a camera's frame, and its Jacobian (2, 3) px/m.
 
-    Plain numbers for one point take a tenth of the time of arrays with two elements.
+    Plain numbers are ten times faster than arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
@@ -203,8 +202,7 @@ def undistort_pixel(
 ) -> tuple[float, float] | None:
     """Return undistorted normalized coordinates of one pixel (2,), by Newton's method.
 
-    None where no ray leads to it: it is not finite, or lies where the distortion folds the image
-        over.
+    Return None if the pixel is not finite or outside the invertible range of the distortion.
     """
     fx, fy, cx, cy = _intrinsics(matrix)
     k = distortion.tolist()
@@ -232,7 +230,7 @@ def _intrinsics(matrix: Floats) -> tuple[float, float, float, float]:
 def _distort(
     x: float, y: float, distortion: list[float]
 ) -> tuple[float, float, float, float, float, float]:
-    """Return Brown's distortion of one ray, and its slopes du/dx, du/dy, dv/dx, dv/dy."""
+    """Apply Brown's distortion to one ray; return u, v, du/dx, du/dy, dv/dx, dv/dy."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -250,11 +248,10 @@ def _distort(
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """Hold a triangulated marker: world position (3,) m, covariance (3, 3) m^2, reprojection px
-    rms.
+    """Triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error px.
 
-    The covariance follows from that of the marker centres, to first order.  For nearly parallel
-    rays it grows with the fourth power of the depth, so that it serves to reject such points.
+    The covariance is that of the marker centres, propagated to first order.  For nearly parallel
+    rays it grows with the fourth power of the depth, which allows to reject them.
     """
 
     point_world: Floats
@@ -263,7 +260,7 @@ class TriangulatedPoint:
 
     @property
     def deviation_m(self) -> float:
-        """Root of the total variance."""
+        """Return the square root of the total variance, m."""
         return float(np.sqrt(np.trace(self.covariance)))
 
 
@@ -276,11 +273,11 @@ def measure(
     left_covariance: Floats,
     right_covariance: Floats,
 ) -> TriangulatedPoint | None:
-    """Triangulate a marker's two pixels (2,), with covariances (2, 2) px^2.
+    """Triangulate a marker from its two pixels (2,), with covariances (2, 2) px^2.
 
-    None if the point is not in front of both cameras, if a pixel is not finite, or if the lens
-    model cannot have drawn it.  The methods weight both views equally, by (J'J)^-1 J' with J the
-    Jacobian of the four pixel coordinates, and so does the covariance.
+    Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
+    the lens model.  The covariance weights both views equally, as the methods do: (J'J)^-1 J' with
+    the Jacobian J of the four pixel coordinates.
     """
     left = undistort_pixel(left_px, geometry.matrices[0], geometry.distortions[0])
     right = undistort_pixel(right_px, geometry.matrices[1], geometry.distortions[1])
@@ -291,21 +288,21 @@ def measure(
     in_right = rig[:3, :3] @ point + rig[:3, 3]
     if not (0.0 < point[2] < MAX_DISTANCE_M and 0.0 < in_right[2] < MAX_DISTANCE_M):
         return None
-    left_drawn, left_slope = project_with_jacobian(
+    left_projected, left_slope = project_with_jacobian(
         point, geometry.matrices[0], geometry.distortions[0]
     )
-    right_drawn, right_slope = project_with_jacobian(
+    right_projected, right_slope = project_with_jacobian(
         in_right, geometry.matrices[1], geometry.distortions[1]
     )
     slope = np.concatenate((left_slope, right_slope @ rig[:3, :3]))
-    known, information = cv2.invert(slope.T @ slope)
-    if not known:  # the rays are parallel up to rounding
+    is_regular, information = cv2.invert(slope.T @ slope)
+    if not is_regular:  # the rays are parallel up to rounding
         return None
     inverse = information @ slope.T
     world = geometry.world_from_left
     left_part = world[:3, :3] @ inverse[:, :2]
     right_part = world[:3, :3] @ inverse[:, 2:]
-    shifts = np.concatenate((left_drawn - left_px, right_drawn - right_px))
+    shifts = np.concatenate((left_projected - left_px, right_projected - right_px))
     return TriangulatedPoint(
         point_world=world[:3, :3] @ point + world[:3, 3],
         covariance=left_part @ left_covariance @ left_part.T
