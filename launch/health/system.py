@@ -132,9 +132,12 @@ def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 1 if a package for nodes is missing; with --tests always 0, as tests report it."""
+    """Check the system packages, and return 1 if a package for nodes is missing.
+
+    Return 0 with --tests, because the tests report missing packages.
+    """
     parser = argparse.ArgumentParser(description="Check the system packages.")
-    parser.add_argument("--tests", action="store_true", help="also what the tests need")
+    parser.add_argument("--tests", action="store_true", help="check packages for tests, too")
     tests = parser.parse_args(arguments).tests
     wanted = [one for one in TABLE if tests or not one.tests_only]
     missing = [one for one in wanted if one.problem() is not None]
