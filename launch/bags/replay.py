@@ -84,7 +84,7 @@ class ReplayResult:
 
 @dataclass(slots=True)
 class Comparison:
-    """Differences between replayed and recorded messages of one topic, paired by source stamp.
+    """Comparison of replayed and recorded messages of one topic, paired by source stamp.
 
     worst: maximum difference by field, for fields that differ; 1 for values other than numbers.
     """
@@ -334,7 +334,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
 
 
 class RecordedInputs:
-    """Read the recorded inputs of a node as far ahead as its execution log needs."""
+    """Reader of the recorded inputs of a node, as far ahead as its execution log needs."""
 
     LOOK_AHEAD = 5000
     """Number of messages that are read before a logged one counts as missing."""
@@ -404,7 +404,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """Call the periodic methods of a node on a virtual clock."""
+    """Periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node

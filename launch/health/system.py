@@ -23,7 +23,7 @@ APT_OPTIONS = ("-qq", "-o", "DPkg::Lock::Timeout=120", "-o", "Acquire::Retries=2
 
 @dataclass(frozen=True, slots=True)
 class SystemPackages:
-    """Name the Debian packages for one purpose.
+    """Debian packages for one purpose.
 
     problem: returns why the packages do not work; None if they do.
     """
@@ -122,7 +122,7 @@ def run_apt(*arguments: str) -> bool:
 def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
     """Install the packages of each purpose, and return those that still do not work.
 
-    Each purpose is a transaction of its own, so that an unavailable package does not block others.
+    Each purpose is a separate transaction, so that an unavailable package does not block others.
     """
     run_apt("update")
     for one in missing:

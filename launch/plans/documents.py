@@ -165,10 +165,10 @@ def _parse_tree(text: str) -> Any:
 
 
 def _check_size(text: str) -> None:
-    """Refuse a text whose parsing would take too long.  Raises YAMLError.
+    """Reject a text whose parsing would be too slow.  Raises YAMLError.
 
-    The parser's time grows at least quadratically with the depth, so tokens are counted first,
-    unless the punctuation shows that there are few.
+    The parser's time grows at least quadratically with the depth. Tokens are counted first, unless
+    the punctuation shows that there are few.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)

@@ -59,7 +59,7 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[P
 
 
 def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
-    """Check that each host has a valid key of its own, if any host has a key."""
+    """Check that each host has a separate valid key, if any host has a key."""
     seen: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")

@@ -144,7 +144,7 @@ def apply_setting(document: Document, setting: str) -> None:
 
 
 def apply_record(document: Document, bag: Path) -> None:
-    """Apply the option --record: set the bag of the recorder, and add one if there is none."""
+    """Apply the option --record: set the bag of the recorder; add a recorder if necessary."""
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError(

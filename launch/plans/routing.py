@@ -85,7 +85,7 @@ def resolve_further_inputs(
     document: Document,
     problems: list[Problem],
 ) -> None:
-    """Add the inputs of nodes whose topics depend on their parameters, such as the recorder."""
+    """Add the inputs of nodes whose topics depend on their parameters (recorder, console)."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:

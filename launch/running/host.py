@@ -243,9 +243,7 @@ class HostAgent:
             self._update_file()
 
     def _update_file(self) -> None:
-        """Write the latched e-stop to the file or remove the file; retry later after an
-        error.
-        """
+        """Write or remove the file of the latched e-stop; retry later after an error."""
         if self._file is None:
             return
         try:

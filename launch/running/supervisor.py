@@ -144,9 +144,7 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Send a signal to the node and to all processes that it started, unless it has
-        exited.
-        """
+        """Send a signal to the node and all processes that it started, unless it has exited."""
         if not self.exited.done():
             # The process is not reaped yet, so its id cannot belong to another process.
             os.killpg(self.pid, number)
@@ -167,11 +165,12 @@ class Child:
             self._loop.remove_reader(self._ready_fd)
 
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
-        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own polling.
+        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own
+        polling.
 
-        Polls are counted instead of clock time: a launcher that was suspended or starved itself
-        has received no heartbeat either.  Time in which the process waited for a processor does
-        not count.  When only that time prevents the timeout, `on_starved` is called with it, once.
+        Polls are counted instead of clock time, because a suspended or starved launcher receives no
+        heartbeat either. Time in which the process waited for a processor does not count. When only
+        that time prevents the timeout, `on_starved` is called with it, once.
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -216,9 +215,7 @@ class Child:
             self._report(self._node, line.decode(errors="replace"))
 
     def _reap(self) -> None:
-        """Handle the exit of the process: kill its children, read its last output, close
-        pipes.
-        """
+        """Handle the exit: kill child processes, read the last output, close pipes."""
         if self.exited.done():
             return
         if self._process.returncode is None:

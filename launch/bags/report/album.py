@@ -28,7 +28,7 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """Store at most `limit` shots at regular intervals, and the first shot after each bookmark.
+    """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
     bookmarks: (seconds, label), in order. seen: number of shots. left_out: number of shots at
     bookmarks beyond the first `MAX_BOOKMARK_SHOTS`.

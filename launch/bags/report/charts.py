@@ -42,7 +42,7 @@ EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart. svg: image. text: its content in words. caption: how to read it."""
+    """A chart. svg: image. text: description of its content. caption: how to read it."""
 
     svg: str
     text: str

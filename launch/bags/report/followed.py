@@ -38,7 +38,7 @@ class Sizes:
 
 
 class FollowedFinger:
-    """Accumulate the errors of the true sheet against the true finger, exposure by exposure.
+    """Accumulator of the errors of the true sheet against the true finger.
 
     A drop-out is an interval without following that overlaps contact.
     """

@@ -23,7 +23,7 @@ METHODS = ("method", *Methods.model_fields)
 
 
 def compute_numbers(session: Session) -> dict[str, Any]:
-    """Compute all figures; None where the bag lacks the data."""
+    """Compute all figures; None where the bag does not contain the data."""
     info, scene = session.info, session.scene
     return {
         "bag": {

@@ -24,7 +24,7 @@ MAX_STATE_AGE_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Divide the time of a bag into equal intervals."""
+    """Division of the time of a bag into equal intervals."""
 
     start_ns: int
     duration_s: float
@@ -42,7 +42,7 @@ class Grid:
 
 
 class Range:
-    """Store minimum and maximum of each interval; NaN without a value."""
+    """Minimum and maximum of each interval; NaN without a value."""
 
     def __init__(self, grid: Grid) -> None:
         self.minimum = np.full(grid.count, np.nan)
@@ -64,7 +64,7 @@ class Range:
 
 
 class Spread:
-    """Store a logarithmic histogram of durations for each interval."""
+    """Logarithmic histogram of durations for each interval."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
@@ -103,7 +103,7 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """Store the last point of each interval, (count, 3); NaN without a point."""
+    """Last point of each interval, (count, 3); NaN without a point."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -113,9 +113,9 @@ class PointSeries:
 
 
 class States:
-    """Store the most severe state of each interval, and the total time in each state.
+    """Most severe state of each interval, and total time in each state.
 
-    order: the known states, from the least to the most severe.
+    order: the expected states, from the least to the most severe.
     """
 
     NOTHING = -1
@@ -145,7 +145,7 @@ class States:
 
 @dataclass(slots=True)
 class RunningMoments:
-    """Accumulate mean, standard deviation and maximum of values that are not stored."""
+    """Mean, standard deviation and maximum of values that are not stored."""
 
     count: int = 0
     total: float = 0.0
@@ -170,7 +170,7 @@ class RunningMoments:
 
 @dataclass(slots=True)
 class Events:
-    """Store at most `limit` events of each kind in order, and count all."""
+    """Events in order, at most `limit` of each kind, and the count of all."""
 
     limit: int = 100
     held: list[tuple[float, str, str]] = field(default_factory=list)

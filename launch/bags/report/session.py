@@ -70,7 +70,7 @@ FAULTY = ("fault", "estop", "disconnected", "stopping")
 
 @dataclass(slots=True)
 class Flow:
-    """Record how regularly a topic was written and which sequence numbers are missing.
+    """Regularity of a topic, and its missing sequence numbers.
 
     lost: messages missing from the writers' numbering. silences: intervals longer than ten of the
     slowest expected period. age: time from the source stamp to the recorder.
@@ -87,9 +87,9 @@ class Flow:
 
 @dataclass(slots=True)
 class PortTotals:
-    """Count the messages that the readers of a topic skipped, lost and refused.
+    """Counts of the messages that the readers of a topic skipped, lost and refused.
 
-    The counters contain earlier starts of a node. What a node counted before the bag began is
+    The counters contain earlier starts of a node. Counts from before the start of the bag are
     subtracted.
     """
 
@@ -102,7 +102,7 @@ class PortTotals:
     def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
         """Add a reader's counters.
 
-        started_earlier: the node had been counting long before the bag began.
+        started_earlier: the node had been counting long before the start of the bag.
         """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
@@ -130,7 +130,7 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """Count how often a host was reported busy, and store the worst report."""
+    """How often a host was reported busy, and its worst report."""
 
     reports: int = 0
     busy: int = 0
@@ -151,7 +151,7 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSummary:
-    """Summarize a node's status messages."""
+    """Summary of a node's status messages."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -177,7 +177,7 @@ class NodeSummary:
 
 
 class Arm:
-    """Summarize one arm over time: modes, speeds and edge force."""
+    """Summary of one arm: modes, speeds and edge force."""
 
     def __init__(self, grid: Grid, fine: Grid) -> None:
         self.modes = States(fine, MODES)

@@ -79,7 +79,7 @@ class FingerRun:
 
 
 class MotionBuffer:
-    """Buffer the samples of a finger and of both sheet edges until errors can be computed."""
+    """Samples of a finger and of both sheet edges, until the errors can be computed."""
 
     def __init__(self) -> None:
         self.finger: list[tuple[int, Floats]] = []
@@ -88,9 +88,7 @@ class MotionBuffer:
     def pop_complete(
         self,
     ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
-        """Return the motions and the times at which all of them are known; keep later
-        samples.
-        """
+        """Return the motions and the times that all of them cover; later samples remain."""
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
         finger = make_motion(self.finger, "finger")
@@ -105,7 +103,7 @@ class MotionBuffer:
 
 
 class SheetErrors:
-    """Accumulate sheet errors from messages in order; call `finish` at the end."""
+    """Accumulator of sheet errors; add messages in order and call `finish` at the end."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
