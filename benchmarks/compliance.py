@@ -22,7 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import twin_force
-from flexsheet.launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
+from flexsheet.launch.health.compliance import (
+    LINEAR_DEPTH_M,
+    compute_compliance,
+    compute_front_curve,
+)
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
@@ -54,7 +58,7 @@ PLACES_MODULUS_PA = 3000.0
 
 def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
     """Compute the force-depth curve of the scene's object, divided by its Young's modulus."""
-    rows, modulus = front_curve(scene), scene.object.material.young_modulus_pa
+    rows, modulus = compute_front_curve(scene), scene.object.material.young_modulus_pa
     return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
 
 
@@ -87,7 +91,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     for modulus in MODULI_PA:
         curve = curve_of(modulus)
         wanted = curve.force_n(depths)
-        shown = scene_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
+        shown = compute_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
         error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
         stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
         old = choose_stretch(stiffness, scene.sheet).stretch_ratio
@@ -108,7 +112,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
 
 def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     curve = object_curve(scene)(PLACES_MODULUS_PA)
-    shown = scene_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
+    shown = compute_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
     print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
     for place in PLACES:
         pushed = shown.indentation_m(depths, place)
@@ -122,11 +126,11 @@ def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
     curve_of = object_curve(scene)
 
     def fits(modulus: float) -> bool:
-        shown = scene_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
+        shown = compute_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
         return float(np.abs(shown.centre.error_ratio).max()) <= TARGET_ERROR_RATIO
 
     def sure(modulus: float) -> bool:
-        shown = scene_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
+        shown = compute_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
         return (
             force_uncertainty_ratio(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
         )

@@ -43,7 +43,7 @@ class NodeNote(Enum):
         "by itself.",
     )
     NODE_HUNG = (
-        "hung: no sign of life",
+        "hung: no heartbeat",
         "The node is restarted. The end of `logs/NODE.log` of the run shows where it stood. "
         "`liveness_s` of the launch file sets how long it may be silent.",
     )
@@ -80,7 +80,7 @@ class NodeNote(Enum):
         "Reduce the traffic of the network, set up chrony, or allow more (docs/clocks.md).",
     )
     ESTOP_KEPT = (
-        "kept until it is reset",
+        "latched until it is reset",
         "Reset it when the danger is over: `flexsheet arms reset`.",
     )
     LAST_SHEET_PLANE = (

@@ -120,7 +120,7 @@ def test_a_tool_that_holds_the_endpoint_does_not_hinder_a_stop(graph: Graph) -> 
     assert ("launcher", "launch", "confirmed") in outcomes(answer)
     assert all(one["mode"] == "estop" for one in answer["arms"])
     assert all(REASON in one["faults"][0] for one in answer["arms"])
-    assert "e-stop of tools, kept until it is reset" in graph.log()
+    assert "e-stop of tools, latched until it is reset" in graph.log()
 
 
 @pytest.mark.usefixtures("holder")
@@ -129,7 +129,7 @@ def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
     code, answer = stop_by_command()
     assert code == 0
     assert answer["stopped"]
-    wait_until(lambda: "kept until it is reset" in graph.log(), "the launcher to keep the stop")
+    wait_until(lambda: "latched until it is reset" in graph.log(), "the launcher to keep the stop")
 
 
 @pytest.mark.usefixtures("holder")

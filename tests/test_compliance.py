@@ -277,7 +277,9 @@ def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
 ) -> None:
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
-    monkeypatch.setattr("flexsheet.launch.health.compliance.front_curve", lambda scene: rows)
+    monkeypatch.setattr(
+        "flexsheet.launch.health.compliance.compute_front_curve", lambda scene: rows
+    )
     command = ["doctor", "compliance", str(SCENE_FILE)]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output

@@ -29,7 +29,7 @@ from flexsheet.nodes.console.sheet import (
     sheet_points,
     sheet_triangles,
 )
-from flexsheet.nodes.console.snapshot import ray_vertices, rays, take_snapshot
+from flexsheet.nodes.console.snapshot import compute_snapshot, ray_vertices, rays
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import Shelf, cylinder
@@ -157,10 +157,10 @@ def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
 
 
 def test_a_picture_of_what_is_known(scene: Scene) -> None:
-    nothing = take_snapshot(scene, Shelf())
+    nothing = compute_snapshot(scene, Shelf())
     assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
     left, right = edges()
-    both = take_snapshot(
+    both = compute_snapshot(
         scene,
         Shelf(
             arm_left=arm_state("left", world_from_flange=left),

@@ -49,7 +49,7 @@ def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
     assert not sent, "nobody wants to look"
     anothers = Display(correction="one_plane", stereo="anaglyph", label="mine")
     eye_view.on_others_display(anothers)
-    eye_view.wanted = True
+    eye_view.enabled = True
     eye_view.advance(2.0)
     asked = sent[0]
     assert (asked.stereo, asked.pixels_every > 0) == ("mono", True)
@@ -94,7 +94,7 @@ def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
     assert corrections() == [], "the renderer follows the scene by itself"
     controller.scenes.choose("silent")
     controller.eye_view.on_scene(corrected_by("four_triangles"))
-    controller.eye_view.wanted = True
+    controller.eye_view.enabled = True
     controller.eye_view.advance(1.0)
     controller.eye_view.advance(60.0)
     rested = sent[-1]
@@ -103,7 +103,7 @@ def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
     controller.scenes.choose("flat")
     controller.scenes.choose("silent")
     assert corrections()[2:] == ["one_plane", "two_pass"]
-    controller.eye_view.picked = "none"
+    controller.eye_view.chosen_correction = "none"
     controller.scenes.choose("flat")
     assert corrections()[4:] == ["none"]
 
@@ -129,7 +129,7 @@ def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
     """On a busy computer each picture came after the next was asked for, and none was shown."""
     sent: list[Message] = []
     eye_view = EyeViewRequester(sent.append, scene)
-    eye_view.wanted = True
+    eye_view.enabled = True
     eye_view.advance(1.0)
     eye_view.on_frame(frame("another"), 1.5)
     eye_view.on_frame(frame(eye_view.label, pixels=False), 1.5)
@@ -159,7 +159,7 @@ def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
 
 def test_a_picture_that_never_comes_is_given_up(scene: Scene) -> None:
     eye_view = EyeViewRequester(lambda message: None, scene)
-    eye_view.wanted = True
+    eye_view.enabled = True
     eye_view.advance(1.0)
     eye_view.on_frame(frame(eye_view.label), 2.0)
     eye_view.advance(2.0 + 1.1 * MAX_TRACING_S)
@@ -169,15 +169,15 @@ def test_a_picture_that_never_comes_is_given_up(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("state", "ago_s", "expected"),
     [
-        (EyeViewState.DRAWING, None, "renderer to draw a frame: 7 s."),
+        (EyeViewState.DRAWING, None, "for a frame of the renderer: 7 s."),
         (EyeViewState.TRACING, None, "busy computer: 7 s."),
-        (EyeViewState.TRACING, 31.0, "The last image came 31 s ago"),
+        (EyeViewState.TRACING, 31.0, "The last image is 31 s old"),
         (EyeViewState.RESTING, 3.0, "Rendered 3 s ago"),
-        (EyeViewState.RESTING, None, "no frame or no image"),
+        (EyeViewState.RESTING, None, "No frame or image"),
     ],
 )
 def test_the_eye_tab_says_what_it_waits_for(
     state: EyeViewState, ago_s: float | None, expected: str
 ) -> None:
-    html = panels.eye(possible=True, wanted=True, state=state, waited_s=7.0, ago_s=ago_s)
+    html = panels.eye(possible=True, enabled=True, state=state, waited_s=7.0, ago_s=ago_s)
     assert expected in html

@@ -185,7 +185,7 @@ async def test_own_display_messages_are_known_by_their_writer(
     eye_view = bench.operator.controller.eye_view
     others = display("console 1")
     bench.operator.on_message(others, Header(1, 1, 1, "clock", writer, 1), 0.0)
-    eye_view.wanted = True
+    eye_view.enabled = True
     bench.run(0.5)
     assert eye_view.state is EyeViewState.DRAWING
     bench.run(2.0 * MAX_DRAWING_S)
@@ -196,7 +196,7 @@ async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)
-    assert "recording to a.mcap" in bench.operator._page.record._words._shown
+    assert "recording to a.mcap" in bench.operator._page.record._text._shown
     assert "meshes, 3 s left" in bench.operator._page._state._shown
 
 

@@ -230,7 +230,9 @@ async def end_recording(page: Page, heard: Heard) -> None:
     await heard.until(lambda: heard.last("recording") == Recording(running=False), "its end")
     await expect(page.get_by_role("combobox", name="Bag")).to_have_value("a.mcap")
     await page.get_by_role("button", name="Show the bag").click()
-    await expect(page.get_by_role("alert").last).to_contain_text("has no topic that the page shows")
+    await expect(page.get_by_role("alert").last).to_contain_text(
+        "contains no topic that the page shows"
+    )
 
 
 def height_m(heard: Heard) -> float:

@@ -109,7 +109,7 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     assert [one.object.material.young_modulus_pa for one in sent if isinstance(one, Scene)] == [6e3]
     controller.choose("other")
     assert controller.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
-    with pytest.raises(scenes.SceneChoiceError, match='no scene "none"; there are: other'):
+    with pytest.raises(scenes.SceneChoiceError, match='unknown scene "none"; choose one of: other'):
         controller.choose("none")
     controller.slide(30.0, size_ratio=-1.0)
     with pytest.raises(scenes.SceneChoiceError):
@@ -159,4 +159,4 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     (begun,) = controller()[1]
     assert isinstance(begun, Scene)
     assert begun.name == scene.name
-    assert "is no valid state" in warnings[0]
+    assert "invalid state" in warnings[0]

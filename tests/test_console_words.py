@@ -157,7 +157,7 @@ def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
     faulty = rendered(arms=arms_in(mode="fault", faults=("x",), auto_arming=auto))
     idle = rendered(arms=arms_in(mode="idle", auto_arming=auto))
     for html in (stopped, faulty):
-        assert ("the arms then move at once" in html) == auto
+        assert ("the arms then move immediately" in html) == auto
     for html in (stopped, faulty, idle):
         assert ("flexsheet arms enable" in html) != auto
 
@@ -194,8 +194,8 @@ def test_words_of_the_tabs() -> None:
     assert "12 mm left and 3 mm above the screen" in told
     assert "4 mm behind" in told
     resting: dict[str, Any] = {"state": EyeViewState.RESTING, "waited_s": 1.0, "ago_s": None}
-    assert "twin_eye" in panels.eye(wanted=True, possible=False, **resting)
-    assert "Tick" in panels.eye(wanted=False, possible=True, **resting)
+    assert "twin_eye" in panels.eye(enabled=True, possible=False, **resting)
+    assert "Tick" in panels.eye(enabled=False, possible=True, **resting)
     assert "no recorder" in panels.recorder(None, ())
     assert "Bookmarks: one, &lt;b&gt;." in panels.recorder("waits", ("one", "<b>"))
 

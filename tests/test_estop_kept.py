@@ -172,7 +172,7 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
         arms = asyncio.create_task(second.arms(modes))
         second.say(RESET)
         # The left bridge refuses while its arm moves: a stop that it holds is not forgotten.
-        await until(lambda: sum("e-stop kept: arm_left" in line for line in second.said) == 2)
+        await until(lambda: sum("arm_left did not confirm it" in line for line in second.said) == 2)
         assert len(files(folder)) == 2
         modes["left"] = "idle"
         monkeypatch.setattr("flexsheet.launch.running.host.RESET_WITHIN_S", DEADLINE_S)
@@ -189,7 +189,7 @@ async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
         launchers.say(STOP)
         await until(lambda: len(files(folder)) == 2, launchers.said)
         launchers.say(RESET, before_ns=-(10**10))
-        refused = "e-stop not reset: by tools, stamped in the future"
+        refused = "e-stop not reset by tools: stamped in the future"
         await until(lambda: launchers.said.count(refused) == 2, launchers.said)
         assert len(files(folder)) == 2
 

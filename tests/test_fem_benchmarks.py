@@ -12,7 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from benchmarks import external_solvers
-from flexsheet.launch.health.compliance import SKIN_SPACING_M, front_curve
+from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
 from flexsheet.launch.methods.charts import write_overview
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import load_cached, save_cached
@@ -104,7 +104,7 @@ def test_a_solver_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPa
 
 def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> None:
     scene = small_scene()
-    by_linear = front_curve(scene, tmp_path)
+    by_linear = compute_front_curve(scene, tmp_path)
     spec = make_soft_body_spec(scene, SKIN_SPACING_M)
     model = load_cached(precompute.response_cache(spec), tmp_path)
     assert model is not None
@@ -118,7 +118,7 @@ def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> No
         reach_m=np.full(count, 0.02),
     )
     save_cached(table_cache(make_table_spec(scene, spec)), tmp_path, table)
-    by_table = front_curve(scene, tmp_path)
+    by_table = compute_front_curve(scene, tmp_path)
     assert by_table[:, 1] == pytest.approx(100.0 * by_table[:, 0], rel=1e-3, abs=1e-9)
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)
 

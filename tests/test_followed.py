@@ -145,7 +145,8 @@ def test_the_report_says_the_same(tmp_path: Path) -> None:
     assert "The true finger along each path" in page
     assert "drop-outs" in page
     assert any(
-        'path "hand" was not followed in contact once' in one.text for one in find_problems(numbers)
+        'path "hand" the arms stopped following in contact once' in one.text
+        for one in find_problems(numbers)
     )
 
 

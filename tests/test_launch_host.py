@@ -79,7 +79,7 @@ async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -
             await until(lambda: sum(answer in line for line in said) == 2, answer)
             writer.close()
 
-        await say(STOP, "kept until it is reset")
+        await say(STOP, "latched until it is reset")
         kept = {launcher_on(host): STOP for host in HOSTS}
         assert await heard_late(plan, graph, kept) == kept
         await say(RESET, "reset by tools")

@@ -154,7 +154,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "    topics: {twin__finger: twin/arms}\n",
-            'topic "twin/arms" carries TwinArms, port "twin__finger" takes TwinFinger',
+            'topic "twin/arms" carries TwinArms, port "twin__finger" needs TwinFinger',
         ),
         (
             GRAPH + f"  second: {{type: '{BEACON}'}}\n",

@@ -156,7 +156,7 @@ async def test_crashes_are_answered_with_growing_delays_and_then_an_end(tmp_path
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
         with pytest.raises(NodeFailedError, match="beacon ended with exit code 3, after 3 restart"):
             await asyncio.wait_for(graph.wait(), DEADLINE_S)
-    delays = [line.split("starts again in ")[1] for line in said if "starts again" in line]
+    delays = [line.split("restarts in ")[1] for line in said if "restarts in" in line]
     assert delays == ["0.02 s", "0.04 s", "0.05 s"]
     assert graph.exit_codes == {"beacon": 3}
 
@@ -220,7 +220,7 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
         assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
         assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
-    told = "hung: no sign of life for 2 s; its log holds the stacks; starts again in 0.01 s"
+    told = "hung: no heartbeat for 2 s; its log contains the stacks; restarts in 0.01 s"
     assert f"stuck {told}" in said
     assert not any("launch_nodes.py" in line for line in said)
 
@@ -353,7 +353,7 @@ async def test_a_port_in_use_is_named_before_anything_starts(
     endpoint = plan.writers["twin/finger"][0].tcp
     assert endpoint is not None
     with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
-        with pytest.raises(BadInputError, match="end the other graph or program"):
+        with pytest.raises(BadInputError, match="stop the other program"):
             await RunningGraph(plan).__aenter__()
         # The other host's launcher does not bind it.
         async with RunningGraph(plan, host="main") as graph:

@@ -19,9 +19,9 @@ from flexsheet.launch.health.layout import (
     check_layout,
     draw_layout,
     layout_result,
-    samples_of,
-    touches,
-    with_base_moved,
+    make_samples,
+    move_base,
+    sample_contacts,
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, cylinder_of
@@ -270,7 +270,7 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
 
 def barred_scene() -> Scene:
     """Return a scene whose left base is so far off that much is out of its reach."""
-    return with_base_moved(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
+    return move_base(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +286,7 @@ def barred() -> Layout:
 def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.reachable
     assert demo.remedies == ()
-    assert demo.broken_ways == ()
+    assert demo.blocked_paths == ()
     result = layout_result(demo)
     assert result["share"] == 1.0
     assert result["share_at_working_speed"] == 1.0
@@ -318,9 +318,9 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
     moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
     assert len(moved) == 1
     offset = np.array(moved[0].values["left_base_offset_m"])
-    again = with_base_moved(barred_scene(), "left", offset)
+    again = move_base(barred_scene(), "left", offset)
     reach = find_best_reach(
-        ArmGeometry(again, "left"), RIGHT, samples_of(again, touches(again)).places
+        ArmGeometry(again, "left"), RIGHT, make_samples(again, sample_contacts(again)).poses
     )
     assert reach.reachable.all()
 

@@ -59,14 +59,14 @@ def page(bag: Path) -> str:
 
 
 @given(st.lists(st.floats(2e-5, 50.0), min_size=1, max_size=200), st.floats(0.01, 1.0))
-def test_a_spread_knows_quantiles_to_a_cell(durations: list[float], share: float) -> None:
+def test_a_spread_knows_quantiles_to_a_cell(durations: list[float], fraction: float) -> None:
     spread = Spread(Grid(0, 1.0, 2))
     for duration in durations:
-        spread.take(1, duration)
-    found = spread.quantile_s(share)
-    exact = float(np.quantile(durations, share, method="inverted_cdf"))
+        spread.add(1, duration)
+    found = spread.quantile_s(fraction)
+    exact = float(np.quantile(durations, fraction, method="inverted_cdf"))
     assert found == pytest.approx(exact, rel=0.024)
-    assert np.isnan(spread.quantiles_s(share)[0])
+    assert np.isnan(spread.quantiles_s(fraction)[0])
     assert spread.longest_s == max(durations)
 
 
@@ -81,7 +81,7 @@ def test_nothing_has_no_quantile_and_no_summary() -> None:
 def test_moments_are_numpys(values: list[float]) -> None:
     moments = RunningMoments()
     for one in values:
-        moments.take(np.abs([one]))
+        moments.add(np.abs([one]))
     found, wanted = moments.summary(2.0), summary(np.abs(values), 2.0)
     assert found is not None
     for key in ("mean", "max"):
@@ -93,7 +93,7 @@ def test_what_is_kept_does_not_grow_with_what_came() -> None:
     album, events = Album(4, [(50.0, "x")]), Events(limit=5)
     image = np.zeros((2, 2), np.uint8)
     for i in range(100):
-        album.take(float(i), str(i), (("left", image),))
+        album.add(float(i), str(i), (("left", image),))
         events.add(float(i), "gap", "")
     events.add(3.0, "estop", "late, but of another kind")
     shots = album.shots()
@@ -109,7 +109,7 @@ def test_what_is_kept_does_not_grow_with_what_came() -> None:
 def test_of_many_moments_the_first_are_shown_and_the_rest_counted() -> None:
     album = Album(4, [(float(i), str(i)) for i in range(500)])
     for i in range(500):
-        album.take(float(i), "", (("left", np.zeros((2, 2), np.uint8)),))
+        album.add(float(i), "", (("left", np.zeros((2, 2), np.uint8)),))
     assert len(album.shots()) == MAX_BOOKMARK_SHOTS
     assert album.left_out == 500 - MAX_BOOKMARK_SHOTS
     assert album.seen == 500
@@ -119,7 +119,7 @@ def test_states_last_until_another_and_gaps_stay_white() -> None:
     grid = Grid(0, 10.0, 10)
     states = States(grid, ("wait", "contact"))
     for second, state in ((0, "wait"), (1, "wait"), (2, "contact"), (7, "contact")):
-        states.take(second, second * 10**9, state)
+        states.add(second, second * 10**9, state)
     assert states.changes == 1
     assert list(find_intervals(states, grid)) == [
         ("wait", 0.0, 2.0),
@@ -147,7 +147,7 @@ def test_a_stroke_is_recognized_by_its_duration_not_by_its_label(
         position_world_m=np.zeros(3),
         velocity_world_m_per_s=np.zeros(3),
     )
-    errors.take(finger, 1_000_000_000)
+    errors.add(finger, 1_000_000_000)
     assert [run.stroke_s for run in errors.runs] == [stroke_s]
 
 
@@ -229,8 +229,8 @@ def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
     assert first.gravity == "bad"
     assert first.text.startswith(
         "In 50% of the time the computer main is busy: twin_arms waits for a processor 61% of the "
-        "time; cores in use: chromium 1.3 (at worst). An arm dropped out once; this is the "
-        "probable cause."
+        "time; cores in use: chromium 1.3 (at worst). An arm stopped following once; "
+        "overload is the probable cause."
     )
 
 
@@ -248,15 +248,15 @@ def test_what_was_wrong_is_said_and_the_worst_first(numbers: dict[str, Any]) -> 
     found = find_problems(numbers)
     said = " ".join(one.text for one in found)
     for part in (
-        "had been changed",
+        "has changes after its commit",
         "E-stop, once; first at 2.10 s: e-stop engaged by console: a person.",
         "left arm: joint 3 is hot",
-        "right arm: joint 2 went at 210% of its greatest speed.",
-        "left arm: its edge was pulled with 25 N; 20 N are allowed.",
+        "right arm: joint 2 reached 210% of its maximum speed.",
+        "left arm: edge force 25 N, limit 20 N.",
         "planner had 3 errors; the last: on_fingertip: bang.",
         "fingertip: 1 messages were refused",
-        "fingertip fell silent once",
-        "out of its range in 10.0% of its answers",
+        "fingertip stopped once",
+        "outside its valid range in 10.0% of its results",
     ):
         assert part in said, part
     gravities = [one.gravity for one in found]
@@ -334,7 +334,7 @@ def test_pictures_are_the_sessions(page: str) -> None:
         buffer = np.frombuffer(base64.b64decode(data), np.uint8)
         levels.append(round(float(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE).mean()), -1))
     assert levels == [0, 10, 20]
-    assert sum("what it should see" in text for text, _ in images) == 3
+    assert sum("expected by the eye" in text for text, _ in images) == 3
     assert sum("projector" in text for text, _ in images) == 3
     # The first shot after the moment at 1.5 s is the one of 2.2 s.
     assert re.search(r"2\.21 s\.[^<]*<strong>Bookmark: &lt;b&gt;first touch", page)
@@ -372,7 +372,7 @@ def test_an_empty_bag_is_reported_as_that(tmp_path: Path) -> None:
     BagWriter(path).close()
     text = render_page(read_session(path))
     assert "No arm was recorded." in text
-    assert "Nothing was found" in text
+    assert "No problem was found" in text
 
 
 def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
@@ -380,7 +380,7 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) - 400])
     found = make_result(read_session(cut))
-    assert found["findings"][0]["text"].startswith("The bag is not whole (cut after")
+    assert found["findings"][0]["text"].startswith("The bag is incomplete (cut after")
     assert found["bag"]["messages"] > 100
 
 
@@ -398,11 +398,11 @@ def test_where_no_page_can_be_written_the_bag_is_not_read(
     monkeypatch.setattr(
         "flexsheet.launch.bags.report.write.read_session", lambda *_: pytest.fail("it was read")
     )
-    with pytest.raises(BagError, match="name a file with -o in a folder that is there"):
+    with pytest.raises(BagError, match="name a file in a writable folder with -o"):
         report(bag, tmp_path / "none" / "a.html", lambda done, whole: None)
     folder = tmp_path / "a.html"
     folder.mkdir()
-    with pytest.raises(BagError, match="name a file with -o in a folder that is there"):
+    with pytest.raises(BagError, match="name a file in a writable folder with -o"):
         report(bag, folder, lambda done, whole: None)
     assert [*tmp_path.iterdir()] == [folder]
 
@@ -418,7 +418,7 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
     assert MARK in copy.with_suffix(".html").read_text()
     letter = tmp_path / "letter.html"
     letter.write_text("dear")
-    with pytest.raises(BagError, match="is no report, so it is not written over"):
+    with pytest.raises(BagError, match="is not a report, so it is not overwritten"):
         report(copy, letter, lambda done, whole: None)
     monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "report", str(copy), "--json"])
     with pytest.raises(SystemExit) as ended:
@@ -434,10 +434,10 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
             rejected=0,
         )  # fmt: skip
 
-    for lived_before, lost in ((True, 3), (False, 8)):
+    for started_earlier, lost in ((True, 3), (False, 8)):
         port = PortTotals(Spread(Grid(0, 1.0, 1)))
         for gaps in (5, 8):
-            port.take("planner", 1, counted(gaps), lived_before=lived_before)
+            port.add("planner", 1, counted(gaps), started_earlier=started_earlier)
         assert port.totals() == (0, lost, 0)
 
 

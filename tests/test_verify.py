@@ -190,7 +190,7 @@ def rewritten(
     ],
 )
 def test_nodes_that_cannot_be_stepped_say_why(bag: Path, name: str, why: str) -> None:
-    with pytest.raises(BagError, match=f"{name} is not replayed: .*{why}"):
+    with pytest.raises(BagError, match=f"{name} cannot be replayed: .*{why}"):
         verify(bag, name)
 
 

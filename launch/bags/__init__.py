@@ -1,1 +1,1 @@
-"""Recordings: played, stepped through a node, reported, and handed to other people's tools."""
+"""Play, replay, report and export bags."""

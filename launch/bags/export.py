@@ -1,16 +1,16 @@
-"""Bags for other people's tools: an MCAP file of well-known schemas, which Foxglove and rerun open.
+"""Export bags as MCAP files with standard schemas, which Foxglove and rerun open.
 
-Each topic becomes a JSON channel of the same name with its numbers (arrays beyond `PLOTTED` values
-are left out: plots have no use for them), and what can be looked at becomes a channel of its own:
+Each topic becomes a JSON channel of the same name with its numbers; arrays of more than `PLOTTED`
+values are left out. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
-    finger      the fingertip, with the path that is foreseen             foxglove.SceneUpdate
+    finger      the fingertip with its predicted path                     foxglove.SceneUpdate
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
-    object      the soft body's skin, dented                              foxglove.SceneUpdate
+    object      the deformed skin of the soft body                        foxglove.SceneUpdate
 
-The world frame is flexsheet's (x right, y up, z towards the user).  Times are the recorder's; where
-the bag knows the time of day at its start they count from 1970, else from the host's start.
+The world frame is flexsheet's (x right, y up, z towards the user). Times are the recorder's. They
+count from 1970 if the bag contains the time of day of its start, else from the host's start.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.models.rigid import transform_from_rpy
 
 PLOTTED = 64
-"""Arrays of up to so many values are exported as numbers."""
+"""Maximum size of an array that is exported as numbers."""
 
 SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
@@ -56,24 +56,24 @@ FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
 LOST_COLOUR = (0.60, 0.60, 0.60, 0.5)
 SHEET_HEIGHT_M, FINGER_RADIUS_M = 0.24, 0.007
 
-Picture = tuple[str, NDArray[np.uint8]]
+NamedImage = tuple[str, NDArray[np.uint8]]
 Output = tuple[str, Any]
 
 
 MIN_FREE_BYTES = 4 << 20
-"""On the disk of an export; more than the library holds back before it writes."""
+"""Minimum free space on the disk of an export; exceeds the library's write buffer."""
 
 
 class ExportError(FlexsheetError, RuntimeError):
-    """Report why an export cannot be made, and what to do."""
+    """An export that cannot be made; the text gives the reason and the remedy."""
 
     code = "export"
     remedy = "Install the package that the text names, or choose another output file."
 
 
 @dataclass(slots=True)
-class Exported:
-    """Hold the number of messages per channel, and the unreadable topics."""
+class ExportResult:
+    """Number of messages per channel, and unreadable topics."""
 
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -87,37 +87,37 @@ def export(
     *,
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
-) -> Exported:
+) -> ExportResult:
     """Write the bag as an MCAP file of Foxglove's schemas.
 
-    topics: by name; default all.  Topics whose type has changed since the recording cannot be read
-    and are named in the result.  Raises ExportError, BagError.
+    topics: names; default: all. A topic whose type has changed since the recording cannot be read,
+    and is named in the result. Raises ExportError and BagError.
     """
-    foxglove = _foxglove()
+    foxglove = _import_foxglove()
     if output.exists():
-        raise ExportError(f"{output}: exists already; an export is never written over")
+        raise ExportError(f"{output}: exists already; name a new file")
     reader = BagReader(bag)
     summary = reader.info()
     wanted = set(reader.topics if topics is None else topics)
     if absent := sorted(wanted - reader.topics.keys()):
-        held = ", ".join(sorted(reader.topics)) or "nothing"
-        raise ExportError(f"{bag}: holds no topic {', '.join(absent)}; it holds {held}")
+        names = ", ".join(sorted(reader.topics)) or "no topic"
+        raise ExportError(f"{bag}: does not contain {', '.join(absent)}; it contains {names}")
     readable = {one.name for one in summary.topics if one.readable} & wanted
     offset_ns = _wall_clock_offset_ns(reader)
-    result = Exported(output, unreadable=tuple(sorted(wanted - readable)))
+    result = ExportResult(output, unreadable=tuple(sorted(wanted - readable)))
     result.wall_clock = offset_ns is not None
     context = foxglove.Context()
     channels: dict[str, Any] = {}
     draft = output.with_name(f"{output.name}.part")
-    seen = Seen()
+    state = ViewState()
     try:
-        _check_room(output)
+        _check_free_space(output)
         with foxglove.open_mcap(draft, context=context, allow_overwrite=True) as writer:
             for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
-                # The library itself would print a line for each message that it cannot write.
-                _check_room(output)
+                # The library would print a line for each message that it cannot write.
+                _check_free_space(output)
                 at_ns = log_time_ns + (offset_ns or 0)
-                views = seen.views(topic, message, at_ns)
+                views = state.views(topic, message, at_ns)
                 for name, value in (*list_numbers(topic, message), *views):
                     channel = channels.get(name) or _channel(foxglove, name, value, context)
                     channels[name] = channel
@@ -137,27 +137,27 @@ def export(
     return result
 
 
-def _check_room(output: Path) -> None:
+def _check_free_space(output: Path) -> None:
     """Raise OSError if the disk is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def list_numbers(topic: str, message: Message) -> Iterator[Output]:
-    """Return the message as JSON, without its large arrays."""
+    """Yield the message as JSON, without its large arrays."""
     yield topic, _plain(message)
 
 
 @dataclass(slots=True)
-class Seen:
-    """Hold the latest scene, skin and flanges, which later messages are drawn with."""
+class ViewState:
+    """Latest scene, skin and flanges, which the drawing of later messages needs."""
 
     scene: Scene | None = None
     skin: Skin | None = None
     flanges: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
-        """What of a message can be looked at: (channel, message of foxglove)."""
+        """Yield images and 3D data of a message: (channel, message of foxglove)."""
         from foxglove import messages as fg
 
         stamp = fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
@@ -168,8 +168,8 @@ class Seen:
                 self.skin = message
                 yield "object", _mesh("object", message.vertices_world_m, message.triangles, stamp)
             case SoftBody() if self.skin is not None and self.skin.mesh_id == message.mesh_id:
-                dented = self.skin.vertices_world_m + message.displacement_world_m
-                yield "object", _mesh("object", dented, self.skin.triangles, stamp)
+                deformed = self.skin.vertices_world_m + message.displacement_world_m
+                yield "object", _mesh("object", deformed, self.skin.triangles, stamp)
             case Fingertip():
                 yield "finger", self._finger(message, stamp)
             case SheetTarget():
@@ -183,11 +183,11 @@ class Seen:
                     yield "sheet", sheet
             case EStop():
                 level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
-                said = "engaged" if message.engaged else "cleared"
-                text = f"e-stop {said}: {message.reason}"
+                state = "engaged" if message.engaged else "reset"
+                text = f"e-stop {state}: {message.reason}"
                 yield "log", fg.Log(timestamp=stamp, level=level, message=text, name=topic)
-        for name, picture in list_images(topic, message):
-            yield name, _raw_image(name, picture, stamp)
+        for name, image in list_images(topic, message):
+            yield name, _raw_image(name, image, stamp)
 
     def _finger(self, message: Fingertip, stamp: Any) -> Any:
         from foxglove import messages as fg
@@ -195,7 +195,7 @@ class Seen:
         radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
         colour = _colour(FINGER_COLOUR if message.valid else LOST_COLOUR)
         ball = fg.SpherePrimitive(
-            pose=_pose(_at(message.position_world_m)),
+            pose=_pose(_translation(message.position_world_m)),
             size=_vector(np.full(3, 2 * radius_m)),
             color=colour,
         )
@@ -211,7 +211,7 @@ class Seen:
         return fg.SceneUpdate(entities=[entity])
 
     def _sheet(self, stamp: Any) -> Any | None:
-        """The sheet as a flat quadrilateral between both clamped edges."""
+        """Return the sheet as a flat quadrilateral between both clamped edges."""
         if self.scene is None or len(self.flanges) < 2:
             return None
         half_m = 0.5 * self.scene.sheet.height_m
@@ -225,21 +225,21 @@ class Seen:
         return _mesh("sheet", np.array(corners), triangles, stamp, SHEET_COLOUR)
 
 
-def list_images(topic: str, message: Message) -> Iterator[Picture]:
-    """Return the images in a message, each with the name of its channel."""
+def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
+    """Yield the images in a message, each with the name of its channel."""
     match message:
         case StereoPair():
             yield f"{topic}/left", message.left
             yield f"{topic}/right", message.right
         case Frame():
-            for picture in message.pixels:
-                yield f"{topic}/picture", picture
+            for image in message.pixels:
+                yield f"{topic}/picture", image
         case TwinEye():
             yield f"{topic}/seen", message.seen
             yield f"{topic}/expected", message.expected
 
 
-def _foxglove() -> Any:
+def _import_foxglove() -> Any:
     try:
         import foxglove
     except ImportError as error:
@@ -250,9 +250,7 @@ def _foxglove() -> Any:
 
 
 def _wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """Return the offset from the recorder's clock to 1970 in ns; None if the bag does not contain
-    it.
-    """
+    """Return the offset from the recorder's clock to 1970, ns; None if it is unknown."""
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])
@@ -341,11 +339,11 @@ def _frames(world_from: dict[str, NDArray[np.float64]], stamp: Any) -> Any:
     return fg.FrameTransforms(transforms=transforms)
 
 
-def _raw_image(name: str, picture: NDArray[np.uint8], stamp: Any) -> Any:
+def _raw_image(name: str, image: NDArray[np.uint8], stamp: Any) -> Any:
     from foxglove import messages as fg
 
-    height, width = picture.shape[:2]
-    channels = 1 if picture.ndim == 2 else picture.shape[2]
+    height, width = image.shape[:2]
+    channels = 1 if image.ndim == 2 else image.shape[2]
     return fg.RawImage(
         timestamp=stamp,
         frame_id=name,
@@ -353,11 +351,11 @@ def _raw_image(name: str, picture: NDArray[np.uint8], stamp: Any) -> Any:
         height=height,
         encoding="mono8" if channels == 1 else "rgb8",
         step=width * channels,
-        data=np.ascontiguousarray(picture).tobytes(),
+        data=np.ascontiguousarray(image).tobytes(),
     )
 
 
-def _at(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _translation(position: NDArray[np.float64]) -> NDArray[np.float64]:
     matrix = np.eye(4)
     matrix[:3, 3] = position
     return matrix

@@ -31,7 +31,7 @@ NEVER_PLAYED = {
 
 @dataclass(frozen=True, slots=True)
 class TopicSelection:
-    """Hold the topics of a bag that can be played, and the others with the reason."""
+    """Topics of a bag that can be played, and the others with the reason."""
 
     topics: tuple[str, ...]
     left_out: dict[str, str]
@@ -40,7 +40,10 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of the bag that tools may write; BagError if a wanted one is not."""
+    """Select the topics of the bag that tools may write.
+
+    Raises BagError if a wanted topic cannot be played.
+    """
     writable = topics_for_tools(plan)
     left_out = {}
     chosen = []
@@ -71,11 +74,10 @@ async def play(
     start_s: float = 0.0,
     progress: Progress = lambda played, total: None,
 ) -> int:
-    """Play once, from `start_s` into the bag, with the speed factor `rate`; return the messages
-    sent.
+    """Play the bag once from `start_s`; return the number of messages sent.
 
-    The last value of every latched topic before the start comes first. Stamps are shifted, so that
-    a message has the same age as when it was recorded.
+    rate: speed factor. The last value of every latched topic before the start is sent first.
+    Stamps are shifted, so that a message has the same age as in the recording.
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)

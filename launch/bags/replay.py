@@ -1,11 +1,12 @@
-"""Step one node through its recorded inputs with a virtual clock, twice, and compare the outputs.
+"""Step one node through its recorded inputs with a virtual clock, twice, and compare the
+outputs.
 
-The node is built from the plan in the bag.  Its status messages hold which messages it handled, in
-which order and when (`messages.types.Status.execution_log`).  The replay follows this log, so that
-messages that the node skipped live are skipped again.  Bags of earlier code hold no such log.
-Then the node gets each recorded input in the order of the recorder, and its timers are called when
-they are due.  The same bag must give the same bytes each time.  The fields of the outputs are
-compared with those that the node sent live, with a tolerance.
+The node is built from the plan in the bag. Its status messages contain the order and time of the
+messages that it handled (`messages.types.Status.execution_log`). The replay follows this log, so it
+skips the same messages as the live node. Bags of earlier versions contain no log. The replay then
+passes each recorded input in the order of the recorder, and calls timers when they are due. The
+same bag must give the same bytes each time. The output fields are compared with the live ones, with
+a tolerance.
 """
 
 from __future__ import annotations
@@ -37,8 +38,7 @@ from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 
 CLOCKS = "clocks"
 EPOCH = 0
-"""Epoch of the replayed writers: that of a live writer is its start time, which a replay must not
-use."""
+"""Epoch of the replayed writers; a live writer uses its start time."""
 
 PROGRESS_STEPS = 100
 """Number of steps between two reports of progress."""
@@ -47,16 +47,16 @@ Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
-    """Hold a message that a replayed node published, as bytes."""
+class SentMessage:
+    """A message that a replayed node published, as bytes."""
 
     topic: str
     data: tuple[bytes, ...]
 
 
 @dataclass(slots=True)
-class Pass:
-    """Hold the result of one replay of the bag.
+class ReplayResult:
+    """Result of one replay of the bag.
 
     as_taken: the replay followed the execution log of the node; else the order of the recorder.
     missing: logged messages that the bag does not contain. logged_until_ns: end of the execution
@@ -67,7 +67,7 @@ class Pass:
     missing: int = 0
     as_taken: bool = False
     logged_until_ns: int | None = None
-    sent: list[Sent] = field(default_factory=list)
+    sent: list[SentMessage] = field(default_factory=list)
     errors: int = 0
     last_error: str = ""
 
@@ -84,9 +84,9 @@ class Pass:
 
 @dataclass(slots=True)
 class Comparison:
-    """Compare replayed with recorded messages of one topic, paired by their source stamps.
+    """Comparison of replayed and recorded messages of one topic, paired by source stamp.
 
-    worst: largest difference by field, for fields that differ; 1 for values other than numbers.
+    worst: maximum difference by field, for fields that differ; 1 for values other than numbers.
     """
 
     recorded: int = 0
@@ -98,7 +98,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Hold the result of `bag verify`; as_taken, missing: see `Pass`."""
+    """Result of `bag verify`; as_taken, missing: see `ReplayResult`."""
 
     node: str
     bag: str
@@ -120,7 +120,7 @@ class Verification:
 
     @property
     def as_live(self) -> bool:
-        """Return whether the outputs equal the live ones, within the tolerance."""
+        """Return whether the outputs equal the live ones within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -138,22 +138,26 @@ def _ignore_progress(done: float, total: float) -> None:
 def verify(
     bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _ignore_progress
 ) -> Verification:
-    """Replay node `name` of the bag's plan twice; BagError for a bag that does not allow it."""
+    """Replay the node `name` of the bag's plan twice.
+
+    Raises BagError for a bag that does not allow it.
+    """
     reader = BagReader(bag)
     plan = _read_plan(reader)
     if name not in plan.nodes:
         raise BagError(
-            f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
+            f'{bag}: its plan contains no node "{name}"; {did_you_mean(name, list(plan.nodes))}'
         )
     node = plan.nodes[name]
     try:
         why = refusal(node)
     except (ValidationError, UnknownNodeError) as error:
         raise BagError(
-            f"{bag}: {name} is unknown to this code; verify it with the code of the recording"
+            f"{bag}: this version has no node type {node.type}; verify {name} with the version of "
+            "the recording"
         ) from error
     if why:
-        raise BagError(f"{name} is not replayed: {why}")
+        raise BagError(f"{name} cannot be replayed: {why}")
     _check_inputs(bag, reader, plan, node)
     first = asyncio.run(replay(bag, node, lambda done, total: progress(done, 2 * total)))
     second = asyncio.run(replay(bag, node, lambda done, total: progress(total + done, 2 * total)))
@@ -178,20 +182,22 @@ def _read_plan(reader: BagReader) -> ResolvedGraph:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except ValidationError as error:
         raise BagError(
-            f"{reader.path}: its plan.json is not valid in this code; verify the bag with the "
-            "code of the recording"
+            f"{reader.path}: its plan.json is not valid in this version; verify the bag with the "
+            "version of the recording"
         ) from error
 
 
 def refusal(node: ResolvedNode) -> str:
-    """Return why a node cannot be stepped through a bag; empty: it can."""
+    """Return why a node cannot be replayed; empty if it can."""
     class_ = node_class(node.type)
     return class_.replay_refusal(find_parameters_type(class_).model_validate(node.parameters))
 
 
-async def replay(bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress) -> Pass:
+async def replay(
+    bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress
+) -> ReplayResult:
     """Step a node through its inputs in the bag."""
-    result = Pass()
+    result = ReplayResult()
     runs = read_runs(bag, planned.name)
     before, total = 0, sum(len(run.steps) for run in runs)
     for run in runs:
@@ -209,25 +215,27 @@ def _report_progress(progress: Progress, before: int, total: int, step: int) -> 
         progress(before + step, total)
 
 
-def _build_node(planned: ResolvedNode, clock: VirtualClock, result: Pass) -> Node:
-    """Build the node as a launcher would, and store what it publishes."""
+def _build_node(planned: ResolvedNode, clock: VirtualClock, result: ReplayResult) -> Node:
+    """Build the node as a launcher does, and store its published messages."""
 
-    def keep(topic: Topic, message: Message, header: Header) -> None:
-        result.sent.append(Sent(topic.name, tuple(bytes(one) for one in encode(message, header))))
+    def store(topic: Topic, message: Message, header: Header) -> None:
+        result.sent.append(
+            SentMessage(topic.name, tuple(bytes(one) for one in encode(message, header)))
+        )
 
     class_ = node_class(planned.type)
     return class_(
         find_parameters_type(class_).model_validate(planned.parameters),
         name=planned.name,
         clock=clock,
-        send=keep,
+        send=store,
         topics={port.port: port.topic for port in (*planned.inputs, *planned.outputs)},
         epoch=EPOCH,
     )
 
 
 @asynccontextmanager
-async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
+async def _set_up(node: Node, result: ReplayResult) -> AsyncIterator[None]:
     try:
         await node.setup()
         yield
@@ -240,7 +248,7 @@ async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
 
 
 async def _replay_in_order(
-    bag: Path, planned: ResolvedNode, result: Pass, progress: Progress
+    bag: Path, planned: ResolvedNode, result: ReplayResult, progress: Progress
 ) -> None:
     """Step the node through all its inputs, in the order of the recorder."""
     ports: dict[str, list[str]] = {}
@@ -268,7 +276,11 @@ async def _replay_in_order(
 
 
 async def _replay_run(
-    bag: Path, planned: ResolvedNode, run: NodeRun, result: Pass, report: Callable[[int], None]
+    bag: Path,
+    planned: ResolvedNode,
+    run: NodeRun,
+    result: ReplayResult,
+    report: Callable[[int], None],
 ) -> None:
     """Step the node through its execution log of one run."""
     clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
@@ -276,7 +288,7 @@ async def _replay_run(
     names, timers = list(node.inputs), find_timers(type(node))
     async with _set_up(node, result):
         messages = RecordedInputs(bag, node)
-        # Messages of before the recording are not in the execution log of the recorded statuses.
+        # The recorded execution log does not contain messages before the recording.
         for port, message, header in messages.latched_before(run):
             result.messages_in += 1
             await node.step(port, message, header)
@@ -298,14 +310,14 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """Hold what a node handled between two starts: rows of its `Status.execution_log`."""
+    """Rows of the execution log of a node between two starts."""
 
     clock_id: str
     steps: NDArray[np.int64]
 
 
 def read_runs(bag: Path, name: str) -> list[NodeRun]:
-    """Read the execution logs of a node, one per start; none in bags of earlier code."""
+    """Read the execution logs of a node, one per start; empty for bags of earlier versions."""
     logs: dict[int, list[NDArray[np.int64]]] = {}
     clock_ids: dict[int, str] = {}
     if "status" not in BagReader(bag).topics:
@@ -313,7 +325,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
     for _, message, header, _ in BagReader(bag, ["status"]):
         if isinstance(message, Status) and message.node == name and len(message.execution_log):
             before = logs.setdefault(header.epoch, [])
-            # In its first seconds a node repeats its whole log.
+            # In its first seconds a node publishes its whole log repeatedly.
             if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
             before.append(message.execution_log)
@@ -322,7 +334,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
 
 
 class RecordedInputs:
-    """Read the recorded inputs of a node as far ahead as its execution log needs."""
+    """Reader of the recorded inputs of a node, as far ahead as its execution log needs."""
 
     LOOK_AHEAD = 5000
     """Number of messages that are read before a logged one counts as missing."""
@@ -358,7 +370,7 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return this message; None if the bag does not contain it."""
+        """Return the message with this number; None if the bag does not contain it."""
         waiting = self._waiting[port]
         latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
         read = seen = 0
@@ -370,7 +382,7 @@ class RecordedInputs:
                 if header.sequence > sequence:
                     return None
                 del waiting[i]
-                # A reader of the latest message never goes back to a skipped one.
+                # A reader of the latest message never returns to a skipped one.
                 for _ in range(i if latest else 0):
                     waiting.popleft()
                 return message, header
@@ -392,7 +404,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """Call the periodic methods of a node on a virtual clock."""
+    """Periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
@@ -415,7 +427,7 @@ class Timers:
 
 
 def compare(
-    bag: Path, node: ResolvedNode, replayed: Pass, tolerance: float
+    bag: Path, node: ResolvedNode, replayed: ReplayResult, tolerance: float
 ) -> dict[str, Comparison]:
     """Compare the outputs that the node published live with the replayed ones."""
     outputs = {port.topic for port in node.outputs} - {"status"}
@@ -483,11 +495,11 @@ def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: Resol
     for other in plan.nodes.values():
         if other.role is NodeRole.RECORDER:
             recorded |= {port.topic for port in other.inputs}
-    lacking = [port.topic for port in node.inputs if port.topic not in recorded]
-    if lacking:
-        options = " ".join(f"--include {topic}" for topic in lacking)
+    missing = [port.topic for port in node.inputs if port.topic not in recorded]
+    if missing:
+        options = " ".join(f"--include {topic}" for topic in missing)
         raise BagError(
-            f"{bag}: {node.name} reads {', '.join(lacking)}, which was not recorded; "
+            f"{bag}: {node.name} reads {', '.join(missing)}, which was not recorded; "
             f"record it with: flexsheet bag record BAG {options}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):

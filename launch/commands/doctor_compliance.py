@@ -46,7 +46,7 @@ def compliance(
 
     Pushed in the middle, by the planner's law: presented and wanted force to the scene's depth.
     """
-    from flexsheet.launch.health.compliance import compliance_result, front_curve
+    from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
     from flexsheet.messages.scene import UnfitGeometryError
@@ -60,7 +60,7 @@ def compliance(
             scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
         )
         with words.status("working out the soft body"):
-            curve = ObjectCurve.from_rows(front_curve(scene))
+            curve = ObjectCurve.from_rows(compute_front_curve(scene))
     except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
     result = compliance_result(scene, law, curve)

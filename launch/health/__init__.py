@@ -1,1 +1,1 @@
-"""Check computers, devices, reach and sheet for a scene, with remedies."""
+"""Check the installation, a scene's layout and the hosts of a graph."""

@@ -1,4 +1,4 @@
-"""Whether a scene's sheet can present its object: the object's force over depth, and what fits."""
+"""Compute how well a scene's sheet can render its object's force over depth."""
 
 from __future__ import annotations
 
@@ -27,15 +27,17 @@ Floats = NDArray[np.float64]
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
-SHOWN_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
+SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Reported depths, as fractions of the maximum push depth."""
 
 
-def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """The object's force over depth (n, 2), m and N, where it faces the user: by the nonlinear
-    table if that is kept for this object, else by the linear method, which is worked out if it is
-    not kept.  cache_dir: None: the user's."""
-    maker = SoftBodyFactory(
+def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
+    """Return the object's force curve (n, 2), m and N, on the side that faces the user.
+
+    The cached nonlinear table of the object is used if it exists, else the linear method, which is
+    computed if necessary. cache_dir: None for the user's.
+    """
+    factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
         linear_depth_m=LINEAR_DEPTH_M,
         max_depth_m=MAX_DEPTH_M,
@@ -43,14 +45,17 @@ def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
         cache_dir=cache_dir or cache.default_cache_dir(),
         workers=0,
     )
-    best, *_ = maker.bodies(scene, "auto", lambda done, total, need: None)
+    best, *_ = factory.bodies(scene, "auto", lambda done, total, need: None)
     return best.at_rest().force_curve
 
 
-def scene_compliance(
+def compute_compliance(
     scene: Scene, law: SheetForceModel, curve: ObjectCurve, *, max_depth_m: float | None = None
 ) -> Compliance:
-    """What the planner presents; max_depth_m: of the push, else the scene's."""
+    """Compute the compliance that the planner renders.
+
+    max_depth_m: maximum push depth; None for that of the scene.
+    """
     return fit_compliance(
         curve,
         law,
@@ -63,19 +68,21 @@ def scene_compliance(
 
 
 def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) -> dict[str, Any]:
-    """What `flexsheet doctor compliance --json` prints."""
-    shown = scene_compliance(scene, law, curve)
-    depths = shown.max_depth_m * np.array(SHOWN_SHARES)
-    wanted, presented = curve.force_n(depths), shown.rendered_force_n(depths)
-    retreat = shown.normal_offset_m(depths)
+    """Return the result of `flexsheet doctor compliance --json`."""
+    shown = compute_compliance(scene, law, curve)
+    depths = shown.max_depth_m * np.array(SHOWN_FRACTIONS)
+    target, rendered = curve.force_n(depths), shown.rendered_force_n(depths)
+    offsets = shown.normal_offset_m(depths)
     rows = [
         {
             "depth_mm": 1e3 * float(depth),
-            "wanted_n": float(want),
-            "presented_n": float(force),
-            "retreat_mm": 1e3 * float(back),
+            "wanted_n": float(wanted_n),
+            "presented_n": float(rendered_n),
+            "retreat_mm": 1e3 * float(offset_m),
         }
-        for depth, want, force, back in zip(depths, wanted, presented, retreat, strict=True)
+        for depth, wanted_n, rendered_n, offset_m in zip(
+            depths, target, rendered, offsets, strict=True
+        )
     ]
     return {
         "scene": scene.name,

@@ -31,7 +31,7 @@ PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Hold the result of one check; `remedy` is what to do unless it is ok."""
+    """Result of one check; `remedy` is empty if the check passed."""
 
     check: str
     state: Literal["ok", "warning", "failed"]
@@ -59,9 +59,9 @@ def check_all() -> Iterator[Finding]:
 
 
 def check_load() -> Finding:
-    """Check that a program as light as an arm bridge gets a processor when it needs one.
+    """Check that a process with the load of an arm bridge gets a processor in time.
 
-    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures how long it waits.
+    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures its waiting time.
     """
     watch, own = CpuWatch(), {"this check": os.getpid()}
     watch.update(own, measure_programs=True)
@@ -112,6 +112,7 @@ def check_libraries() -> Finding:
 
 
 def check_opencv() -> Finding:
+    """Check that OpenCV can be imported, and list its video backends."""
     try:
         import cv2
     except ImportError as error:
@@ -122,6 +123,7 @@ def check_opencv() -> Finding:
 
 
 def check_opengl() -> Finding:
+    """Check that a headless OpenGL context can be created."""
     problem = opengl_problem()
     if problem is None:
         return Finding("opengl", "ok", "a headless context can be created (EGL)")
@@ -129,6 +131,7 @@ def check_opengl() -> Finding:
 
 
 def check_cores() -> Finding:
+    """Check the number of processor cores."""
     cores = len(os.sched_getaffinity(0))
     if cores < MIN_CORES:
         return Finding("cores", "warning", str(cores), f"the demo needs {MIN_CORES}")
@@ -136,10 +139,11 @@ def check_cores() -> Finding:
 
 
 def check_disk() -> Finding:
+    """Check the free disk space of the working folder."""
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
     if free < MIN_FREE_DISK_BYTES:
-        return Finding("disk", "warning", text, "free some: bags with images take 37 MB/s")
+        return Finding("disk", "warning", text, "free some space: bags with images need 37 MB/s")
     return Finding("disk", "ok", text)
 
 
@@ -162,6 +166,7 @@ def check_clock() -> Finding:
 
 
 def check_sockets() -> Finding:
+    """Check that the folder of runs can be used."""
     directory = root()
     if not directory.exists():
         return Finding("sockets", "ok", f"{directory} will be created")
@@ -177,6 +182,7 @@ def check_sockets() -> Finding:
 
 
 def check_leftovers() -> Finding:
+    """Find processes that launchers left behind."""
     found = find_orphans()
     if found:
         pids = ", ".join(str(process.pid) for process in found)
@@ -190,14 +196,14 @@ def check_leftovers() -> Finding:
 
 
 def check_demo() -> Finding:
-    """Check that the demo's launch file resolves and that ports free."""
+    """Check that the demo's launch file resolves and that its ports are free."""
     try:
         plan = load_graph(DEMO)
     except BadInputError as error:
         return Finding("demo", "failed", str(error))
-    taken = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]
-    if taken:
-        what = f"ports in use: {', '.join(map(str, taken))}"
+    used = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]
+    if used:
+        what = f"ports in use: {', '.join(map(str, used))}"
         return Finding(
             "demo", "warning", what, "end the running graph, or choose other ports with --set"
         )

@@ -1,4 +1,4 @@
-"""Evaluate host probes: one finding for each host and check, with a remedy.
+"""Evaluate host probes: return one finding for each host and check, with a remedy.
 
 The findings come from the probes (`launch.health.probe`) and from checks of this computer.
 """
@@ -34,19 +34,23 @@ from flexsheet.messages.security import SecurityError, public_of, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
 from flexsheet.nodes import NodeRole
+from flexsheet.nodes.arm_bridge.link_drivers import Driver
 
 State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
-"""Rates are measured over one second, so one message more or less is no fault."""
+"""Relative tolerance of rates, which are measured over one second."""
 
 MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
+TCP_DRIVERS: frozenset[Driver] = frozenset({"modbus"})
+"""Drivers of arms whose controllers accept TCP connections."""
+
 MAX_NAMES_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """Hold the result of one check of one host; `remedy` is what to do unless it is ok."""
+    """Result of one check of one host; `remedy` is empty if the check passed."""
 
     host: str
     check: str
@@ -84,7 +88,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.HANDSHAKE_TIMEOUT: (
         "launcher",
-        "accepts connections, but does not answer",
+        "accepts connections, but does not complete the handshake",
         "its launcher hangs or another program uses its ports; on {host}: flexsheet doctor",
     ),
     Reachability.NO_RESPONSE: (
@@ -100,7 +104,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.KEY_REJECTED: (
         "keys",
         "it rejects the key of {here}: its launch file has none or another for {here}",
-        "copy {file} from here to {host}; its launcher reads it again by itself",
+        "copy {file} from here to {host}; its launcher reloads it automatically",
     ),
     Reachability.UNENCRYPTED: (
         "keys",
@@ -128,7 +132,7 @@ def evaluate_probes(
     running = any(probe.status is not None for probe in probes.values())
     for host, probe in probes.items():
         if probe.status is not None:
-            # First, because a busy computer explains most other faults.
+            # Overload comes first, because it causes most other faults.
             found.append(_check_load(probe.status))
         found += _check_reachability(plan, here, probe, running=running)
         if probe.status is None:
@@ -150,7 +154,7 @@ def _check_reachability(
     plan: ResolvedGraph, here: str, probe: HostProbe, *, running: bool
 ) -> Iterator[HostFinding]:
     host, address = probe.host, plan.hosts[probe.host]
-    words = {
+    fields = {
         "host": host,
         "here": here,
         "address": address,
@@ -160,7 +164,8 @@ def _check_reachability(
     }
     if probe.reachability in NETWORK_FAULTS:
         what, remedy = NETWORK_FAULTS[probe.reachability]
-        yield HostFinding(host, "reachable", "failed", what.format(**words), remedy.format(**words))
+        problem = what.format(**fields)
+        yield HostFinding(host, "reachable", "failed", problem, remedy.format(**fields))
         yield HostFinding(host, "all else", "not asked", "the host cannot be reached")
         return
     yield HostFinding(
@@ -179,11 +184,11 @@ def _check_reachability(
         )
     else:
         check, what, remedy = LAUNCHER_FAULTS[probe.reachability]
-        # Before any graph is started, a closed port is no fault.
+        # A closed port is not a fault before any graph is started.
         state: State = (
             "warning" if probe.reachability == Reachability.CLOSED and not running else "failed"
         )
-        yield HostFinding(host, check, state, what.format(**words), remedy.format(**words))
+        yield HostFinding(host, check, state, what.format(**fields), remedy.format(**fields))
         yield HostFinding(host, "all else", "not asked", "its launcher does not report")
     for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
         # The first handshake of this probe succeeded, so the keys are right.
@@ -200,6 +205,7 @@ def _check_reachability(
 
 
 def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
+    """Compare the plan of a host with the local one, and report a latched e-stop."""
     assert probe.status is not None
     if probe.status.plan_hash == plan.hash:
         yield HostFinding(probe.host, "plan", "ok", plan.hash)
@@ -228,6 +234,7 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
 
 
 def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+    """Compare the keys of a host with the launch file."""
     assert probe.status is not None
     theirs = {one.host: one.key for one in probe.status.keys}
     names = sorted(theirs.keys() | plan.keys.keys())
@@ -237,15 +244,16 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
             probe.host,
             "keys",
             "failed",
-            f"has other keys than this launch file for {', '.join(other)}",
-            f"copy {plan.launch_file} to {probe.host}; its launcher reads it again by itself",
+            f"its keys differ from this launch file for {', '.join(other)}",
+            f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically",
         )
     return HostFinding(
-        probe.host, "keys", "ok", f"accepts {', '.join(names)}, as this computer does"
+        probe.host, "keys", "ok", f"accepts the same keys as this computer: {', '.join(names)}"
     )
 
 
 def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
+    """Compare the versions of a host with those of this computer."""
     status = probe.status
     assert status is not None
     python, versions, code = reference
@@ -277,32 +285,33 @@ def _check_clocks(
         )
     limit_s = probe.clocks.max_offset_uncertainty_s
     known = {one.clock_id: one for one in probe.clocks.offsets}
-    words, bad = [], False
+    texts, bad = [], False
     for name, other in probes.items():
         if name == probe.host or not other.clock_id:
             continue
         offset = known.get(other.clock_id)
         if other.clock_id == probe.clock_id:
-            words.append(f"{name}: the same clock")
+            texts.append(f"{name}: the same clock")
         elif offset is None:
             bad = True
-            words.append(f"{name}: not measured")
+            texts.append(f"{name}: not measured")
         else:
             bad = bad or offset.uncertainty_s > limit_s
-            words.append(
+            texts.append(
                 f"{name}: {offset.offset_ns * 1e-9:+.6f} s within "
                 f"{1e3 * offset.uncertainty_s:.2f} ms, drift {1e6 * offset.drift_ratio:+.0f} ppm"
                 + (f", stepped {offset.resets} times" if offset.resets else "")
             )
-    if not words:
+    if not texts:
         return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
-    what = f"{'; '.join(words)}; {1e3 * limit_s:g} ms are allowed"
+    what = f"{'; '.join(texts)}; {1e3 * limit_s:g} ms are allowed"
     if bad:
         return HostFinding(probe.host, "clocks", "failed", what, remedy)
     return HostFinding(probe.host, "clocks", "ok", what)
 
 
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+    """Check that all nodes of a host are ready and were not restarted."""
     assert probe.status is not None
     nodes = probe.status.nodes
     missing = [one.name for one in nodes if one.state != "ready"]
@@ -334,11 +343,11 @@ def _check_rates(probe: HostProbe) -> HostFinding:
             elif topic is not None and topic.rate_hz is not None:
                 right += 1
     if odd or refused:
-        words = _shorten(odd)
+        texts = _shorten(odd)
         if refused:
-            words.append(f"refused: {', '.join(_shorten(refused))}")
-        remedy = "begin with the first node upstream; see status and log of these nodes"
-        return HostFinding(probe.host, "rates", "warning", "; ".join(words), remedy)
+            texts.append(f"refused: {', '.join(_shorten(refused))}")
+        remedy = "start with the first node upstream; see its status and log"
+        return HostFinding(probe.host, "rates", "warning", "; ".join(texts), remedy)
     if not right:
         return HostFinding(probe.host, "rates", "not asked", "its nodes report no rates yet")
     return HostFinding(probe.host, "rates", "ok", f"{right} ports at the rate of their topic")
@@ -368,7 +377,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
     ),
 }
-"""Check and remedy of the nodes that must publish, by role."""
+"""Check and remedy by role, for nodes that must publish."""
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
@@ -418,11 +427,13 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
     if arm.faults:
         remedy = "when the cause is fixed: flexsheet arms reset"
         return HostFinding(probe.host, check, "warning", what, remedy)
-    auto_arming = node.parameters.get("arming") == "auto"
-    moves = "moves as soon as no interlock holds"
-    waits = moves if auto_arming else "flexsheet arms enable lets it move"
-    ready = "ready" if arm.ready else waits
-    return HostFinding(probe.host, check, "ok", f"{what}; {ready}")
+    if arm.ready:
+        next_step = "ready"
+    elif arm.auto_arming:
+        next_step = "moves when no interlock is active"
+    else:
+        next_step = "to let it move: flexsheet arms enable"
+    return HostFinding(probe.host, check, "ok", f"{what}; {next_step}")
 
 
 def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
@@ -440,6 +451,7 @@ def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostF
 
 
 def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
+    """Check the free disk space and memory of a host."""
     status = probe.status
     assert status is not None
     yield _check_disk(probe.host, status.disk_free_bytes)
@@ -546,6 +558,7 @@ def check_before_start(
 
 
 def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
+    """Check that the TCP ports of this host are free."""
     address = plan.hosts[here]
     wanted = [
         int(writer.tcp.rpartition(":")[2])
@@ -553,18 +566,18 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
         for writer in writers
         if writer.tcp is not None and writer.host == here
     ]
-    mine = is_loopback(address) or address in own_addresses()
-    taken = [port for port in wanted if mine and not is_free(address, port)]
-    taken += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
-    if taken:
+    is_own = is_loopback(address) or address in own_addresses()
+    used = [port for port in wanted if is_own and not is_free(address, port)]
+    used += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
+    if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
-        what = f"in use: {', '.join(map(str, sorted(taken)))}"
+        what = f"in use: {', '.join(map(str, sorted(used)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
     return HostFinding(here, "ports", "ok", f"{len(wanted)} are free")
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
-    """Check that an arm's controller accepts connections, while no graph uses the only one."""
+    """Check that an arm's controller accepts connections; call it while no graph is running."""
     check = f"arm {node.arm_side}"
     if node.device_address is None:
         return HostFinding(here, check, "not asked", f"{node.name} uses its own driver")
@@ -572,7 +585,7 @@ def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
     if is_loopback(address):
         what = f"{address}:{port} is simulated and starts with the graph"
         return HostFinding(here, check, "not asked", what)
-    if node.parameters.get("driver") != "modbus":
+    if node.parameters.get("driver") not in TCP_DRIVERS:
         return HostFinding(here, check, "not asked", f"{address}:{port} uses UDP")
     try:
         socket.create_connection((address, int(port)), CONTROLLER_S).close()

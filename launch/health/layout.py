@@ -1,9 +1,8 @@
-"""Whether two arms reach all of a scene's working range, what keeps them from it, what helps.
+"""Check whether two arms reach a scene's whole working range, and suggest remedies.
 
-The range is sampled: where a finger can touch the object, how the sheet can lie there, how deep it
-is pushed, how far it is stretched, how fast it must move on.  How the sheet lies follows the
-planner's own rules (`flexsheet.nodes.planner.rolling`), whether an arm can hold it the bridge's
-(`flexsheet.nodes.arm_bridge.reach`).
+The range is sampled over contact points, sheet poses, push depths, stretches and motions. The sheet
+poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach of an arm follows
+the bridge's rules (`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
@@ -45,35 +44,34 @@ from flexsheet.nodes.planner.rolling import (
 Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-TILTS, TURNS, DEPTHS = 17, 5, 6
-"""Samples over the tilts up and down, those to the sides, and the depths."""
+TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
+"""Number of samples over the vertical tilts, the horizontal tilts and the depths."""
 
-FAR_M = 1.0
-SAME_M, SAME_NORMAL = 0.004, 0.02
-"""Contacts nearer than both count as one."""
+VIEW_DISTANCE_M = 1.0
+DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
+"""Contacts whose differences are below both limits count as one."""
 
-STARTS = 24
-"""Contacts that the sheet is rolled from, to see where on it a place can be touched."""
+ROLL_STARTS = 24
+"""Number of contacts from which the sheet is rolled to find other contacts on the sheet."""
 
 CLAMP_MARGIN_M = 0.03
-"""A finger does not come nearer to a clamped edge than this."""
+"""Minimum distance of a finger from a clamped edge."""
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""Along each axis, where else a base is tried."""
+"""Offsets along each axis at which a base is tried."""
 
 REACHED_COLOR = "#dcefdc"
 
-THINNED = 600
-"""Number of samples that decide whether a base position is worth a complete check."""
+THINNED_COUNT = 600
+"""Number of samples that decide whether a base position gets a complete check."""
 
 
 @dataclass(frozen=True, slots=True)
-class Touch:
-    """A place where the finger can touch, and how the sheet can lie there without a push.
+class ContactSample:
+    """A contact of the finger and a pose of the sheet there, without push.
 
-    tilt_rad: of the normal away from the user, positive upwards.
-    world_from_sheet: (4, 4).  twists_world: (k, 6), the sheet's motions when the finger strokes on
-    from there at the scene's working speed.
+    tilt_rad: angle of the normal away from the user, positive upwards. world_from_sheet: (4, 4).
+    twists_world: (k, 6), motions of the sheet when the finger strokes at the scene's working speed.
     """
 
     tilt_rad: float
@@ -82,23 +80,23 @@ class Touch:
     twists_world: Floats
 
 
-Touches = Callable[[Scene], Sequence[Touch]]
-"""Where a scene's object can be touched and how the sheet lies there."""
+FindContacts = Callable[[Scene], Sequence[ContactSample]]
+"""Function that samples the contacts of a scene's object."""
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
-    """All that the arms are asked: places, with the tilt (n,), depth (n,) and contact (n, 3)."""
+class LayoutSamples:
+    """Sheet poses that the arms must reach, with tilt (n,), depth (n,) and contact (n, 3)."""
 
-    places: SheetPoses
+    poses: SheetPoses
     tilt_rad: Floats
     depth_m: Floats
     contact_world_m: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Remedy:
-    """Something that would make all of the range reachable, in words and figures."""
+class LayoutRemedy:
+    """A change that makes the whole range reachable, as text and values."""
 
     what: str
     values: dict[str, Any]
@@ -106,14 +104,14 @@ class Remedy:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What the check found: each arm's reach at the samples, ways between them, remedies."""
+    """Result of the check: the reach of each arm, blocked paths between samples, remedies."""
 
     scene: Scene
-    samples: Samples
+    samples: LayoutSamples
     left: ArmReach
     right: ArmReach
-    broken_ways: tuple[str, ...]
-    remedies: tuple[Remedy, ...]
+    blocked_paths: tuple[str, ...]
+    remedies: tuple[LayoutRemedy, ...]
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -125,19 +123,22 @@ class Layout:
 
     @property
     def reachable(self) -> bool:
-        return bool(self.reached.all()) and not self.broken_ways
+        return bool(self.reached.all()) and not self.blocked_paths
 
-    def speed_m_per_s(self, share: float) -> float:
-        """With what speed a finger may move at that share (0..1) of the places reached; else 0."""
+    def speed_m_per_s(self, fraction: float) -> float:
+        """Return the finger speed that the arms can follow at a fraction of the reached samples.
+
+        fraction: 0 to 1. Return 0 if no sample is reached.
+        """
         if not self.reached.any():
             return 0.0
         speeds = np.minimum(*(self.speeds_m_per_s(reach) for _, reach in self.arms()))
-        return float(np.quantile(speeds[self.reached], 1.0 - share))
+        return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """With what speed (n,) a finger may stroke and push, for this arm to follow; NaN: nowhere.
+        """Return the maximum finger speeds (n,) that an arm can follow; NaN if out of reach.
 
-        All speeds of arm and sheet are in proportion to the finger's.
+        All speeds of arm and sheet are proportional to the finger's.
         """
         used = np.max([1.0 - reach.margins[limit] for limit in SPEED_LIMITS], axis=0)
         return np.asarray(self.scene.working_range.speed_m_per_s / used)
@@ -146,37 +147,37 @@ class Layout:
         return ("left", self.left), ("right", self.right)
 
 
-def touches(scene: Scene) -> list[Touch]:
-    """The places that a finger can touch, and the sheet there, for any shape.
+def sample_contacts(scene: Scene) -> list[ContactSample]:
+    """Sample the contact points of any shape, and the poses of the sheet there.
 
-    The object is looked at from all sides within the scene's tilt.  At each place the sheet may lie
-    with its middle line there, as it is presented to a finger that comes, or as it lies when it was
-    rolled there from another place: those rolls that bring the touched point furthest along the
-    sheet, each way, are taken, as far as the sheet's usable half-height and half-width go.
+    The object is viewed from all directions within the scene's tilt. At each point the sheet
+    touches with its centre, or as after rolling from another point. For each axis the two rolls
+    with the largest positions on the sheet are used, limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
     place = scene.object.world_from_object
     world_from_object = transform_from_rpy(place.position_m, place.rpy_rad)
     home = world_from_object[:3, :3].T
     most = np.array([0.5 * scene.sheet.width_m - CLAMP_MARGIN_M, scene.sheet.usable_half_height_m])
-    found = _seen(scene, world_from_object, shape.closest)
+    found = _find_touchable_points(scene, world_from_object, shape.closest)
     ready = [make_tangent_contact(home, one, float(most[0])) for one in found]
-    begun = ready[:: max(1, len(ready) // STARTS)]
-    turn = np.kron(np.eye(2), world_from_object[:3, :3])
+    starts = ready[:: max(1, len(ready) // ROLL_STARTS)]
+    rotation = np.kron(np.eye(2), world_from_object[:3, :3])
     result = []
     for one, waiting in zip(found, ready, strict=True):
         normal = world_from_object[:3, :3] @ one.normal
         lean = float(np.arctan2(np.hypot(normal[0], normal[1]), normal[2]))
-        for contact in _ways_to_lie(waiting, begun, one, most):
+        for contact in _list_contacts(waiting, starts, one, most):
             result.append(
-                Touch(
+                ContactSample(
                     tilt_rad=lean if normal[1] >= -1e-9 else -lean,
                     contact_world_m=apply(world_from_object, one.point),
                     world_from_sheet=world_from_object @ contact.object_from_sheet,
                     twists_world=np.array(
                         [
-                            turn @ rolling_twist(contact, scene.working_range.speed_m_per_s * way)
-                            for way in (contact.axes[:, 0], contact.axes[:, 1])
+                            rotation
+                            @ rolling_twist(contact, scene.working_range.speed_m_per_s * direction)
+                            for direction in (contact.axes[:, 0], contact.axes[:, 1])
                         ]
                     ),
                 )
@@ -184,36 +185,40 @@ def touches(scene: Scene) -> list[Touch]:
     return result
 
 
-def _seen(
+def _find_touchable_points(
     scene: Scene, world_from_object: Floats, closest: Callable[[Floats], Nearest]
 ) -> list[Nearest]:
-    """Touchable points whose normals lean no further than the scene's tilt, each once."""
+    """Return the distinct surface points whose normals are within the scene's tilt."""
     most = scene.working_range.tilt_rad
     low, high = (np.array(v) for v in (scene.finger.volume_min_m, scene.finger.volume_max_m))
-    shares = np.linspace(0.0, 1.0, 3)
+    fractions = np.linspace(0.0, 1.0, 3)
     beside = [
         np.array([x, y, 0.0])
-        for x in low[0] + shares * (high[0] - low[0])
-        for y in low[1] + shares * (high[1] - low[1])
+        for x in low[0] + fractions * (high[0] - low[0])
+        for y in low[1] + fractions * (high[1] - low[1])
     ]
     middle = world_from_object[:3, 3]
     queries = []
-    for up, side in product(np.linspace(-most, most, TILTS), np.linspace(-most, most, TURNS)):
+    for up, side in product(np.linspace(-most, most, TILTS), np.linspace(-most, most, SIDE_TILTS)):
         lean = float(np.hypot(up, side))
         if lean > most + 1e-9:
             continue
         aside = np.array([side, up]) / lean if lean > 0.0 else np.zeros(2)
         away = np.array([*(np.sin(lean) * aside), np.cos(lean)])
-        queries += [middle + FAR_M * away + offset for offset in beside]
+        queries += [middle + VIEW_DISTANCE_M * away + offset for offset in beside]
     found = closest(apply(inverse(world_from_object), np.array(queries)))
     front = world_from_object[:3, :3].T[:, 2]
     leans = np.arccos(np.clip(found.normal @ front, -1.0, 1.0))
-    kept: list[int] = []
+    chosen: list[int] = []
     for index in np.flatnonzero(leans <= most + 1e-6):
-        near = np.linalg.norm(found.point[kept] - found.point[index], axis=1) < SAME_M
-        alike = np.linalg.norm(found.normal[kept] - found.normal[index], axis=1) < SAME_NORMAL
+        near = (
+            np.linalg.norm(found.point[chosen] - found.point[index], axis=1) < DUPLICATE_DISTANCE_M
+        )
+        alike = (
+            np.linalg.norm(found.normal[chosen] - found.normal[index], axis=1) < DUPLICATE_NORMAL
+        )
         if not (near & alike).any():
-            kept.append(int(index))
+            chosen.append(int(index))
     return [
         Nearest(
             found.point[i],
@@ -223,16 +228,16 @@ def _seen(
             found.on_edge[i],
             found.undecided[i],
         )
-        for i in kept
+        for i in chosen
     ]
 
 
-def _ways_to_lie(
-    waiting: SheetContact, begun: Sequence[SheetContact], found: Nearest, most: Floats
+def _list_contacts(
+    waiting: SheetContact, starts: Sequence[SheetContact], found: Nearest, most: Floats
 ) -> Iterator[SheetContact]:
-    """The sheet held ready at a point, and as it lies there after the longest rolls."""
+    """Yield the sheet's central contact at a point, and its contacts after the longest rolls."""
     yield waiting
-    rolls = [roll_contact(contact, found) for contact in begun]
+    rolls = [roll_contact(contact, found) for contact in starts]
     position_sheet_m = np.array([contact.position_sheet_m for contact in rolls])
     chosen = {
         int(pick(position_sheet_m[:, axis])) for axis in (0, 1) for pick in (np.argmin, np.argmax)
@@ -241,11 +246,11 @@ def _ways_to_lie(
         yield replace(rolls[index], position_sheet_m=np.clip(position_sheet_m[index], -most, most))
 
 
-def samples_of(scene: Scene, touch_places: Sequence[Touch]) -> Samples:
-    """Every touch at every depth and at the least and largest stretch.
+def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
+    """Combine every contact with every depth and with the minimum and maximum stretch.
 
-    With the push the sheet yields along its normal, by at most as much; pushing at the working
-    speed is one of the motions that the arms must follow.
+    The sheet complies along its normal, by at most the push depth. Pushing at the working speed is
+    one of the motions that the arms must follow.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(
@@ -255,65 +260,68 @@ def samples_of(scene: Scene, touch_places: Sequence[Touch]) -> Samples:
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    # A hair inside, so that the limit itself is not what rounding makes of it.
+    # The margin keeps rounding from exceeding the limit.
     largest = max(sheet.min_stretch_ratio, min(sheet.max_stretch_ratio, longest) - 1e-9)
-    poses, stretches, twists, tilts, depths, contacts = [], [], [], [], [], []
-    for touch in touch_places:
-        normal = touch.world_from_sheet[:3, 2]
+    poses, stretches, twists, tilts, depths, positions = [], [], [], [], [], []
+    for contact in contacts:
+        normal = contact.world_from_sheet[:3, 2]
         push = np.concatenate([-scene.working_range.speed_m_per_s * normal, np.zeros(3)])
         for depth in np.linspace(0.0, scene.working_range.push_depth_m, DEPTHS):
-            pose = touch.world_from_sheet.copy()
+            pose = contact.world_from_sheet.copy()
             pose[:3, 3] -= depth * normal
             for stretch in (sheet.min_stretch_ratio, largest):
                 poses.append(pose)
                 stretches.append(stretch)
-                twists.append(np.vstack([touch.twists_world, push]))
-                tilts.append(touch.tilt_rad)
+                twists.append(np.vstack([contact.twists_world, push]))
+                tilts.append(contact.tilt_rad)
                 depths.append(depth)
-                contacts.append(touch.contact_world_m)
-    return Samples(
+                positions.append(contact.contact_world_m)
+    return LayoutSamples(
         SheetPoses(np.array(poses), np.array(stretches), np.array(twists)),
         np.array(tilts),
         np.array(depths),
-        np.array(contacts),
+        np.array(positions),
     )
 
 
 def check_layout(
-    scene: Scene, *, progress: Progress = lambda text: None, touches_of: Touches = touches
+    scene: Scene,
+    *,
+    progress: Progress = lambda text: None,
+    find_contacts: FindContacts = sample_contacts,
 ) -> Layout:
-    """Ask both arms for all of the scene's working range, and look for remedies where it fails."""
-    progress("where the object can be touched")
-    samples = samples_of(scene, touches_of(scene))
+    """Check both arms over the scene's working range, and find remedies if one fails."""
+    progress("finding the contacts on the object")
+    samples = make_samples(scene, find_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
-    progress(f"{len(samples.places)} places of the sheet, left arm")
-    left_reach = find_best_reach(left, right, samples.places)
-    progress(f"{len(samples.places)} places of the sheet, right arm")
-    right_reach = find_best_reach(right, left, samples.places)
+    progress(f"{len(samples.poses)} poses of the sheet, left arm")
+    left_reach = find_best_reach(left, right, samples.poses)
+    progress(f"{len(samples.poses)} poses of the sheet, right arm")
+    right_reach = find_best_reach(right, left, samples.poses)
     found = Layout(scene, samples, left_reach, right_reach, (), ())
-    progress("ways from the front to the farthest places")
-    found = replace(found, broken_ways=tuple(_broken_ways(found, left, right)))
+    progress("checking paths from the front to the limits of the range")
+    found = replace(found, blocked_paths=tuple(_find_blocked_paths(found, left, right)))
     if found.reached.all():
         return found
-    return replace(found, remedies=tuple(_remedies(found, progress)))
+    return replace(found, remedies=tuple(_find_remedies(found, progress)))
 
 
-def _broken_ways(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
-    """Where the arms cannot go from the front to a reachable place at the range's rim."""
-    places, reached = layout.samples.places, layout.reached
+def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
+    """Yield the paths from the front to the limits of the range that the arms cannot follow."""
+    poses, reached = layout.samples.poses, layout.reached
     if not reached.any():
         return
-    fair = np.flatnonzero(reached)
+    inside = np.flatnonzero(reached)
 
     def motion(index: int) -> SheetMotion:
-        stretch = float(places.stretch_ratio[index])
-        return SheetMotion(places.world_from_sheet[index], np.zeros(6), stretch, 0.0)
+        stretch = float(poses.stretch_ratio[index])
+        return SheetMotion(poses.world_from_sheet[index], np.zeros(6), stretch, 0.0)
 
-    tilt, depth = layout.samples.tilt_rad[fair], layout.samples.depth_m[fair]
-    start = int(fair[np.lexsort((depth, np.abs(tilt)))[0]])
-    centre = places.world_from_sheet[fair, :3, 3]
+    tilt, depth = layout.samples.tilt_rad[inside], layout.samples.depth_m[inside]
+    start = int(inside[np.lexsort((depth, np.abs(tilt)))[0]])
+    centre = poses.world_from_sheet[inside, :3, 3]
     rim = {
-        int(fair[pick(values)]) for values in (tilt, *centre.T) for pick in (np.argmin, np.argmax)
+        int(inside[pick(values)]) for values in (tilt, *centre.T) for pick in (np.argmin, np.argmax)
     }
     for goal in sorted(rim):
         try:
@@ -331,24 +339,24 @@ def _broken_ways(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Itera
             yield f"to {tilt_deg:.0f} degrees, {depth_mm:.0f} mm deep: {error}"
 
 
-def _remedies(layout: Layout, progress: Progress) -> Iterator[Remedy]:
-    """What would make all reachable: bases moved, less tilt, less depth, less speed."""
+def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
+    """Yield changes that make all samples reachable: bases, tilt or depth."""
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
         if not reach.reachable.all():
-            progress(f"other places for the {side} base")
-            offset = _base_offset(layout, side)
+            progress(f"searching positions of the {side} base")
+            offset = _find_base_offset(layout, side)
             if offset is None:
                 moved.clear()
                 break
             moved[side] = offset
     if moved:
-        words = " and ".join(
+        moves = " and ".join(
             f"{side} base by ({', '.join(f'{1e3 * one:+.0f}' for one in offset)}) mm"
             for side, offset in moved.items()
         )
-        yield Remedy(
-            f"move the {words} along the world's x, y, z",
+        yield LayoutRemedy(
+            f"move the {moves} along the world's x, y, z",
             {f"{side}_base_offset_m": offset.tolist() for side, offset in moved.items()},
         )
     reached = layout.reached
@@ -357,17 +365,17 @@ def _remedies(layout: Layout, progress: Progress) -> Iterator[Remedy]:
         ("push_depth", layout.samples.depth_m, "mm", 1e3),
     ):
         bad = values[~reached]
-        fair = values[values < bad.min() - 1e-9] if len(bad) else values
-        if len(fair) and fair.max() > 0.0:
-            largest = float(fair.max())
+        possible = values[values < bad.min() - 1e-9] if len(bad) else values
+        if len(possible) and possible.max() > 0.0:
+            largest = float(possible.max())
             key = "tilt_rad" if name == "tilt" else "push_depth_m"
-            yield Remedy(
-                f"working_range.{key}: no more than {factor * largest:.1f} {unit}", {key: largest}
+            yield LayoutRemedy(
+                f"working_range.{key}: at most {factor * largest:.1f} {unit}", {key: largest}
             )
 
 
-def with_base_moved(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """The scene with one arm's base shifted in the world."""
+def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
+    """Return the scene with one arm's base shifted in the world."""
     arms = scene.arms
     arm: ArmSpec = getattr(arms, side)
     base = Pose(
@@ -378,36 +386,39 @@ def with_base_moved(scene: Scene, side: Side, offset_m: Floats) -> Scene:
     return scene.model_copy(update={"arms": changed})
 
 
-def _base_offset(layout: Layout, side: Side) -> Floats | None:
-    """The least of the tried shifts of a base with which that arm reaches all, or None."""
+def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
+    """Return the smallest tried base offset with which the arm reaches all samples, or None."""
     other: Side = "right" if side == "left" else "left"
     reach = layout.left if side == "left" else layout.right
     bad = np.flatnonzero(~reach.reachable)
-    fair = np.flatnonzero(reach.reachable)
-    # Where the flange may be does not depend on where the base is.
-    elsewhere = {"workspace", "flange distance", "edge force"}
-    if any(LIMITS[number] in elsewhere for number in set(reach.binding[bad].tolist())):
+    good = np.flatnonzero(reach.reachable)
+    # Limits of the flange's pose do not depend on the base.
+    independent_limits = {"workspace", "flange distance", "edge force"}
+    if any(LIMITS[number] in independent_limits for number in set(reach.binding[bad].tolist())):
         return None
     chosen = np.concatenate(
-        [bad[:: max(1, 2 * len(bad) // THINNED)], fair[:: max(1, 2 * len(fair) // THINNED)]]
+        [
+            bad[:: max(1, 2 * len(bad) // THINNED_COUNT)],
+            good[:: max(1, 2 * len(good) // THINNED_COUNT)],
+        ]
     )
-    thin = layout.samples.places.some(chosen)
+    thin = layout.samples.poses.some(chosen)
     other_arm = ArmGeometry(layout.scene, other)
     offsets = sorted(
         (np.array(one) for one in product(OFFSETS_M, repeat=3)),
         key=lambda one: (round(float(np.linalg.norm(one)), 6), *np.abs(one)),
     )
     for offset in offsets[1:]:
-        arm = ArmGeometry(with_base_moved(layout.scene, side, offset), side)
+        arm = ArmGeometry(move_base(layout.scene, side, offset), side)
         if not find_best_reach(arm, other_arm, thin.without_twists()).reachable.all():
             continue
-        if find_best_reach(arm, other_arm, layout.samples.places.without_twists()).reachable.all():
+        if find_best_reach(arm, other_arm, layout.samples.poses.without_twists()).reachable.all():
             return offset
     return None
 
 
 def layout_result(layout: Layout) -> dict[str, Any]:
-    """What `doctor scene --json` prints."""
+    """Return the result of `doctor scene --json`."""
     return {
         "scene": layout.scene.name,
         "reachable": layout.reachable,
@@ -415,9 +426,9 @@ def layout_result(layout: Layout) -> dict[str, Any]:
         "share_at_working_speed": float(layout.followed.mean()),
         "speed_everywhere_m_per_s": layout.speed_m_per_s(1.0),
         "speed_at_half_m_per_s": layout.speed_m_per_s(0.5),
-        "samples": len(layout.samples.places),
+        "samples": len(layout.samples.poses),
         "arms": {side: _arm_result(layout, reach) for side, reach in layout.arms()},
-        "broken_ways": list(layout.broken_ways),
+        "broken_ways": list(layout.blocked_paths),
         "remedies": [{"what": one.what, **one.values} for one in layout.remedies],
     }
 
@@ -429,13 +440,13 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
         "share": float(reach.reachable.mean()),
         "share_at_working_speed": float(reach.trackable.mean()),
         "branch": reach.branch._asdict(),
-        "binding": [_first(layout, number, binding) for number in present],
-        "least_margins": least_margins(layout, reach),
+        "binding": [_summarize_limit(layout, number, binding) for number in present],
+        "least_margins": find_min_margins(layout, reach),
     }
 
 
-def _first(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Where a limit binds, and where nearest to the front: by the tilt, then by the depth."""
+def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
+    """Return where a limit applies, and its sample nearest to the front by tilt, then depth."""
     where = np.flatnonzero(binding == number)
     samples = layout.samples
     order = np.lexsort((samples.depth_m[where], np.round(np.abs(samples.tilt_rad[where]), 6)))
@@ -449,8 +460,8 @@ def _first(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, 
     }
 
 
-def least_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
-    """The least margin of each kind over all samples, what it is of, and at what tilt and depth."""
+def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
+    """Return the minimum margin of each kind with its limit, tilt and depth."""
     kinds = {
         "joint range": (RANGES, "rad"),
         "shoulder singularity": (("shoulder singularity",), "m"),
@@ -479,27 +490,27 @@ def least_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float 
 
 
 def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw maps over tilt and depth, for each arm: what binds where, and how fast it can follow."""
+    """Draw the binding limit and the speed of each arm over tilt and depth."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    grid = _Grid.of(layout)
-    present = {int(n) for _, reach in layout.arms() for n in set(_place_binding(reach).tolist())}
+    grid = _Grid.from_layout(layout)
+    present = {int(n) for _, reach in layout.arms() for n in set(_binding_limits(reach).tolist())}
     colors = {n: f"C{i % 10}" for i, n in enumerate(sorted(present - {-1}))}
-    asked = 1e3 * layout.scene.working_range.speed_m_per_s
+    required = 1e3 * layout.scene.working_range.speed_m_per_s
     for column, (side, reach) in enumerate(layout.arms()):
         upper, lower = panels[0, column], panels[1, column]
-        upper.imshow(grid.colored(_place_binding(reach), colors), **grid.frame)
+        upper.imshow(grid.colored(_binding_limits(reach), colors), **grid.frame)
         upper.set_title(f"{side} arm: reaches {100 * reach.reachable.mean():.1f} %")
         speeds = np.where(reach.reachable, 1e3 * layout.speeds_m_per_s(reach), np.nan)
-        shown = lower.imshow(grid.least(speeds), vmin=0.0, vmax=2.0 * asked, **grid.frame)
+        shown = lower.imshow(grid.minimum(speeds), vmin=0.0, vmax=2.0 * required, **grid.frame)
         followed = 100 * reach.trackable.mean()
-        lower.set_title(f"{side} arm: follows {asked:.0f} mm/s at {followed:.1f} %")
+        lower.set_title(f"{side} arm: follows {required:.0f} mm/s at {followed:.1f} %")
         lower.set_xlabel("tilt of the contact, degrees (positive: facing up)")
         panels[column, 0].set_ylabel("push depth, mm")
-    figure.colorbar(shown, ax=panels[1], label="finger's speed that is followed, mm/s")
+    figure.colorbar(shown, ax=panels[1], label="speed of the finger that the arm can follow, mm/s")
     legend = [Patch(color=REACHED_COLOR, label="reached")]
     legend += [Patch(color=color, label=LIMITS[n]) for n, color in colors.items()]
     panels[0, 1].legend(handles=legend, loc="upper left", bbox_to_anchor=(1.01, 1.0))
@@ -510,21 +521,25 @@ def draw_layout(layout: Layout, path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def _place_binding(reach: ArmReach) -> NDArray[np.intp]:
-    """Number of the limit that keeps the arm from a place, (n,); -1 where it reaches it."""
+def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
+    """Return the index of the limit that excludes each sample (n,); -1 where the arm reaches
+    it.
+    """
     return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Cells over tilt and depth; rows, columns: of each sample (n,).  frame: how to draw them."""
+    """Cells over tilt and depth. rows, columns: cell of each sample (n,). frame: plot
+    options.
+    """
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
     frame: dict[str, Any]
 
     @classmethod
-    def of(cls, layout: Layout) -> _Grid:
+    def from_layout(cls, layout: Layout) -> _Grid:
         tilt, depth = layout.samples.tilt_rad, layout.samples.depth_m
         most = layout.scene.working_range.tilt_rad
         deepest = layout.scene.working_range.push_depth_m
@@ -540,15 +555,15 @@ class _Grid:
         frame = {"origin": "lower", "aspect": "auto", "extent": extent}
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 
-    def least(self, values: Floats) -> Floats:
-        """The least value in each cell; NaN where there is none."""
+    def minimum(self, values: Floats) -> Floats:
+        """Return the minimum value of each cell; NaN for an empty cell."""
         cells = np.full((DEPTHS, TILTS), np.inf)
         finite = np.isfinite(values)
         np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Each cell's colour: of the limit that binds most often, paler where it seldom does."""
+        """Return each cell's colour: that of its most frequent limit, paler if it is rare."""
         from matplotlib.colors import to_rgb
 
         cells = np.ones((DEPTHS, TILTS, 3))
@@ -559,7 +574,7 @@ class _Grid:
             cells[row, column] = to_rgb(REACHED_COLOR)
             out = here[here >= 0]
             if len(out):
-                share = 0.3 + 0.7 * len(out) / len(here)
+                weight = 0.3 + 0.7 * len(out) / len(here)
                 worst = np.array(to_rgb(colors[int(np.bincount(out).argmax())]))
-                cells[row, column] = (1.0 - share) * cells[row, column] + share * worst
+                cells[row, column] = (1.0 - weight) * cells[row, column] + weight * worst
         return cells

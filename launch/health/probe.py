@@ -1,7 +1,7 @@
 """Probe every host of a graph over the network, from one of them.
 
-A running launcher reports the state of its host on the topics `host`, `status`, `clocks` and its
-arm's.  For a host that does not report, the probe finds how far a connection gets.
+A running launcher publishes the state of its host on the topics `host`, `status`, `clocks` and
+those of its arms. For other hosts, the probe finds the step at which a connection fails.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ SSH_PORT = 22
 
 
 class Reachability(StrEnum):
-    """How far a connection to a host's launcher gets."""
+    """Result of a connection to a host's launcher."""
 
     RESPONDING = "responding"
     LOCAL = "local"
-    """This computer, where no graph runs."""
+    """This computer, on which no graph runs."""
     NO_ROUTE = "no_route"
     UNREACHABLE = "unreachable"
     """No host has the address."""
@@ -57,12 +57,12 @@ class Reachability(StrEnum):
     KEY_MISMATCH = "key_mismatch"
     """The host does not have the key that the launch file gives for it."""
     KEY_REJECTED = "key_rejected"
-    """The host does not accept our key."""
+    """The host does not accept this computer's key."""
     UNENCRYPTED = "unencrypted"
     NO_RESPONSE = "no_response"
     """The handshake succeeded, but no host status arrived."""
     OWN_KEY_INVALID = "own_key_invalid"
-    """Our own key cannot be used, so the host was not asked."""
+    """This computer's key cannot be used, so the host was not probed."""
 
 
 HANDSHAKES: dict[int, Reachability] = {
@@ -75,10 +75,10 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """Hold what one host reported, and the problems that reading it met.
+    """Messages that one host published, and problems while reading them.
 
-    refused: messages that were not accepted.  failed_handshakes: connections that did not prove
-    their key though an earlier one did.
+    refused: messages that were not accepted. failed_handshakes: connections without a valid key
+    after an earlier valid one.
     """
 
     host: str
@@ -95,10 +95,10 @@ class HostProbe:
 async def probe_all(
     plan: ResolvedGraph, *, here: str, keys: KeyRing | None, run: Run | None, timeout_s: float
 ) -> dict[str, HostProbe]:
-    """Probe all hosts at once and return the results by host.
+    """Probe all hosts concurrently and return the results by host.
 
-    here: the host that asks.  keys: its keys; None if there are none or they cannot be used.
-    run: its running graph; None if none runs.
+    here: name of this host. keys: its keys; None if there are none or they cannot be used. run: its
+    running graph; None if no graph runs.
     """
     probes = await asyncio.gather(
         *(

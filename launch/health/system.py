@@ -23,7 +23,7 @@ APT_OPTIONS = ("-qq", "-o", "DPkg::Lock::Timeout=120", "-o", "Acquire::Retries=2
 
 @dataclass(frozen=True, slots=True)
 class SystemPackages:
-    """Name the Debian packages for one purpose.
+    """Debian packages for one purpose.
 
     problem: returns why the packages do not work; None if they do.
     """
@@ -122,7 +122,7 @@ def run_apt(*arguments: str) -> bool:
 def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
     """Install the packages of each purpose, and return those that still do not work.
 
-    Each purpose is a transaction of its own, so that an unavailable package does not block others.
+    Each purpose is a separate transaction, so that an unavailable package does not block others.
     """
     run_apt("update")
     for one in missing:
@@ -132,9 +132,12 @@ def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 1 if a package for nodes is missing; with --tests always 0, as tests report it."""
+    """Check the system packages, and return 1 if a package for nodes is missing.
+
+    Return 0 with --tests, because the tests report missing packages.
+    """
     parser = argparse.ArgumentParser(description="Check the system packages.")
-    parser.add_argument("--tests", action="store_true", help="also what the tests need")
+    parser.add_argument("--tests", action="store_true", help="check packages for tests, too")
     tests = parser.parse_args(arguments).tests
     wanted = [one for one in TABLE if tests or not one.tests_only]
     missing = [one for one in wanted if one.problem() is not None]

@@ -1,1 +1,1 @@
-"""Launch files and scenes: read, checked, and resolved into what runs where."""
+"""Read, check and resolve launch files and scenes."""

@@ -1,7 +1,7 @@
 """Read YAML files, and report their errors with file, line, key, value and remedy.
 
-A file is read with its line numbers and validated against a pydantic model.  All errors are
-reported at once as `Problem`s.
+A file is read with its line numbers and validated against a pydantic model. All errors are reported
+together as `Problem`s.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""The largest file of launch/ has 300; the parser needs a second for the maximum."""
+"""Maximum number of values; the parser needs a second for it, and the largest file has 300."""
 
 OPENING_TOKENS = (
     BlockMappingStartToken,
@@ -78,7 +78,7 @@ Key = tuple[str | int, ...]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Describe one error: location, key, what is wrong, and what to do."""
+    """One error: location, key, what is wrong, and what to do."""
 
     where: str
     key: Key
@@ -92,7 +92,7 @@ class Problem:
 
 
 class BadInputError(FlexsheetError, ValueError):
-    """Input that cannot be used; `problems` holds all that was found."""
+    """Input that cannot be used; `problems` contains all errors."""
 
     code = "bad-input"
     exit_code = 2
@@ -107,7 +107,7 @@ class BadInputError(FlexsheetError, ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """Hold a YAML file as plain values, with the line of every key, and overridden values."""
+    """A YAML file as plain values, with the line of every key, and overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -126,6 +126,7 @@ class Document:
         return str(self.path)
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
+        """Make a problem of a key of this document."""
         return Problem(self.where(key), key, what, remedy)
 
     def set(self, key: Key, value: Any, origin: str) -> None:
@@ -164,10 +165,10 @@ def _parse_tree(text: str) -> Any:
 
 
 def _check_size(text: str) -> None:
-    """Refuse a text whose parsing would take too long.  Raises YAMLError.
+    """Reject a text whose parsing would be too slow.  Raises YAMLError.
 
-    The parser's time grows at least quadratically with the depth, so tokens are counted first,
-    unless the punctuation shows that there are few.
+    The parser's time grows at least quadratically with the depth. Tokens are counted first, unless
+    the punctuation shows that there are few.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
@@ -208,7 +209,7 @@ def parse_json(text: str) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file that holds one mapping; raises BadInputError."""
+    """Read a YAML file that contains one mapping; raises BadInputError."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -247,7 +248,7 @@ def read_document(path: Path) -> Document:
 def plain(tree: Any) -> Any:
     """Convert a YAML tree into Python's own types, without comments and quoting.
 
-    Raises YAMLError for keys other than words and numbers, and if aliases expand to more than
+    Raises YAMLError for keys that are lists or mappings, and if aliases expand to more than
     MAX_VALUES values.
     """
     left = MAX_VALUES
@@ -271,7 +272,7 @@ def plain(tree: Any) -> Any:
     def key(name: Any) -> Any:
         if name is None or isinstance(name, str | int | float):
             return convert(name)
-        raise YAMLError("a key is a list or a mapping, not a word or a number")
+        raise YAMLError("a key is a list or a mapping; write text or a number")
 
     try:
         return convert(tree)
@@ -315,11 +316,11 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return the remedy for an unknown name: its new name, the nearest one, or all there are."""
+    """Return the remedy for an unknown name: the most similar name, or all names."""
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
-    return f"choose one of: {', '.join(known)}" if known else "there are none"
+    return f"choose one of: {', '.join(known)}" if known else "none is defined"
 
 
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
@@ -363,9 +364,9 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 
 
 def _existing_part(document: Document, key: Key) -> Key:
-    """Return the longest beginning of `key` that the document holds.
+    """Return the longest prefix of `key` that exists in the document.
 
-    Pydantic's locations also name options of unions and parts of keys, which no file holds.
+    Pydantic's locations also contain members of unions, which are not keys of the file.
     """
     values: Any = document.values
     for number, part in enumerate(key):
@@ -377,7 +378,7 @@ def _existing_part(document: Document, key: Key) -> Key:
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return old to new names of the keys beside `key`."""
+    """Return old to new names of the keys on the level of `key`."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
         # A launch file may name a shipped node by its class, too.

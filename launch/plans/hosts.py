@@ -59,6 +59,7 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[P
 
 
 def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
+    """Check that each host has a separate valid key, if any host has a key."""
     seen: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")
@@ -91,9 +92,9 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[P
 
 
 def load_keys(path: Path) -> dict[str, str]:
-    """Read the public key of each host from a launch file, which may have changed since the start.
+    """Read the public key of each host from a launch file.
 
-    Raises BadInputError.
+    The file may have changed since the start. Raises BadInputError.
     """
     document = read_document(path)
     spec = validate(LaunchFile, document)
@@ -115,4 +116,5 @@ def clock_node(host: str) -> str:
 
 
 def is_loopback(address: str) -> bool:
+    """Return whether an IP address is on loopback."""
     return ipaddress.ip_address(address).is_loopback

@@ -23,7 +23,7 @@ RECORDER_NICE = 5
 """The recorder's messages wait in queues, so its delay affects no other node."""
 
 CONSOLE_NICE = 10
-"""Displays must not slow the nodes that they display."""
+"""The console must not delay the nodes that it shows."""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
 """Path of the bags that the console records, relative to the working folder."""
@@ -32,7 +32,7 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
 class HostSpec(StrictModel):
-    """Configure one computer."""
+    """Settings of one computer."""
 
     address: str = Field(description="IP address on which its nodes listen")
     key: str | None = Field(
@@ -45,7 +45,7 @@ class HostSpec(StrictModel):
 
 
 class NodeSpec(StrictModel):
-    """Configure one node."""
+    """Settings of one node."""
 
     type: str = Field(description='name of a node type, or "module:Class"')
     host: str = MAIN
@@ -65,12 +65,12 @@ class NodeSpec(StrictModel):
         default=0,
         ge=-20,
         le=19,
-        description="niceness of the process; below 0 it takes precedence, if the user may set it",
+        description="niceness of the process; below 0 (more priority) only if the user may set it",
     )
 
 
 class ClocksSpec(StrictModel):
-    """Configure the required accuracy of the hosts' clocks; see docs/clocks.md."""
+    """Required accuracy of the hosts' clocks; see docs/clocks.md."""
 
     max_offset_uncertainty_s: float = Field(
         default=0.005,
@@ -88,7 +88,7 @@ class ClocksSpec(StrictModel):
 
 
 class LaunchFile(StrictModel):
-    """Define the keys of a launch file."""
+    """Keys of a launch file."""
 
     scene: str | None = Field(default=None, description="scene file, relative to the launch file")
     hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
@@ -103,12 +103,17 @@ class LaunchFile(StrictModel):
 
 
 def apply_setting(document: Document, setting: str) -> None:
+    """Apply an option --set node.parameter=value.  Raises BadInputError."""
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")
     node, dot, parameter = target.partition(".")
     if not (equals and dot and node and parameter):
         raise BadInputError(
-            [Problem(origin, (), "has no node, parameter or value", "write node.parameter=value")]
+            [
+                Problem(
+                    origin, (), "node, parameter or value is missing", "write node.parameter=value"
+                )
+            ]
         )
     names = document.values.get("nodes")
     known = list(names) if isinstance(names, dict) else []
@@ -139,6 +144,7 @@ def apply_setting(document: Document, setting: str) -> None:
 
 
 def apply_record(document: Document, bag: Path) -> None:
+    """Apply the option --record: set the bag of the recorder; add a recorder if necessary."""
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError(
@@ -153,6 +159,7 @@ def apply_record(document: Document, bag: Path) -> None:
 
 
 def apply_console(document: Document) -> None:
+    """Apply the option --console: add a console, and a recorder that starts paused."""
     origin = "--console"
     nodes = document.values.get("nodes")
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []

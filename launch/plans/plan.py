@@ -1,7 +1,7 @@
-"""Check a launch file and resolve it: which node runs where, with which parameters and endpoints.
+"""Check a launch file and resolve it to nodes with hosts, parameters and endpoints.
 
 `load_graph` returns a `ResolvedGraph`, in which every endpoint is known before any process starts.
-All errors of the file are reported at once.  Every host resolves the same file to the same graph;
+All errors of the file are reported together. Every host resolves the same file to the same graph;
 hosts compare its hash.
 """
 

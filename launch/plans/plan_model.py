@@ -1,7 +1,6 @@
 """Define the resolved form of a launch file: its nodes, their hosts, and the topics' endpoints.
 
-The module is separate from the resolver (`launch.plans.plan`), so that tools which inspect a
-running graph start fast.
+The module is separate from the resolver (`launch.plans.plan`), so that tools start fast.
 """
 
 from __future__ import annotations
@@ -42,16 +41,16 @@ OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
 
 
 class StrictModel(LimitedModel):
-    """Base of immutable models that refuse unknown keys."""
+    """Base of immutable models that reject unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RestartSpec(StrictModel):
-    """Configure what happens when a node's process ends by itself.
+    """Behaviour when a node's process exits.
 
-    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`.
-    After `max_restarts` in `window_s` the node has failed, and the run ends.
+    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`. After
+    `max_restarts` in `window_s` the node has failed, and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
@@ -62,7 +61,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """One writer of a topic, and the endpoints it binds: ipc for its own host, tcp for others."""
+    """A writer of a topic, and its endpoints: ipc for its own host, tcp for others."""
 
     name: str
     host: str
@@ -79,7 +78,7 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the endpoint for a subscriber on `host`, with the writer that it accepts."""
+        """Return the endpoint for a subscriber on `host`, with the writer's identity."""
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
@@ -93,7 +92,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """Everything needed to start one node."""
+    """All settings that are needed to start a node."""
 
     name: str
     type: str
@@ -122,7 +121,7 @@ class ResolvedNode(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _add_missing_fields(cls, values: Any) -> Any:
-        """Derive the fields that plans in older bags lack: role, device address, calibrations."""
+        """Derive the fields that plans of older bags do not contain."""
         if not isinstance(values, dict):
             return values
         derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}
@@ -138,7 +137,7 @@ class ResolvedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """A resolved launch file."""
+    """A resolved launch file: nodes, hosts, and the endpoints of all topics."""
 
     launch_file: str
     launch_text: str
@@ -155,7 +154,7 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer `name` of `topic`; None if it may not write it."""
+        """Return the writer `name` of `topic`; None if it may not write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
@@ -179,7 +178,7 @@ class ResolvedGraph(StrictModel):
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """Return (node, TCP port) for each port on which a node itself listens."""
+        """Return (node, TCP port) for each port on which a node listens."""
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:

@@ -58,7 +58,7 @@ LAUNCH_KEYS: Mapping[str, str] = {
     "also": "include",
     "waits": "start_paused",
 }
-"""Old to new keys of launch files, those of `record` among them."""
+"""Old to new keys of launch files, including those of `record`."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
@@ -69,4 +69,4 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
-"""Old to new values, by the key that holds them: names of methods and patterns."""
+"""Old to new values, by key: names of methods, patterns and modes."""

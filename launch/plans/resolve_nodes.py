@@ -36,16 +36,16 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""Files of a run's directory besides those named after nodes."""
+"""Files of a run's directory that are not named after nodes."""
 
 _PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
-"""Keys that hold the parameters of a node; other nodes have a key `parameters`."""
+"""Keys that contain a node's parameters directly; other nodes have a key `parameters`."""
 
 
 class NodeEntry:
-    """Collect what is known of a node while its launch file is checked.
+    """Data of a node while its launch file is checked.
 
-    type, parameters: None until they are resolved.  ports, unconnected: ports with their topics.
+    type, parameters: None until they are resolved. ports, unconnected: ports with their topics.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -57,12 +57,14 @@ class NodeEntry:
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
+        """Return the topics of the inputs or outputs by port."""
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
+        """Return the unconnected inputs or outputs."""
         return tuple(
             ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
@@ -73,6 +75,7 @@ class NodeEntry:
 def collect_entries(
     spec: LaunchFile, document: Document, problems: list[Problem]
 ) -> list[NodeEntry]:
+    """Return the entries of all nodes, with the recorder and the clock nodes."""
     entries = []
     for name, node_spec in spec.nodes.items():
         entries.append(NodeEntry(name, node_spec, ("nodes", name)))
@@ -217,7 +220,7 @@ def _connect_ports(
                 document.problem(
                     key,
                     f'topic "{topic.name}" carries {topic.message.__name__}, '
-                    f'port "{port.name}" takes {port.message.__name__}',
+                    f'port "{port.name}" needs {port.message.__name__}',
                     "connect a topic of that type",
                 )
             )
@@ -228,7 +231,7 @@ def _connect_ports(
 def check_device_hosts(
     entries: list[NodeEntry], spec: LaunchFile, document: Document, problems: list[Problem]
 ) -> None:
-    """Check that no device is reached across the network: device protocols are not encrypted."""
+    """Check that no device is on another host: device protocols are not encrypted."""
     for entry in entries:
         if entry.parameters is None:
             continue
@@ -295,7 +298,7 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _base(document: Document, key: Key) -> Path:
-    """Return the folder to which paths at `key` are relative: the file's, or the working folder."""
+    """Return the folder to which paths at `key` are relative."""
     return Path.cwd() if key in document.overrides else document.path.parent
 
 

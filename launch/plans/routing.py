@@ -14,13 +14,13 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""Topics that tools on every host may write, so that a stop is possible beside each arm."""
+"""Topics that tools on every host may write, so that each host can stop the arms."""
 
 LAUNCHER_TOPICS = ("host", "estop")
 """Topics that the launcher of each host writes."""
 
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
-"""TCP ports lie below the range of outgoing connections on Linux (32768 and above)."""
+"""TCP ports below the range of outgoing connections on Linux (32768 and above)."""
 
 
 def list_writers(
@@ -85,7 +85,7 @@ def resolve_further_inputs(
     document: Document,
     problems: list[Problem],
 ) -> None:
-    """Add the inputs of nodes whose topics depend on their parameters, such as the recorder."""
+    """Add the inputs of nodes whose topics depend on their parameters (recorder, console)."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:
@@ -107,6 +107,7 @@ def check_inputs(
     document: Document,
     problems: list[Problem],
 ) -> None:
+    """Check that every input has a writer."""
     for entry in entries:
         for port_name, topic in entry.topics("input"):
             if topic.name not in writers:
@@ -162,8 +163,8 @@ def _make_tcp_endpoint(address: str, port: int | None) -> str | None:
 def _assign_ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
     """Return a TCP port for each (host, writer, topic), from the hash of its name.
 
-    Collisions are resolved in the order of the names, so that a new topic changes no other port
-    unless the two collide.  Ports are unique over all hosts, as hosts may share a computer.
+    Collisions are resolved in the order of the names, so a new topic changes only colliding ports.
+    Ports are unique over all hosts, as hosts may share a computer.
     """
     taken: dict[int, tuple[str, str, str]] = {}
     for link in links:

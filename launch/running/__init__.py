@@ -1,1 +1,1 @@
-"""A plan's processes on one host: started, watched, spoken to, ended."""
+"""Start, supervise and stop the processes of a graph on one host."""

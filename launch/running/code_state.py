@@ -1,4 +1,4 @@
-"""Finds the commit of the code that runs, and whether its sources were changed since."""
+"""Find the commit of the running code, and whether its sources were changed since."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
-"""Paths of the repository that hold what a run executes; the rest cannot change a run."""
+"""Paths of the repository that contain all code that a run executes."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""Suffixes of new files that change a run by being there.  A new launch file, scene or mesh acts
-only where a launch file names it, and the bag holds that launch file and its scene."""
+"""Suffixes of new files that change a run.
+
+A new launch file, scene or mesh affects a run only if a launch file names it."""
 
 UNTRACKED = "??"
 
@@ -21,8 +22,8 @@ UNTRACKED = "??"
 def git_state(directory: Path) -> str:
     """Return the commit of the code and whether its sources were changed since, as JSON.
 
-    directory: of the repository.  commit: outside of git (in a container) what COMMIT_VARIABLE
-    names, else null.  changed: null outside of git.
+    directory: root of the repository. commit: outside of git the value of COMMIT_VARIABLE, else
+    null. changed: null outside of git.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS
@@ -47,7 +48,7 @@ def _git(directory: Path, *arguments: str) -> str | None:
     """Return what git prints, None where it fails or is missing."""
     try:
         result = subprocess.run(
-            # A service's user is seldom the owner of the clone; git would answer owners alone.
+            # Without this option git refuses a clone that belongs to another user.
             ["git", "-c", "safe.directory=*", "-C", str(directory), *arguments],
             capture_output=True,
             text=True,

@@ -1,9 +1,9 @@
-"""Measures how long nodes wait for a processor, and which programs take the processors.
+"""Measure how long nodes wait for a processor, and which programs use the processors.
 
 Linux counts for each thread how long it was ready to run but did not (`/proc/PID/schedstat`).  The
-main thread of a node runs its loop, so its waiting delays all that the node does.  Counters of the
-whole system (load, /proc/pressure) also count programs of high niceness, which wait by design;
-they therefore do not show whether nodes are late.
+main thread of a node runs its loop, so its waiting delays the whole node.  Counters of the system
+(load, /proc/pressure) also count programs of high niceness, which wait by design.  They therefore
+do not show whether nodes are late.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""Fraction of the time that a node may wait; above it the computer is busy."""
+"""Maximum fraction of the time that a node waits; above it the computer is busy."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
@@ -32,16 +32,16 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """Hold the total waiting time (s) by process id at one time (s)."""
+    """Total waiting time (s) by process id at one time (s)."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """Compare the kernel's counters with those of WINDOW_S before; call `update` once a second.
+    """Comparison of the kernel's counters with those of WINDOW_S before.
 
-    proc: folder of the kernel's counters.  now_s: monotonic clock.
+    Call `update` once a second. proc: folder of the kernel's counters. now_s: monotonic clock.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -94,7 +94,7 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs that use most since the last call; none at the first call."""
+        """Return the programs with most processor time since the last call, if there was one."""
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)
@@ -116,7 +116,7 @@ class CpuWatch:
                 text = (folder / "stat").read_text(errors="replace")
             except OSError:
                 continue  # the process has ended
-            # The name is in brackets and may hold brackets; user and system time are fields 14, 15.
+            # The name may contain brackets itself; user and system time are fields 14 and 15.
             head, _, tail = text.rpartition(")")
             user, system = tail.split()[11:13]
             yield head.partition("(")[2], int(folder.name), (int(user) + int(system)) / _TICKS_PER_S

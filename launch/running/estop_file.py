@@ -1,7 +1,7 @@
-"""Persist an engaged e-stop across restarts of a host's launcher.
+"""Store an engaged e-stop so that it survives restarts of a host's launcher.
 
-Only a reset removes the file.  A file that cannot be read counts as a stop.  The file's name
-depends on the arms that it stops.  Graphs with the same arms therefore share it, and others do not.
+Only a reset removes the file. A file that cannot be read counts as a stop. The file's name depends
+on the arms, so only graphs with the same arms share it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def directory() -> Path:
 
 
 class EStopFile:
-    """Read and write the e-stop of one host.
+    """File with the e-stop of one host.
 
     arms: addresses of the arms.
     """
@@ -43,7 +43,7 @@ class EStopFile:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = f"{self.path} cannot be read ({error}) and may hold an e-stop"
+            reason = f"{self.path} cannot be read ({error}) and may contain an e-stop"
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:

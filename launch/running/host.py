@@ -1,9 +1,9 @@
 """Publish the state of a host, and latch e-stops for nodes that start later.
 
-The writer of an e-stop (a tool, or a node that crashed) may be gone when a bridge restarts.  Each
-launcher therefore latches the last e-stop and repeats it to its host's nodes, as a writer of its
-own, until a permitted writer resets it.  With manual arming it also stores the e-stop in a file,
-in case all launchers end.
+The writer of an e-stop (a tool, or a node that crashed) may have exited when a bridge restarts.
+Each launcher therefore latches the last e-stop and publishes it to its host's nodes, until a
+permitted writer resets it. With manual arming it also stores the e-stop in a file, in case all
+launchers exit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""Longer reasons are cut: an e-stop must fit into every message that repeats it."""
+"""Maximum length of a reason; the e-stop must fit into every message that repeats it."""
 
 RESET_WITHIN_S = 5.0
 """Time within which all arms must report that a reset was accepted."""
@@ -51,11 +51,11 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
-    """Publish the host's status and latch e-stops, between `start` and `close`.
+    """Publisher of a host's status that also latches e-stops, between `start` and `close`.
 
-    endpoints, sources: functions that fill in the run's directory.  code: commit for `HostStatus`.
-    run_directory: folder of the socket for e-stops; None for no socket.
-    pids: returns the process ids of the running nodes by node.
+    endpoints, sources: functions that fill in the run's directory. code: commit for `HostStatus`.
+    run_directory: folder of the socket for e-stops; None for no socket. pids: returns the process
+    ids of the running nodes by node.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class HostAgent:
         self._sources = sources
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
-        # After a restart it learns the e-stop from other launchers, which repeat known ones, too.
+        # After a restart, other launchers provide the e-stop, because they repeat it.
         self._launchers = {launcher_on(name) for name in plan.hosts}
         self._sequence = {"host": 0, "estop": 0}
         self.publishers: dict[str, Publisher] = {}
@@ -96,7 +96,7 @@ class HostAgent:
         self._clock_table = ClockTable(self._clock.id)
         self._subscribers: list[Subscriber] = []
         self._task: asyncio.Task[None] | None = None
-        self._kept: EStop | None = None
+        self._latched: EStop | None = None
         self._engaged_ns = 0
         self._resetting: asyncio.Task[None] | None = None
         self._file = EStopFile(host, list_arms(plan)) if has_manual_arming(plan) else None
@@ -112,16 +112,16 @@ class HostAgent:
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
-        """Subscribe and publish; needs a running event loop."""
+        """Subscribe and start to publish; needs a running event loop."""
         if self._stop_socket is not None:
             self._stop_socket.open()
-        remembered = None if self._file is None else self._file.read()
-        if remembered is not None:
+        stored = None if self._file is None else self._file.read()
+        if stored is not None:
             self._on_problem(
-                f"e-stop from before this start: {remembered.reason}; the arms stand until it is "
-                "reset: flexsheet arms reset"
+                f"e-stop from before this start: {stored.reason}; the arms do not move until it "
+                "is reset: flexsheet arms reset"
             )
-            self._engage(remembered, self._clock.now_ns())
+            self._engage(stored, self._clock.now_ns())
         others = [
             source
             for source in self._plan.sources_to_read("estop", self._host)
@@ -131,9 +131,10 @@ class HostAgent:
         measured = self._plan.writer("clocks", clock_node(self._host))
         if measured is not None:
             source = measured.source_for(self._host)
-            take = self._clock_table.update
             self._subscribers.append(
-                self._subscribe("clocks", [source], lambda clocks, _: take(clocks))
+                self._subscribe(
+                    "clocks", [source], lambda clocks, _: self._clock_table.update(clocks)
+                )
             )
         self._task = asyncio.create_task(self._publish_loop(), name=f"host {self._host}")
 
@@ -171,93 +172,91 @@ class HostAgent:
             publisher.close()
 
     def _stop(self, reason: str) -> None:
-        """Engage an e-stop that came through the socket."""
+        """Engage an e-stop received through the socket."""
         writer = tools_on(self._host)
-        self._on_problem(f"e-stop of {writer}, kept until it is reset")
+        self._on_problem(f"e-stop of {writer}, latched until it is reset")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
     def _latch_estop(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
         _, header, clock_problem = self._clock_table.localised(estop, header, now_ns)
         if estop.engaged:
-            if self._kept is not None and header.writer in self._launchers:
+            if self._latched is not None and header.writer in self._launchers:
                 return
-            if self._kept is None:
-                self._on_problem(f"e-stop of {header.writer}, kept until it is reset")
-            # A stamp from the future would bar every reset to come.
+            if self._latched is None:
+                self._on_problem(f"e-stop of {header.writer}, latched until it is reset")
+            # A stamp from the future would prevent every later reset.
             self._engage(estop, now_ns if clock_problem else min(header.source_ns, now_ns))
-        elif header.writer in self._plan.may_reset_estop() and self._kept is not None:
-            # A late reader is given each writer's last word: a reset may be older than the stop.
+        elif header.writer in self._plan.may_reset_estop() and self._latched is not None:
+            # A late subscriber gets each writer's last message, so a reset may precede the stop.
             if header.source_ns < self._engaged_ns:
                 return
             if header.source_ns > now_ns + MAX_STAMP_AHEAD_NS:
                 clock_problem = clock_problem or "stamped in the future"
             if clock_problem:
-                self._on_problem(f"e-stop not reset: by {header.writer}, {clock_problem}")
+                self._on_problem(f"e-stop not reset by {header.writer}: {clock_problem}")
             elif self._resetting is None or self._resetting.done():
-                self._resetting = asyncio.create_task(self._reset(header.writer, self._kept))
+                self._resetting = asyncio.create_task(self._reset(header.writer, self._latched))
 
     def _engage(self, estop: EStop, at_ns: int) -> None:
-        known = self._kept
-        self._kept = EStop(engaged=True, reason=estop.reason[:REASON_LENGTH])
+        before = self._latched
+        self._latched = EStop(engaged=True, reason=estop.reason[:REASON_LENGTH])
         self._engaged_ns = max(self._engaged_ns, at_ns)
-        self._publish("estop", self._kept)
-        if known != self._kept:
+        self._publish("estop", self._latched)
+        if before != self._latched:
             self._update_file()
 
-    async def _reset(self, writer: str, kept: EStop) -> None:
-        """Forget the e-stop once all arms say that they have: they refuse while they move."""
+    async def _reset(self, writer: str, latched: EStop) -> None:
+        """Release the e-stop once all arms confirm the reset; moving arms refuse it."""
         stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
         all_clear = asyncio.Event()
 
-        def take(state: ArmState, _: Header) -> None:
+        def on_state(state: ArmState, _: Header) -> None:
             if not shows_estop(state):
                 stopped.discard(f"arm_{state.side}")
             if not stopped:
                 all_clear.set()
 
         arms = [
-            self._subscribe(topic, list(self._plan.sources_to_read(topic, self._host)), take)
+            self._subscribe(topic, list(self._plan.sources_to_read(topic, self._host)), on_state)
             for topic in stopped
         ]
-        begun_ns = self._engaged_ns
+        engaged_before_ns = self._engaged_ns
         try:
             if stopped:
                 await asyncio.wait([asyncio.create_task(all_clear.wait())], timeout=RESET_WITHIN_S)
         finally:
             for subscriber in arms:
                 subscriber.close()
-        if self._kept is not kept or self._engaged_ns != begun_ns:
-            self._on_problem(f"e-stop not reset by {writer}: it was engaged again meanwhile")
+        if self._latched is not latched or self._engaged_ns != engaged_before_ns:
+            self._on_problem(f"e-stop not reset by {writer}: it was engaged again")
         elif stopped:
             self._on_problem(
-                f"e-stop kept: {', '.join(sorted(stopped))} did not say within "
-                f"{RESET_WITHIN_S:g} s that {writer}'s reset was taken; once their bridges run and "
-                "the arms rest: flexsheet arms reset"
+                f"e-stop not reset by {writer}: {', '.join(sorted(stopped))} did not confirm it "
+                f"within {RESET_WITHIN_S:g} s; when their bridges run and the arms are at rest: "
+                "flexsheet arms reset"
             )
         else:
             self._on_problem(f"e-stop reset by {writer}")
-            self._kept = None
+            self._latched = None
             self.publishers["estop"].forget()
             self._update_file()
 
     def _update_file(self) -> None:
-        """Write the latched e-stop to the file, or remove the file; repeat it later if it fails."""
+        """Write or remove the file of the latched e-stop; retry later after an error."""
         if self._file is None:
             return
         try:
-            if self._kept is None:
+            if self._latched is None:
                 self._file.remove()
             else:
-                self._file.write(self._kept)
+                self._file.write(self._latched)
         except OSError as error:
             if not self._file_outdated:
-                after = (
-                    "stands though it was reset" if self._kept is None else "knows nothing of it"
-                )
+                effect = "engages it again" if self._latched is None else "does not engage it"
                 self._on_problem(
-                    f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
-                    f"launchers end, the next start {after}"
+                    f"e-stop: {self._file.path} cannot be written ({error.strerror}); if all "
+                    f"launchers exit, the next start {effect}"
                 )
             self._file_outdated = True
         else:
@@ -305,7 +304,7 @@ class HostAgent:
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
         processes, pids = self._processes(), self._pids()
-        # A starting node imports for seconds; its waiting delays no message yet.
+        # A starting node imports for seconds, and delays no messages yet.
         watched = {
             one.name: pids[one.name]
             for one in processes
@@ -327,13 +326,13 @@ class HostAgent:
             keys=()
             if self._keys is None
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
-            estop=None if self._kept is None else self._kept.reason,
+            estop=None if self._latched is None else self._latched.reason,
             cpu=self._cpu.update(watched, pids),
         )
 
 
 def shows_estop(state: ArmState) -> bool:
-    """Return whether an arm's bridge holds an e-stop."""
+    """Return whether an arm's bridge has an engaged e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
 
@@ -344,7 +343,7 @@ def list_arms(plan: ResolvedGraph) -> list[str]:
 
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
-    """Return whether a person has to arm the arms; simulated ones may arm themselves."""
+    """Return whether a user has to arm an arm of the graph."""
     return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
 
 
@@ -353,7 +352,7 @@ def python_version() -> str:
 
 
 def software() -> str:
-    """Return the versions that all hosts should share."""
+    """Return the versions of the libraries that all hosts should share."""
     try:
         own = version("flexsheet")
     except PackageNotFoundError:
@@ -367,7 +366,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
 
 
 def recording_folder(nodes: list[ResolvedNode]) -> Path:
-    """Return the folder of the recorder's bag; the working folder if there is none yet."""
+    """Return the folder of the recorder's bag; the working folder if it does not exist."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:
             folder = Path(str(node.parameters["bag"])).parent

@@ -1,8 +1,8 @@
 """Store key pairs, install public keys in launch files, and pass keys to a run's processes.
 
-The secret key of a host is a file named after it in `directory()`; its public key is
-`hosts.NAME.key` of the launch file.  For each host that runs here, the run's directory holds a file
-from which the host's processes read both.
+The secret key of a host is a file with its name in `directory()`. Its public key is
+`hosts.NAME.key` of the launch file. For each local host, a file in the run's directory contains
+both keys for the host's processes.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ def directory() -> Path:
 
 
 def secret_file(host: str) -> Path:
+    """Return the path of a host's secret key."""
     return directory() / f"{host}.secret"
 
 
@@ -55,7 +56,7 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 
 
 class KeyWatch:
-    """Detect changes of the keys in a launch file, and pass them to a run's processes."""
+    """Detector of changed keys in a launch file, which passes them to a run's processes."""
 
     def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
         self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings

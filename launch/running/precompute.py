@@ -23,7 +23,7 @@ REPORT_STEP_RATIO = 0.1
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
-    """The soft body of a scene cannot be computed; the text gives the reason and a remedy."""
+    """A soft body that cannot be computed; the text gives the reason and a remedy."""
 
     code = "no-soft-body"
     remedy = "Follow the remedy in the text; see docs/meshing.md and docs/soft-body.md."
@@ -50,9 +50,10 @@ def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal[
 def precompute_deflection_shapes(
     scene: Scene, cache_dir: Path | str | None, progress: Progress
 ) -> Path:
-    """Return the file with the deflection shapes of a scene's sheet, computed if it does not exist.
+    """Return the file with the deflection shapes of a scene's sheet; compute it if necessary.
 
-    Where the membrane has no equilibrium, that is reported, and the renderer uses four triangles.
+    If the membrane has no equilibrium, the reason is reported, and the renderer uses four
+    triangles.
     """
     folder = None if cache_dir is None else Path(cache_dir)
     try:
@@ -80,7 +81,7 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
 
 
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """Return the file with the table of a scene's sheet force, computed if it does not exist.
+    """Return the file with the table of a scene's sheet force; compute it if necessary.
 
     Raises NoEquilibriumError if the membrane has no equilibrium.
     """
@@ -98,10 +99,10 @@ def precompute_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """Return the file with the nonlinear table of a soft body, computed if it does not exist.
+    """Return the file with the nonlinear table of a soft body; compute it if necessary.
 
-    scheduler: as the parameter of the node fem_solver.  Raises NoSoftBodyError if the
-    scheduler cannot be used, the body cannot be meshed, or memory is insufficient.
+    scheduler: as the parameter of the node fem_solver. Raises NoSoftBodyError if the scheduler
+    cannot be used, the body cannot be meshed, or memory is insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table

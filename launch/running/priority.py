@@ -1,4 +1,4 @@
-"""Finds how far this user may raise the priority of processes."""
+"""Determine how far this user may raise the priority of processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CAP_SYS_NICE = 23
 
 
 def min_nice_step() -> int:
-    """Return the lowest niceness that a child may take, relative to this process."""
+    """Return the minimum niceness of a child process, relative to this process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # RLIMIT_NICE counts from 20 downwards: 25 allows -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
@@ -30,12 +30,12 @@ def _has_cap_sys_nice() -> bool:
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Describe which nodes cannot take the niceness of their launch file; None if all can."""
-    least = min_nice_step()
-    names = [node.name for node in nodes if node.nice < least]
+    """Describe which nodes cannot have their configured niceness; None if all can."""
+    minimum = min_nice_step()
+    names = [node.name for node in nodes if node.nice < minimum]
     if not names:
         return None
     return (
-        f"{', '.join(names)}: this user may not set nice below {least}, so these nodes run without "
-        "precedence; start as root or set `nice` in /etc/security/limits.conf"
+        f"{', '.join(names)}: this user may not set nice below {minimum}, so these nodes run "
+        "without precedence; start as root or set `nice` in /etc/security/limits.conf"
     )

@@ -1,8 +1,8 @@
-"""Manage the runs of graphs on this computer: their directories, and processes that they left.
+"""Manage the runs of graphs on this computer: their directories and orphaned processes.
 
-A run is named after its launcher's process: pid, start time and a count.  The name shows whether
-the launcher is alive; a process tagged with the run of an ended launcher is an orphan.
-The module imports little, because `flexsheet arms stop` finds the runs before all else.
+The name of a run consists of its launcher's pid, start time and a count. It shows whether the
+launcher is alive. A process with the tag of a run whose launcher has exited is an orphan. The
+module imports little, because `flexsheet arms stop` uses it first.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ _count = itertools.count(1)
 
 
 class RunDirectoryError(FlexsheetError, RuntimeError):
-    """The directory of runs cannot be used."""
+    """The directory of runs cannot be used; the text gives the reason."""
 
     code = "run-directory"
-    remedy = "Set `FLEXSHEET_RUNS` to a folder of your own."
+    remedy = "Set `FLEXSHEET_RUNS` to a folder that belongs to you."
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Identify a run and its directory of sockets, configurations, plan and logs."""
+    """A run and its directory of sockets, configurations, plan and logs."""
 
     id: str
     directory: Path
@@ -77,7 +77,7 @@ class Run:
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)
 
     def end(self) -> None:
-        """Remove the sockets and the launcher's marker; keep plan and logs for diagnosis."""
+        """Remove the sockets and the launcher's marker; the plan and the logs remain."""
         for entry in self.directory.iterdir():
             if stat.S_ISSOCK(entry.lstat().st_mode) or entry.name == _LAUNCHER_FILE:
                 entry.unlink(missing_ok=True)
@@ -106,12 +106,12 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs; short, as socket paths have at most 107 bytes."""
+    """Return the folder of this user's runs; socket paths have at most 107 bytes."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
 def create_run() -> Run:
-    """Create the directory of a new run of this process, which other users cannot read.
+    """Create the directory of a new run, which other users cannot read.
 
     Raises RunDirectoryError.
     """
@@ -120,12 +120,12 @@ def create_run() -> Run:
     status = directory.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         raise RunDirectoryError(
-            f"{directory} belongs to another user; set {ROOT_VARIABLE} to a directory of your own"
+            f"{directory}: belongs to another user; set {ROOT_VARIABLE} to a folder of this user"
         )
     directory.chmod(0o700)
     run_id = f"{os.getpid()}.{_start_ticks(os.getpid())}.{next(_count)}"
     run = Run(run_id, directory / run_id)
-    # It gets its name when it is complete, so that no other launcher removes it as a dead run.
+    # The final name is set last, so that no other launcher removes the run as dead.
     incomplete = Run(run_id, directory / f"{_INCOMPLETE_PREFIX}{run_id}")
     incomplete.directory.mkdir(mode=0o700)
     incomplete.logs.mkdir()
@@ -153,14 +153,14 @@ def live_runs() -> list[Run]:
 
 
 def launcher_is_alive(run_id: str) -> bool:
-    """Return whether the launcher of the run is alive, and not another process with its number."""
+    """Return whether the launcher of the run is alive; compare its pid and start time."""
     pid, _, rest = run_id.partition(".")
     start, _, _ = rest.partition(".")
     return pid.isdigit() and str(_start_ticks(int(pid))) == start
 
 
 def find_orphans() -> list[psutil.Process]:
-    """Return this user's processes that are tagged with the run of an ended launcher."""
+    """Return this user's processes that belong to the run of an exited launcher."""
     import psutil
 
     found = []

@@ -11,10 +11,10 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """Hold the kernel's counters of a process's main thread, in seconds.
+    """The kernel's counters of a process's main thread, in seconds.
 
-    run_s: time on a processor.  wait_s: time runnable without one, up to its last run.
-    state: letter of /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor. wait_s: time runnable without one, up to its last run. state: letter
+    of /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -38,10 +38,10 @@ class ProcessorTime:
 def compute_starved_s(
     before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float
 ) -> float:
-    """Return how long a process waited for a processor between two readings, at most `elapsed_s`.
+    """Return how long a process waited for a processor between two readings, s.
 
-    The kernel counts a wait only when it ends.  A process that is runnable now has therefore
-    waited whenever it did not run.
+    The result is at most `elapsed_s`. The kernel counts a wait only when it ends. A process that is
+    runnable now has therefore waited whenever it did not run.
     """
     if before is None or now is None:
         return 0.0

@@ -33,7 +33,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """Name the path on which an e-stop was sent."""
+    """Path on which an e-stop was sent."""
 
     LAUNCHER = "launcher"
     NODE = "node"
@@ -42,11 +42,11 @@ class StopPath(StrEnum):
 
 
 class StopOutcome(StrEnum):
-    """Name the outcome of an attempt.
+    """Outcome of an attempt to stop.
 
-    confirmed: the receiver has engaged the stop.  silent: it was sent and may be received later.
-    absent: no process listens.  published: sent on the topic, without an answer.  refused: another
-    tool uses the topic's endpoint.  killed: the process was killed.
+    confirmed: the receiver has engaged the stop. silent: it was sent, without confirmation. absent:
+    no process listens. published: sent on the topic, without confirmation. refused: another tool
+    uses the topic's endpoint. killed: the process was killed.
     """
 
     CONFIRMED = "confirmed"
@@ -59,7 +59,7 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """Record one attempt: path, receiver, outcome, and time since the first packet (ms)."""
+    """One attempt to stop: path, receiver, outcome, and time since the first packet (ms)."""
 
     path: StopPath
     receiver: str
@@ -83,8 +83,8 @@ class _Receiver:
 def send_early(arguments: Sequence[str]) -> None:
     """Send the stop of `flexsheet arms stop ARGUMENTS` before the command line is imported.
 
-    Nothing is sent with arguments that are not options of that command, which refuses them later.
-    `sent_early` holds the attempts for the command.
+    Nothing is sent for invalid arguments, which the command rejects later. `sent_early` stores the
+    attempts for the command.
     """
     options = {"--run": "", "--reason": DEFAULT_REASON}
     rest = [argument for argument in arguments if argument != "--json"]
@@ -99,16 +99,16 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""The attempts of `send_early`, at most one list of them."""
+"""Attempts of `send_early`, at most one list of them."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
     """Engage the e-stop in the runs with these directories, within `KILL_AFTER_S`."""
-    begun_s = time.monotonic()
+    started_s = time.monotonic()
     attempts: list[StopAttempt] = []
 
     def note(path: StopPath, receiver: str, outcome: StopOutcome) -> None:
-        after_ms = (time.monotonic() - begun_s) * 1e3
+        after_ms = (time.monotonic() - started_s) * 1e3
         attempts.append(StopAttempt(path, receiver, outcome, after_ms))
 
     request = (REQUEST + reason.encode())[:MAX_REQUEST_BYTES]
@@ -124,7 +124,7 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
             waiting.append(_Receiver(StopPath(kind), name, connection, process))
     try:
         for until_s, signalled in ((CONTINUE_AFTER_S, signal.SIGCONT), (KILL_AFTER_S, None)):
-            for receiver in _await_answers(waiting, begun_s + until_s):
+            for receiver in _await_answers(waiting, started_s + until_s):
                 note(receiver.path, receiver.name, StopOutcome.CONFIRMED)
             for receiver in waiting if signalled else ():
                 _send_signal(receiver.process, signalled or 0)
@@ -204,7 +204,7 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
 
 
 def _send_signal(process: int, number: int) -> bool:
-    """Return whether the signal was sent; process 0 is unknown on this computer."""
+    """Return whether the signal was sent; process 0 stands for an unknown process."""
     if process <= 0:
         return False
     try:

@@ -1,12 +1,12 @@
-"""Start the nodes of a graph, restart those that fail, and remove all traces at the end.
+"""Start the nodes of a graph, restart failed ones, and clean up at the end.
 
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
         ...
 
-Every node is a process in a session of its own.  It reports through a pipe that it is set up.  When
-it ends by itself, its restart policy decides.  To stop, each gets SIGINT, SIGTERM, then SIGKILL.
-No thread is used: exits arrive as readable pidfds, logs and readiness through pipes.
+Every node is a process in a separate session, and reports through a pipe that it is set up. When it
+exits, its restart policy applies. To stop, it gets SIGINT, SIGTERM, then SIGKILL. The launcher uses
+no threads: exits arrive as readable pidfds, logs and readiness through pipes.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ STACK_DUMP_S = 0.5
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
-"""Function of (node, line) for each line of log; the launcher's lines have the node "launch"."""
+"""Function of (node, line) for each line of log; for the launcher the node is "launch"."""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
-    """A node failed for good: it ended, or was not ready in time, more often than it may."""
+    """A node that exited or was late more often than its restart policy allows."""
 
     code = "node-failed"
     remedy = (
@@ -86,7 +86,7 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """Run a node's process once."""
+    """The process of a node, from its start to its exit."""
 
     def __init__(
         self,
@@ -144,9 +144,9 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Send a signal to the node and all processes that it started, unless it has ended."""
+        """Send a signal to the node and all processes that it started, unless it has exited."""
         if not self.exited.done():
-            # It is not reaped yet, so its process id is still its own.
+            # The process is not reaped yet, so its id cannot belong to another process.
             os.killpg(self.pid, number)
 
     def kill_now(self) -> None:
@@ -165,11 +165,12 @@ class Child:
             self._loop.remove_reader(self._ready_fd)
 
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
-        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own polling.
+        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own
+        polling.
 
-        Polls are counted instead of clock time: a launcher that was suspended or starved itself
-        has received no heartbeat either.  Time in which the process waited for a processor does
-        not count.  When only that time prevents the timeout, `on_starved` is called with it, once.
+        Polls are counted instead of clock time, because a suspended or starved launcher receives no
+        heartbeat either. Time in which the process waited for a processor does not count. When only
+        that time prevents the timeout, `on_starved` is called with it, once.
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -189,13 +190,13 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Let Python's fault handler write the stacks to the log, then kill the process."""
+        """Make Python's fault handler write the stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy a piece of output to the log and report its lines; return False at the end."""
+        """Copy available output to the log and report its lines; return False at the end."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -214,7 +215,7 @@ class Child:
             self._report(self._node, line.decode(errors="replace"))
 
     def _reap(self) -> None:
-        """Handle the end of the process: kill its children, read its last output, close pipes."""
+        """Handle the exit: kill child processes, read the last output, close pipes."""
         if self.exited.done():
             return
         if self._process.returncode is None:
@@ -234,10 +235,10 @@ class Child:
 
 
 class RunningGraph:
-    """Run the nodes of a graph as processes.
+    """The processes of a graph's nodes.
 
-    host: start only the nodes of this host; None starts all, on this computer.
-    report: called with (node, line) for every line of log; `run.logs` holds all lines, too.
+    host: start only the nodes of this host; None starts all on this computer. report: called with
+    (node, line) for every line of log; `run.logs` contains all lines, too.
     """
 
     def __init__(
@@ -325,7 +326,7 @@ class RunningGraph:
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
-        """Wait until every node has ended by itself.  Raises NodeFailedError."""
+        """Wait until every node has exited.  Raises NodeFailedError."""
         pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -369,7 +370,7 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        """End the nodes; those that only read come last, to receive the final messages."""
+        """End the nodes; nodes that only read end last, to receive the final messages."""
         readers = {
             node.name
             for node in self.nodes
@@ -384,7 +385,7 @@ class RunningGraph:
         swept = sweep()
         self._run = create_run()
         if swept:
-            self._report(LAUNCHER, f"ended {len(swept)} processes that ended launchers had left")
+            self._report(LAUNCHER, f"ended {len(swept)} processes of earlier launchers")
         _check_ports(self.plan, self._host)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
@@ -465,7 +466,7 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Distribute changes of the keys in the launch file and of this user's key files."""
+        """Pass changed keys of the launch file and of this user's key files to the processes."""
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -487,7 +488,7 @@ class RunningGraph:
                     self._agents[host].renew_keys(change)
 
     async def _supervise(self, node: ResolvedNode) -> None:
-        """Run the node and restart it as its policy says.  Raises NodeFailedError."""
+        """Run the node and restart it according to its policy.  Raises NodeFailedError."""
         policy = node.restart
         recent: deque[float] = deque()
         loop = asyncio.get_running_loop()
@@ -508,9 +509,7 @@ class RunningGraph:
                 )
             delay_s = min(policy.delay_s * 2 ** len(recent), policy.max_delay_s)
             recent.append(loop.time())
-            self._report(
-                LAUNCHER, f"{node.name} {problem or 'ended'}; starts again in {delay_s:g} s"
-            )
+            self._report(LAUNCHER, f"{node.name} {problem or 'ended'}; restarts in {delay_s:g} s")
             await asyncio.sleep(delay_s)
             self.restarts[node.name] += 1
 
@@ -537,11 +536,11 @@ class RunningGraph:
             return f"was not ready within {node.start_deadline_s:g} s"
         if hangs:
             self.hangs[node.name] += 1
-            return f"hung: no sign of life for {node.liveness_s:g} s; its log holds the stacks"
+            return f"hung: no heartbeat for {node.liveness_s:g} s; its log contains the stacks"
         return describe_exit(code)
 
     async def _detect_hang(self, child: Child, node: ResolvedNode) -> bool:
-        """Return True and end the process if it hangs; return False when it ends by itself."""
+        """Return True and end the process if it hangs; return False when it exits."""
         if node.liveness_s is None:
             return False
 
@@ -582,7 +581,7 @@ class RunningGraph:
         return child
 
     def _write_run_files(self) -> None:
-        """Write the files that a recorder attaches and by which tools find the graph."""
+        """Write the files for the recorder and for tools that find the graph."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -596,7 +595,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write the scenes that a node may publish, as JSON: those beside the graph's own."""
+        """Write the scenes beside the graph's own as JSON, for nodes that publish them."""
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
@@ -606,7 +605,7 @@ class RunningGraph:
                 self._report(LAUNCHER, f"scene {path.name} is skipped: {error}")
 
     def _fail(self, text: str) -> NodeFailedError:
-        self.failure = NodeFailedError(f"{text}; its log is {self.run.logs}")
+        self.failure = NodeFailedError(f"{text}; its log is in {self.run.logs}")
         self._report(LAUNCHER, text)
         return self.failure
 
@@ -700,7 +699,14 @@ def _fill_run(value: Any, run: Run) -> Any:
 def _check_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
         raise BadInputError(
-            [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
+            [
+                Problem(
+                    "--host",
+                    (),
+                    f'unknown host "{host}"',
+                    f"choose one of: {', '.join(plan.hosts)}",
+                )
+            ]
         )
     for name, address in plan.hosts.items():
         if not is_loopback(address) and not plan.keys:
@@ -708,7 +714,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
                 [
                     read_document(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
-                        f"{address} is beyond loopback, and the hosts have no keys",
+                        f"{address} is not loopback, and the hosts have no keys",
                         f"create a key on each host (flexsheet keys new {name}) and install all "
                         f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
                     )
@@ -717,22 +723,22 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Check that every TCP port on which this launcher's processes will listen is free."""
-    wanted = [
+    """Check that every TCP port on which this launcher's processes listen is free."""
+    needed = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
         for topic, writers in plan.writers.items()
         for writer in writers
         if writer.tcp is not None and host in (None, writer.host)
     ]
-    wanted += [(node, "127.0.0.1", str(port)) for node, port in plan.listening_nodes(host)]
+    needed += [(node, "127.0.0.1", str(port)) for node, port in plan.listening_nodes(host)]
     problems = [
         Problem(
             plan.launch_file,
             (),
             f"port {port} of {address}, for {what}, is in use",
-            "end the other graph or program, or choose another port: --set NODE.PARAMETER=PORT",
+            "stop the other program, or choose another port: --set NODE.PARAMETER=PORT",
         )
-        for what, address, port in wanted
+        for what, address, port in needed
         if not is_free(address.strip("[]"), int(port))
     ]
     if problems:

@@ -17,7 +17,7 @@ TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
 SOFTWARE = Path(__file__).resolve().parents[2]
 STATE_FOLDER = Path("/var/lib/flexsheet")
-"""The only folder that the service may write to."""
+"""The only folder to which the service can write."""
 SOCKET_VARIABLE, WATCHDOG_VARIABLE = "NOTIFY_SOCKET", "WATCHDOG_USEC"
 
 
@@ -30,7 +30,7 @@ def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class SystemFile:
-    """Hold a file to write: path, text and mode."""
+    """A file to write: path, text and mode."""
 
     path: Path
     text: str
@@ -63,7 +63,7 @@ def make_files(
 
 
 def notify_systemd(text: str) -> None:
-    """Send a line of sd_notify(3); do nothing unless systemd asks for it."""
+    """Send a line of sd_notify(3); do nothing if systemd did not request it."""
     address = os.environ.get(SOCKET_VARIABLE)
     if not address:
         return

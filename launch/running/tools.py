@@ -1,7 +1,7 @@
-"""Read topics of a running graph, and write to it, from tools on any of its hosts.
+"""Read and write topics of a running graph from tools on any of its hosts.
 
-Tools are writers of every graph.  On the main host they write the topics that no node writes; on
-other hosts they write e-stops only.  They use the keys of their host.
+On the main host, tools write the topics that no node writes. On other hosts they write e-stops
+only. They use the keys of their host.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Exceeds the half second after which readers look for a missing writer again."""
+"""Time after which readers have connected; they retry every half second."""
 
 
 @dataclass(slots=True)
 class ToolCounts:
-    """Count the messages that a tool's subscriber lost or refused."""
+    """Counts of the messages that a tool's subscriber lost or refused."""
 
     dropped: int = 0
     gaps: int = 0
@@ -39,7 +39,7 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the host whose tools this process belongs to."""
+    """Return the host to whose tools this process belongs."""
     return run.host or MAIN
 
 
@@ -62,18 +62,18 @@ def make_subscriber(
     on_problem: Problem,
     unopened: bool = False,
 ) -> Subscriber:
-    """Make a subscriber to all writers of a topic in a running graph, not started yet."""
-    wanted = topic_named(topic)
+    """Make a subscriber to all writers of a topic in a running graph, without starting it."""
+    definition = topic_named(topic)
     return Subscriber(
-        wanted,
+        definition,
         local_sources(run, plan.sources_to_read(topic, tools_host(run))),
         on_message,
         ToolCounts(),
         on_problem=on_problem,
         unopened=unopened,
         keys=load_tool_keys(plan, run),
-        # Nodes and hosts of another plan must be reported, too.
-        plan=None if wanted.message in (Status, HostStatus) else plan.hash,
+        # The states of nodes and hosts with another plan are read, too, to report them.
+        plan=None if definition.message in (Status, HostStatus) else plan.hash,
     )
 
 
@@ -105,9 +105,9 @@ async def read_topic(
 
 
 class GraphWriter:
-    """Publish topics of a running graph from outside; needs a running event loop.
+    """Writer of topics of a running graph from outside; needs a running event loop.
 
-    Raises BadInputError for a topic that a node writes, BusError if another tool writes it now.
+    Raises BadInputError for a topic that a node writes, BusError if another tool is writing it.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:

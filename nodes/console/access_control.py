@@ -1,8 +1,8 @@
 """Control access to the page: loopback by default, a token elsewhere, and no foreign web pages.
 
-A page of another site, open in somebody's browser, can connect to sockets on that computer. A
-loopback address alone therefore protects nothing: the Host and Origin of every request are checked.
-No page may show the console in a frame, where a click could be led to an unseen button.
+A page of another site in a browser on this computer can connect to its sockets. A loopback address
+alone is therefore no protection: the Host and Origin of every request are checked. No page may show
+the console in a frame, because a frame can hide what the user clicks.
 """
 
 from __future__ import annotations
@@ -38,30 +38,33 @@ FRAMING_HEADERS = {
     "X-Frame-Options": "DENY",
     "Content-Security-Policy": "frame-ancestors 'none'",
 }
-"""Headers of every answer."""
+"""Headers of every response."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
-"""Values of Sec-Fetch-Dest with which a browser requests a page to show it inside another one."""
+"""Values of Sec-Fetch-Dest in requests for a page inside another one."""
 
 SINGLE_HEADERS = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Cookie", "Sec-Fetch-Dest")
-"""Headers that are read; a request that repeats one of them is malformed."""
+"""Headers that are read; a request with a repeated one is malformed."""
 
 MALFORMED = "the console cannot read this HTTP request; open its address in a browser"
 CLOSE_TIMEOUT_S = 1.0
-"""Time that a client has to read why its request was refused."""
+"""Time for a client to read why its request was refused."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """Report that the page cannot be served, why, and what to do."""
+    """A page that cannot be served; the text gives the reason and the remedy."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
 
 
 def read_token(path: Path) -> str:
-    """Read a token file: one line, readable by its owner alone; ConsoleError otherwise."""
+    """Read a token file: one line that only its owner can read.
+
+    Raises ConsoleError.
+    """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -70,16 +73,17 @@ def read_token(path: Path) -> str:
         raise ConsoleError(f"token_file {path}: other users can read it; run chmod 600 {path}")
     if len(text) < MIN_TOKEN_LENGTH or not (text.isascii() and text.isalnum()):
         raise ConsoleError(
-            f"token_file {path}: needs {MIN_TOKEN_LENGTH} or more letters and digits; make one with"
-            f" python3 -c 'import secrets; print(secrets.token_hex(16))' > {path}"
+            f"token_file {path}: expected at least {MIN_TOKEN_LENGTH} letters and digits; create "
+            f"it with python3 -c 'import secrets; print(secrets.token_hex(16))' > {path}"
         )
     return text
 
 
 class AccessControl:
-    """Check each request for the page or its socket.
+    """Access control of the requests for the page and its socket.
 
-    address: IP address at which the page is served. token: None lets everybody on this computer in.
+    address: IP address of the page. token: required token; None permits every user of this
+    computer.
     """
 
     def __init__(self, address: str, token: str | None) -> None:
@@ -91,14 +95,17 @@ class AccessControl:
         self._token = token
 
     def refusal(self, request: Request) -> Response | None:
-        """Return the answer to send instead of the page; None for a permitted request."""
+        """Return the response that refuses a request; None for a permitted request."""
         try:
             return self._refusal(request)
         except (ValueError, MultipleValuesError):
             return bad_request()
 
     def _refusal(self, request: Request) -> Response | None:
-        """Return as `refusal`; ValueError or MultipleValuesError for a malformed request."""
+        """Check a request as `refusal` does.
+
+        Raises ValueError or MultipleValuesError for a malformed request.
+        """
         repeated = [name for name in SINGLE_HEADERS if len(request.headers.get_all(name)) > 1]
         if repeated or "Host" not in request.headers:
             return bad_request()
@@ -108,16 +115,16 @@ class AccessControl:
         if not _names_an_address(host):
             return _page(
                 http.HTTPStatus.FORBIDDEN,
-                f"the console does not answer to the name {host!r}; use its IP address",
+                f"the console cannot be opened as {host!r}; use its IP address",
             )
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
-            return _page(http.HTTPStatus.FORBIDDEN, "another site's page may not use the console")
+            return _page(http.HTTPStatus.FORBIDDEN, "pages of other sites may not use the console")
         if self._token is None:
             return None
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
         if hmac.compare_digest(given.encode(), self._token.encode()):
-            # A cookie, so that the token does not stay in the address line and in bookmarks.
+            # The cookie keeps the token out of the address line and of bookmarks.
             to_page = {
                 "Location": "/",
                 "Set-Cookie": f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/",
@@ -133,7 +140,7 @@ class AccessControl:
 
 
 def _names_an_address(host: str) -> bool:
-    """Return whether a Host header is an IP address or localhost: any site can own a name."""
+    """Return whether a Host header is an IP address or localhost; other names can be forged."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
         return name == "localhost" or bool(ipaddress.ip_address(name))
@@ -143,13 +150,14 @@ def _names_an_address(host: str) -> bool:
 
 def _cookie(request: Request) -> str:
     try:
-        held = SimpleCookie(request.headers.get("Cookie", "")).get(COOKIE)
+        cookie = SimpleCookie(request.headers.get("Cookie", "")).get(COOKIE)
     except CookieError:
         return ""
-    return "" if held is None else held.value
+    return "" if cookie is None else cookie.value
 
 
 def bad_request() -> Response:
+    """Return the response to a malformed request."""
     return _page(http.HTTPStatus.BAD_REQUEST, MALFORMED)
 
 
@@ -172,7 +180,7 @@ def _page(status: http.HTTPStatus, text: str, more: dict[str, str] | None = None
 
 
 def forbid_framing(response: Response) -> Response:
-    """Add the headers that keep a browser from showing the answer in a frame."""
+    """Add the headers that prevent a browser from showing the response in a frame."""
     response.headers.update(FRAMING_HEADERS)
     return response
 
@@ -189,7 +197,9 @@ def page_logger() -> logging.Logger:
 
 
 def shorten_traceback(record: logging.LogRecord) -> bool:
-    """Replace a record's traceback by its last line."""
+    """Replace a record's traceback by its last line; return True, so that the record is
+    logged.
+    """
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
         record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
@@ -198,12 +208,14 @@ def shorten_traceback(record: logging.LogRecord) -> bool:
 
 
 class PageConnection(ServerConnection):
-    """Answer malformed HTTP with status 400, where websockets logs a traceback."""
+    """Connection that answers malformed HTTP with status 400, where websockets logs a
+    traceback.
+    """
 
     refused = False
 
     def send_data(self) -> None:
-        """Send the data of the protocol; to a malformed request first the refusal."""
+        """Send the data of the protocol; send a refusal first after a malformed request."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
@@ -220,11 +232,11 @@ class PageConnection(ServerConnection):
 
 
 def start_server(address: str, port: int, access: AccessControl, label: str) -> viser.ViserServer:
-    """Start a viser server at exactly this address, with access control; ConsoleError.
+    """Start a viser server at exactly this address, with access control.
 
-    viser takes the next free port if the given one is in use, and accepts every client. The port is
-    therefore tried first, and the access control runs before viser's own request handler. It is
-    installed where viser starts to listen. A viser that starts to listen elsewhere is not served.
+    viser uses the next free port if the requested one is in use, and accepts every client. The port
+    is therefore tried first, and the access control runs before viser's own request handler. Raises
+    ConsoleError, also if this version of viser listens in another way.
     """
     _check_port_is_free(address, port)
     with _checking(access) as checked_servers:
@@ -243,27 +255,27 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
 
 @contextmanager
 def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
-    """Let new servers of websockets check each request with `access` first.
+    """Make new servers of websockets check each request with `access` first.
 
-    Yields the list of the request handlers that were replaced.
+    Yield the list of the replaced request handlers.
     """
     serve = websockets.asyncio.server.serve
     checked_servers: list[PageRequest] = []
 
-    def answer(ask_viser: PageRequest, connection: Any, request: Request) -> Response | None:
-        answered = access.refusal(request)
-        if answered is None:
+    def respond(viser_handler: PageRequest, connection: Any, request: Request) -> Response | None:
+        response = access.refusal(request)
+        if response is None:
             try:
-                answered = ask_viser(connection, request)
-            except (OSError, ValueError):  # a path that no file system takes
-                answered = bad_request()
-        return None if answered is None else forbid_framing(inject_assets(answered))
+                response = viser_handler(connection, request)
+            except (OSError, ValueError):  # a path that is invalid in the file system
+                response = bad_request()
+        return None if response is None else forbid_framing(inject_assets(response))
 
     def serve_checked(*arguments: Any, process_request: PageRequest, **rest: Any) -> Any:
         checked_servers.append(process_request)
         return serve(
             *arguments,
-            process_request=partial(answer, process_request),
+            process_request=partial(respond, process_request),
             create_connection=PageConnection,
             logger=page_logger(),
             **rest,
@@ -288,6 +300,6 @@ def _check_port_is_free(address: str, port: int) -> None:
 
 def _port_in_use_text(address: str, port: int) -> str:
     return (
-        f"page_port {port} of {address} is in use, perhaps by another console; "
+        f"page_port {port} of {address} is in use; "
         "choose another port with --set console.page_port=PORT"
     )

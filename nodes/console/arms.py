@@ -1,8 +1,8 @@
-"""Describe the drawn arms: boxes per link, and the poses of the links.
+"""Define the drawn arms: boxes per link, and the poses of the links.
 
 The lengths are those of the RV-1A: base to shoulder, upper arm, elbow, forearm, flange. The
-thicknesses are drawn, not measured. The origin of a link's frame lies on its joint axis. With all
-joints at zero every frame is parallel to the base.
+thicknesses are approximate. The origin of a link's frame is on its joint axis. With all joints at
+zero every frame is parallel to the base.
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ JOINTS = (
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Describe a box of a link: its size and centre (m) in the frame of the link; link 0 is the
-    base.
-    """
+    """A box of a link: size and centre (m) in the frame of the link; link 0 is the base."""
 
     link: int
     size_m: tuple[float, float, float]
@@ -56,7 +54,7 @@ CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 """Corners of a box, (8, 3): x is bit 4 of the index, y bit 2, z bit 1."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""Size of the bar that holds the sheet: across, along the edge (over its length), through."""
+"""Size of the bar that clamps the sheet: across, along the edge (over its length), through."""
 
 
 def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:

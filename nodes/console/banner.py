@@ -1,4 +1,4 @@
-"""Render the banner: the state of the arms, what to do about it, and what is shown."""
+"""Render the banner: the state of the arms, the remedy, and the source of the view."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from enum import IntEnum
 from html import escape
 
 from flexsheet.messages.types import ArmMode, ArmState, SheetReason, SheetTarget
-from flexsheet.nodes.console.panels import MODES, words
+from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
 class BannerState(IntEnum):
-    """Name the states of the banner, the most urgent last."""
+    """States of the banner, the most urgent last."""
 
     READY = 0
     WAITING = 1
@@ -38,14 +38,14 @@ SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "fingertip_too_old": "the fingertip is too old",
     "fingertip_in_future": "the fingertip is stamped in the future",
     "implausible_input": "the finger is too far away or too fast",
-    "ambiguous_side": "the finger is inside the object, on no definite side",
+    "ambiguous_side": "the finger is inside the object, and its side is unclear",
     "through_object": "the finger has passed through the object",
     "past_object_edge": "the finger is past the object's edge",
     "beyond_tilt": "the finger is beyond the tilt of the sheet",
     "beyond_spin": "the sheet has rotated too far about its normal; lift the finger",
     "past_sheet_width": "the finger is past the sheet's usable width",
     "past_sheet_height": "the finger is past the sheet's usable height",
-    "concave_contact": "the object is concave there, and the flat sheet rests on the rim",
+    "concave_contact": "the object is concave there, and the flat sheet touches its rim",
 }
 
 STILL_STOPPED = "the arms are still stopped"
@@ -53,11 +53,11 @@ STILL_STOPPED = "the arms are still stopped"
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """Hold the inputs of the banner.
+    """Inputs of the banner.
 
     arms: by side. estop_reason: None without an e-stop. overload: sentence about an overloaded
-    computer, else empty. solver_note: note of the soft body's solver while it has not answered for
-    this scene. replay: name of the shown bag.
+    computer, or empty. solver_note: note of the soft body's solver while it has no result for this
+    scene. replay: name of the displayed bag.
     """
 
     scene: str
@@ -70,14 +70,14 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """Return the reason of an engaged e-stop, as far as the console knows it."""
+        """Return the reason of an engaged e-stop; None without an e-stop."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason
 
     @property
     def banner(self) -> BannerState:
-        """Return the most urgent present state."""
+        """Return the most urgent current state."""
         if self.stopped is not None:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
@@ -90,7 +90,7 @@ class GraphState:
 
     @property
     def resettable(self) -> bool:
-        """Return whether a reset would clear something."""
+        """Return whether there is an e-stop or a fault to reset."""
         return self.stopped is not None or any(arm.faults for arm in self.arms.values())
 
 
@@ -107,7 +107,7 @@ def render(state: GraphState) -> str:
     if forces:
         sentences.append(f"The edge force is {max(forces):.1f} N.")
     if state.solver_note:
-        sentences.append(f"No object is shown yet, its solver reports: {state.solver_note}.")
+        sentences.append(f"The object is not shown yet. Its solver reports: {state.solver_note}.")
     scene = f"<b>{escape(state.scene)}</b>"
     source = f"Scene {scene}, live."
     if state.replay is not None:
@@ -120,7 +120,7 @@ def render(state: GraphState) -> str:
         '<div class="fs-state" tabindex="0" role="group" aria-label="State of the arms">'
         f'<div role="status" aria-live="polite" data-state="{shown.name.lower()}" '
         f'class="fs-banner fs-ground-{GROUNDS[shown]}">{escape(_title(state, shown))}</div>'
-        f"{words(text)}</div>"
+        f"{make_paragraph(text)}</div>"
     )
 
 
@@ -149,10 +149,10 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """Return what a person can do; empty if there is nothing to do."""
+    """Return what the user can do; empty if nothing is necessary."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
-        return f"Release the stop once the arms rest; {_after_reset(state)}."
+        return f"Release the stop when the arms are at rest; {_after_reset(state)}."
     if shown is BannerState.FAULT:
         if any(arm.path_blocked and not arm.faults for arm in arms):
             return (
@@ -162,23 +162,23 @@ def _remedy(state: GraphState, shown: BannerState) -> str:
         if all(arm.mode == "disconnected" for arm in arms if is_faulty(arm)):
             return "Check the power and the cable of the arm; it reconnects automatically."
         return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
-    if shown is BannerState.WAITING and any(_awaits_person(arm) for arm in arms):
-        return "The arms stay where they are until: flexsheet arms enable."
+    if shown is BannerState.WAITING and any(_awaits_user(arm) for arm in arms):
+        return "The arms stay at rest until: flexsheet arms enable."
     return ""
 
 
-def _awaits_person(arm: ArmState) -> bool:
+def _awaits_user(arm: ArmState) -> bool:
     return not arm.ready and not arm.auto_arming
 
 
 def _after_reset(state: GraphState) -> str:
     if state.arms and all(arm.auto_arming for arm in state.arms.values()):
-        return "the arms then move at once"
-    return "the arms then stay where they are until: flexsheet arms enable"
+        return "the arms then move immediately"
+    return "the arms then stay at rest until: flexsheet arms enable"
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:
-    """Why arms without a fault do not follow, or what the sheet does."""
+    """Return why arms without a fault do not follow, or the state of the sheet."""
     if shown is BannerState.ESTOP:
         return ""
     for side, arm in state.arms.items():

@@ -34,13 +34,13 @@ SETTLE_S = 0.4
 EYE_VIEW_PERIOD_S = 6.0
 PIXELS_EVERY = 3
 MAX_DRAWING_S = 5.0
-"""The renderer draws many frames in this time, or none."""
+"""Time after which the console stops waiting for a frame."""
 
 CAPTURE_S = 1.0
 """Time after a frame within which the simulated eye has all its inputs."""
 
 MAX_TRACING_S = 120.0
-"""Time after which an image is given up."""
+"""Time after which the console stops waiting for an image."""
 
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
@@ -49,7 +49,7 @@ MAX_LABELS = 64
 
 @dataclass(frozen=True, slots=True)
 class Sliders:
-    """Hold the values of the page's sliders."""
+    """Values of the page's sliders."""
 
     young_modulus_pa: float
     stretch_ratio: float
@@ -57,6 +57,7 @@ class Sliders:
 
     @staticmethod
     def from_scene(scene: Scene) -> Sliders:
+        """Return the slider values of an unchanged scene."""
         return Sliders(
             scene.object.material.young_modulus_pa,
             max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
@@ -65,7 +66,7 @@ class Sliders:
 
 
 class SceneController:
-    """Control the scene that the graph uses: choose it, and change it by the sliders."""
+    """Controller of the graph's scene: selects it, and changes it by the sliders."""
 
     def __init__(
         self,
@@ -74,7 +75,10 @@ class SceneController:
         first: Scene,
         sliders: Sliders | None = None,
     ) -> None:
-        """Start with `first`. sliders: values of the last console; None: nobody has moved them."""
+        """Start with the scene `first`.
+
+        sliders: values of the previous console; None if nobody has moved them.
+        """
         self._publish, self._folder = publish, folder
         self.names = scenes.scene_names(folder)
         self.base, self.moved = first, sliders is not None
@@ -84,13 +88,13 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another of the run's scenes; SceneChoiceError."""
+        """Change to another of the run's scenes.  Raises SceneChoiceError."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store the value of a slider; `apply_sliders` publishes the scene once it rests."""
+        """Store a slider's value; `apply_sliders` publishes the scene when the sliders rest."""
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
@@ -114,11 +118,11 @@ class SceneController:
         self._publish(scene)
 
     def publish_current(self) -> None:
-        """Publish the scene in use again."""
+        """Publish the current scene again."""
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Make the picker of the present object in a thread, and give it to the finger."""
+        """Make the picker of the current object in a thread, and pass it to the finger."""
         if self._picker_task is not None:
             self._picker_task.cancel()
         finger.use(None)
@@ -139,7 +143,7 @@ class SceneController:
 
 
 class EyeViewState(Enum):
-    """Name what the next image of the user's eye waits for."""
+    """State of a request for an image of the user's eye."""
 
     RESTING = auto()
     DRAWING = auto()
@@ -147,18 +151,17 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """Request images of the user's eye: frames with pixels, which the simulated eye traces.
+    """Requester of images of the user's eye: frames with pixels, which the simulated eye traces.
 
-    Tracing takes one second of processor time, and much longer on a busy computer. No other image
-    is requested meanwhile. The display settings of another writer are restored as soon as the eye
-    has its inputs. Without such settings, the correction of the scene or of the console is
-    restored.
+    Tracing needs one second of processor time, and longer on a busy computer. Only one image is
+    requested at a time. When the eye has its inputs, the display settings of another writer are
+    restored. Without them, the correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
-        self.wanted = False
-        self.picked: Correction | Literal["auto"] = "auto"
+        self.enabled = False
+        self.chosen_correction: Correction | Literal["auto"] = "auto"
         self.state = EyeViewState.RESTING
         self._by_scene = scene.methods.correction
         self._owns_display = self._borrowed = False
@@ -169,16 +172,16 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Label of the newest request."""
+        """Return the label of the newest request."""
         return f"console {self._number}"
 
     @property
     def correction(self) -> Correction:
-        """Return the correction that was chosen at the console, else that of the scene."""
-        return chosen(self.picked, self._by_scene, "two_pass")
+        """Return the correction chosen at the console, or that of the scene."""
+        return chosen(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
-        """Return how long the present state has lasted."""
+        """Return the duration of the current state, s."""
         return now_s - self._since_s
 
     def on_scene(self, scene: Scene) -> None:
@@ -196,11 +199,11 @@ class EyeViewRequester:
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
-        """Request the next image if it is due, and give up one that takes too long."""
+        """Request the next image if it is due, and end a request that takes too long."""
         waited_s = self.waited_s(now_s)
         match self.state:
             case EyeViewState.RESTING:
-                if self.wanted and now_s >= self._next_s:
+                if self.enabled and now_s >= self._next_s:
                     self._request(now_s)
             case EyeViewState.DRAWING:
                 if waited_s > MAX_DRAWING_S:
@@ -231,12 +234,12 @@ class EyeViewRequester:
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Note the first frame with the requested pixels; the eye traces it."""
+        """Process the first frame with the requested pixels, which the eye traces."""
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Note an image, and return whether this console requested it, however late."""
+        """Process an image; return whether this console requested it, however late it is."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -257,7 +260,7 @@ class EyeViewRequester:
 
 
 class Replay:
-    """Show a bag in place of the running graph; none of its messages is published."""
+    """Display of a bag instead of the running graph; none of its messages is published."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -266,10 +269,11 @@ class Replay:
         self.rate = 1.0
 
     def bags(self) -> list[str]:
+        """Return the names of the bags in the folder, the newest first."""
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Show a bag of the folder from its beginning; BagError."""
+        """Show a bag of the folder from its start.  Raises BagError."""
         self.timeline = Timeline(self._folder / name)
         self.playing = True
 
@@ -283,13 +287,13 @@ class Replay:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
     def play_or_pause(self) -> None:
-        """Pause, or play from the present position; at the end, from the beginning."""
+        """Pause, or play from the current position; at the end, play from the start."""
         if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
             self.seek(0.0)
         self.playing = not self.playing
 
     def advance(self, duration_s: float) -> None:
-        """Play on by this time (s); stop at the end."""
+        """Play for this time (s); stop at the end."""
         if self.timeline is None or not self.playing:
             return
         self.seek(self.timeline.seconds + self.rate * duration_s)
@@ -299,7 +303,7 @@ class Replay:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleFiles:
-    """Name the files of a console: the run's plan and scenes, the bags, and its state."""
+    """Files of a console: the run's plan and scenes, the bags, and its state."""
 
     plan: Path
     scenes: Path
@@ -308,7 +312,7 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """Report that this console's host may not reset an e-stop, and which hosts may."""
+    """This console's host may not reset an e-stop; the text names the hosts that may."""
 
     code = "release"
     remedy = (
@@ -318,10 +322,10 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """Combine the controllers, and publish e-stops, recordings and bookmarks.
+    """Combination of the controllers, which also publishes e-stops, recordings and bookmarks.
 
     A restarted console continues with the scene, the sliders and the recording of its run. warn:
-    called with the reason if it cannot.
+    called with the reason if it cannot continue.
     """
 
     def __init__(
@@ -335,8 +339,8 @@ class ConsoleController:
         self._files, self.facts = files, facts or GraphFacts()
         state = load_first_state(files, warn)
         self.recording, sliders = state.recording, state.sliders
-        given = None if sliders is None else Sliders(*sliders)
-        self.scenes = SceneController(self._send_scene, files.scenes, state.base, given)
+        previous = None if sliders is None else Sliders(*sliders)
+        self.scenes = SceneController(self._send_scene, files.scenes, state.base, previous)
         self.finger = finger
         if state.finger is not None:
             finger.restore(state.finger)
@@ -352,6 +356,7 @@ class ConsoleController:
             self._publish(Recording(running=True))
 
     def stop(self, reason: str) -> None:
+        """Engage the e-stop."""
         self.stopped = reason
         self._publish(EStop(engaged=True, reason=reason))
 
@@ -366,6 +371,7 @@ class ConsoleController:
         self._publish(EStop(engaged=False, reason="reset at the console"))
 
     def record(self, running: bool) -> None:
+        """Start or stop recording."""
         self.recording = running
         self._publish(Recording(running=running))
         self.save_state()
@@ -382,7 +388,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Store what a restarted console continues with."""
+        """Store the state with which a restarted console continues."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
@@ -394,7 +400,7 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Return the state of the console before this one, else the first scene alone."""
+    """Return the state of the previous console; without one, a state with the first scene."""
     try:
         state = load_state(files.state)
     except scenes.SceneChoiceError as error:

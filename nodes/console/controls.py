@@ -14,15 +14,14 @@ Request = Callable[..., None]
 
 
 def make_callback(request: Request, name: str, *values: Any) -> Callable[[Any], None]:
-    """Return a callback that makes this request."""
+    """Return a callback that makes the request `name`."""
     return lambda event: request(name, *values)
 
 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
-    """Call `changed` with each value that a viewer sets, not with values set by the page.
+    """Call `changed` with each value that a viewer sets, but not with values of the page.
 
-    The callback is a coroutine on viser's loop, so that the values arrive in the order of the
-    changes.
+    The callback is a coroutine on viser's loop, so that values arrive in order.
     """
 
     async def on_update(event: Any) -> None:
@@ -39,7 +38,7 @@ def show_value(handle: Any, value: Any) -> None:
 
 
 class Html:
-    """Show a piece of HTML on the page; send it only when it has changed."""
+    """A piece of HTML on the page, sent only when it changes."""
 
     def __init__(self, gui: Any, html: str = "") -> None:
         self._handle, self._shown = gui.add_html(html), html

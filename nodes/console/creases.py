@@ -13,10 +13,10 @@ CREASE_RAD = 0.7
 
 
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
-    """Give the triangles on both sides of a sharp edge vertices of their own.
+    """Duplicate the vertices of sharp edges, so that each side has separate vertices.
 
-    vertices (n, 3), triangles (t, 3).  Return the index (k,) of the vertex that each of k >= n
-    vertices is a copy of, and triangles (t, 3) of the copies.
+    vertices (n, 3), triangles (t, 3). Return the source vertex (k,) of each of the k >= n new
+    vertices, and the triangles (t, 3) of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

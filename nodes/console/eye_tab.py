@@ -19,16 +19,16 @@ IMAGES = (
 
 
 class EyeTab:
-    """Show each image once it exists."""
+    """Tab with the images of the user's eye; an image is visible once it exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(
-            "Render images", False, hint="One every six seconds: each costs the graph some work"
+            "Render images", False, hint="One image every six seconds; each one loads the graph"
         )
         self._correction = gui.add_dropdown(
             "Correction",
             CORRECTIONS,
-            hint="Corrects the tilt and the deflection of the sheet; the best one first",
+            hint="Correction of the sheet's tilt and deflection; the best one is first",
         )
         on_value(self._enabled, lambda on: request("eye_view", on))
         on_value(self._correction, lambda name: request("correct", name))
@@ -40,7 +40,7 @@ class EyeTab:
         }
 
     def show_correction(self, correction: Correction) -> None:
-        """Show the correction that the scene or a viewer chose."""
+        """Show the correction of the scene or of the viewer."""
         self._correction.value = correction
 
     def show_text(self, html: str) -> None:

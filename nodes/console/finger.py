@@ -16,15 +16,15 @@ Floats = NDArray[np.float64]
 
 LABEL = "console"
 FRONT_M = 1.5
-"""Distance from the screen at which a ray from the front begins."""
+"""Distance from the screen at which a ray from the front starts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """Hold a ray of the world frame; its first point on the object is a position on the surface.
+    """Ray in the world frame, which selects the first point on the object that it meets.
 
-    origin_m (3,), direction (3,) of any length. ValueError for values that are not finite, and for
-    a direction of length 0.
+    origin_m (3,), direction (3,) of any length. Raises ValueError for values that are not finite,
+    and for a direction of length 0.
     """
 
     origin_m: tuple[float, float, float]
@@ -39,21 +39,21 @@ class Ray:
 
     @property
     def is_from_front(self) -> bool:
-        """Return whether the ray goes straight away from the user."""
+        """Return whether the ray is along the negative z axis."""
         return self.direction[:2] == (0.0, 0.0) and self.direction[2] < 0.0
 
     @classmethod
     def from_front(cls, x_m: float, y_m: float) -> Ray:
-        """Return the ray straight from the front through (x, y)."""
+        """Return the ray along the negative z axis through (x, y)."""
         return cls((x_m, y_m, FRONT_M), (0.0, 0.0, -1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class FingerIntent:
-    """Hold the requested position of the finger.
+    """Requested position of the finger.
 
-    position: on the surface of any object. depth_m: below it, unless lifted. lifted: the finger
-    waits above the position. ValueError for an invalid depth.
+    position: ray to a point on any object. depth_m: depth below the surface, unless lifted. lifted:
+    the finger hovers above the position. Raises ValueError for an invalid depth.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))
@@ -71,10 +71,10 @@ class FingerIntent:
 
 
 class FingerController:
-    """Move the simulated finger to the requested position at a limited speed.
+    """Controller that moves the simulated finger to the requested position at a limited speed.
 
-    Each step is a path of one point. Nothing is published before the first command: until then
-    other writers control the finger.
+    Each step is a path of one point. Nothing is published before the first command, so that other
+    writers can control the finger.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
@@ -88,12 +88,12 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Apply the request to another object; None: its shape is not known yet."""
+        """Apply the request to another object; None while its shape is unknown."""
         self._picker = picker
         self._update_target()
 
     def restore(self, intent: FingerIntent) -> None:
-        """Continue with the request of the console before this one."""
+        """Continue with the request of the previous console."""
         self.intent, self._commanded = intent, True
         self._update_target()
 
@@ -104,16 +104,16 @@ class FingerController:
 
     @property
     def position_m(self) -> tuple[float, float]:
-        """Return the requested position (x, y), seen from the front."""
+        """Return the requested position (x, y) as viewed from the front."""
         return self._position_m
 
     def touch(self, origin: Floats, direction: Floats) -> None:
-        """Push where a ray from the viewer's eye meets the object."""
+        """Push at the point where a ray from the viewer's eye meets the object."""
         position = Ray(tuple(map(float, origin)), tuple(map(float, direction)))  # type: ignore[arg-type]  # three each
         self._request(position=position, lifted=False)
 
     def place(self, x_m: float, y_m: float) -> None:
-        """Move to (x, y), seen from the front, lifted or pushing as before."""
+        """Move to (x, y) as viewed from the front; stay lifted or pushing."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
@@ -121,7 +121,7 @@ class FingerController:
         self._request(depth_m=depth_m, lifted=False)
 
     def lift(self) -> None:
-        """Wait above the position."""
+        """Lift the finger above the position."""
         self._request(lifted=True)
 
     def lift_or_lower(self) -> None:
@@ -134,7 +134,7 @@ class FingerController:
         self._update_target()
 
     def _update_target(self) -> None:
-        """Compute the target from request and object, if both are known."""
+        """Compute the target, if the request and the object exist."""
         self._target, self._arrived = None, False
         position = self.intent.position
         if position.is_from_front:
@@ -144,14 +144,14 @@ class FingerController:
             if not position.is_from_front:
                 self._position_m = float(target[0]), float(target[1])
 
-    def advance(self, duration_s: float, seen: Floats | None) -> bool:
-        """Publish the next step, if there is one; return whether it was the last.
+    def advance(self, duration_s: float, measured: Floats | None) -> bool:
+        """Publish the next step, if any; return whether it was the last.
 
-        seen: the measured position of the finger (3,), None: unknown.
+        measured: measured position of the finger (3,); None if unknown.
         """
         if self._target is None or self._picker is None or self._arrived:
-            if seen is not None:
-                self._last_point = seen
+            if measured is not None:
+                self._last_point = measured
             return False
         max_step_m = self._speed_m_per_s * duration_s
         depth_m = 0.0 if self.intent.lifted else self.intent.depth_m

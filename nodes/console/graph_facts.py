@@ -1,4 +1,4 @@
-"""Read from the run's plan what the console must know of its graph."""
+"""Read facts about the graph from the run's plan."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from flexsheet.nodes import NodeRole
 
 @dataclass(frozen=True, slots=True)
 class GraphFacts:
-    """Hold facts of the run's plan, which are constant while the console runs.
+    """Facts about the graph, which are constant while the console runs.
 
     others_may_reset: hosts that may reset an e-stop; empty if the console's own host may.
-    recorders: names of the recorders.  records_on_request: whether one of them records only while
-    a message of the topic `recording` says so.  solvers: names of the nodes that publish the skin.
-    consoles: names of the consoles.
+    recorders: names of the recorders. records_on_request: whether a recorder waits for the topic
+    `recording`. solvers: names of the nodes that publish the skin. consoles: names of the consoles.
     """
 
     others_may_reset: tuple[str, ...] = ()
@@ -30,7 +29,7 @@ class GraphFacts:
 
     @property
     def sampling_readers(self) -> tuple[str, ...]:
-        """Names of the nodes that skip messages by design."""
+        """Return the names of the nodes that skip messages by design."""
         return self.consoles
 
     @classmethod

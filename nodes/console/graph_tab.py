@@ -15,12 +15,12 @@ Floats = NDArray[np.float64]
 
 
 class GraphTab:
-    """Show a chart whose lines differ by colour and by dashes, and the tables under it."""
+    """Chart whose lines differ by colour and dashes, with tables below it."""
 
     def __init__(self, gui: Any) -> None:
         gui.add_html(
             '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s; the table '
-            "below names the lines</p>"
+            "below explains the lines</p>"
         )
         lines = tuple(
             {"label": name, "stroke": line.color, "width": 2, "dash": line.dash, "spanGaps": False}

@@ -18,7 +18,7 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """Store samples of the latencies, each in ms since its exposure."""
+    """Samples of the latencies after the exposure, ms."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
@@ -30,7 +30,10 @@ class History:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return seconds before the latest sample (<= 0), then each series in ms; NaN: no value."""
+        """Return seconds before the latest sample (<= 0), and each series in ms.
+
+        A missing value is NaN.
+        """
         if not self._samples:
             return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
         newest_s = self._samples[-1][0]
@@ -42,8 +45,8 @@ class History:
         """Return the latest sample (ms) and the maximum by series; NaN without a value."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
-            known = values[np.isfinite(values)]
-            found[name] = float(values[-1]), float(known.max()) if len(known) else float("nan")
+            valid = values[np.isfinite(values)]
+            found[name] = float(values[-1]), float(valid.max()) if len(valid) else float("nan")
         return found
 
 
@@ -59,8 +62,8 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
         series = [np.repeat(values, 2) for values in series]
     widened = []
     for values in series:
-        known = np.isfinite(values)
-        lonely = known & ~np.r_[False, known[:-1]] & ~np.r_[known[1:], False]
+        valid = np.isfinite(values)
+        lonely = valid & ~np.r_[False, valid[:-1]] & ~np.r_[valid[1:], False]
         beside = np.flatnonzero(lonely)
         filled = values.copy()
         filled[np.where(beside > 0, beside - 1, 1)] = values[beside]

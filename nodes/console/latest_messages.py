@@ -13,7 +13,7 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageSource(Protocol):
-    """Provide the messages that the page shows: of the running graph, or of a bag."""
+    """Source of the messages that the page shows: the running graph, or a bag."""
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
         """Return the latest message of the topic with its header; None before the first."""
@@ -21,7 +21,7 @@ class MessageSource(Protocol):
 
 
 class LatestMessages:
-    """Hold the latest message of each topic as frames, and decode it at the first access.
+    """Latest message of each topic, decoded at the first access.
 
     refused: called with the topic and the error of a message that cannot be decoded.
     """
@@ -32,13 +32,13 @@ class LatestMessages:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Store the frames; return whether they replaced frames that nobody read."""
-        unseen = name in self._frames
+        """Store the frames; return whether they replaced unread frames."""
+        unread = name in self._frames
         self._frames[name] = frames
-        return unseen
+        return unread
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """See `MessageSource`."""
+        """Return the latest message; see `MessageSource`."""
         frames = self._frames.pop(name, None)
         if frames is not None:
             topic = topic_named(name)
@@ -50,10 +50,10 @@ class LatestMessages:
 
 
 def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return the entry with the type `kind`; TypeError for another type."""
+    """Return the entry with the type `kind`.  Raises TypeError for another type."""
     if entry is None:
         return None
     message, header = entry
     if not isinstance(message, kind):
-        raise TypeError(f"{type(message).__name__} is not a {kind.__name__}")
+        raise TypeError(f"expected {kind.__name__}, found {type(message).__name__}")
     return message, header

@@ -1,4 +1,4 @@
-"""Serve a page in the browser that shows the whole apparatus and controls it."""
+"""Serve a page in the browser that shows and controls the whole apparatus."""
 
 from __future__ import annotations
 
@@ -33,19 +33,21 @@ TOPICS_READ = {
 
 
 class ConsoleParameters(NodeParameters):
-    """Hold the address of the page, its update rates and its files."""
+    """Address of the page, its update rates and its files."""
 
-    address: str = Field(default="127.0.0.1", description="IP address that the page is served at")
+    address: str = Field(default="127.0.0.1", description="IP address of the page")
     page_port: ListenPort = Field(
         default=8080, description="TCP port of the page; 0: any free port"
     )
     token_file: Path | None = Field(
         default=None,
-        description="file with the token that viewers need; required unless on loopback",
+        description="file with the token of the viewers; required unless on loopback",
     )
     rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")
-    control_finger: bool = Field(default=True, description="let viewers move the simulated finger")
+    control_finger: bool = Field(
+        default=True, description="whether viewers move the simulated finger"
+    )
     finger_speed_m_per_s: Positive = Field(
         default=0.15, description="maximum speed of the simulated finger"
     )
@@ -56,7 +58,7 @@ class ConsoleParameters(NodeParameters):
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
     state_file: Path = Field(
         default=Path("@run/console-kept.json"),
-        description="state that a restarted console continues with",
+        description="file with the state for a restart of the console",
     )
 
     @field_validator("address")
@@ -65,7 +67,9 @@ class ConsoleParameters(NodeParameters):
         try:
             return str(ip_address(address))
         except ValueError:
-            raise ValueError(f'"{address}" is no IP address; use one such as 127.0.0.1') from None
+            raise ValueError(
+                f'"{address}" is not an IP address; use for example 127.0.0.1'
+            ) from None
 
     @model_validator(mode="after")
     def _has_access_control(self) -> Self:
@@ -78,7 +82,7 @@ class ConsoleParameters(NodeParameters):
 
 
 class Console(Node):
-    """Serve the page. It reads messages at its own rates, and only while there are viewers."""
+    """Node that serves the page; it reads messages at its own rates while there are viewers."""
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
@@ -93,7 +97,7 @@ class Console(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it serves a page, and the requests of its viewers are not in the bag"
+        return "the bag does not contain the requests of its viewers"
 
     @classmethod
     def further_inputs(
@@ -130,7 +134,7 @@ class Console(Node):
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Store frames until they are drawn; decode at once where every message counts."""
+        """Store messages until they are drawn; decode them immediately if all are needed."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         superseded = self._latest.put(source.topic.name, message)
@@ -143,7 +147,7 @@ class Console(Node):
 
     @periodic("rate_hz")
     def draw(self) -> None:
-        """Update the 3D view and everything that moves."""
+        """Update the 3D view and all moving parts."""
         now_s = self.clock.now_ns() * 1e-9
         viewers = len(self._server.get_clients())
         self.note = f"{self.url}, viewers: {viewers}"

@@ -36,7 +36,7 @@ from flexsheet.nodes.console.latest_messages import LatestMessages, MessageSourc
 from flexsheet.nodes.console.page import Page
 from flexsheet.nodes.console.record_tab import NO_BAG
 from flexsheet.nodes.console.scene_view import LAYERS
-from flexsheet.nodes.console.snapshot import take_snapshot
+from flexsheet.nodes.console.snapshot import compute_snapshot
 
 Floats = NDArray[np.float64]
 
@@ -45,13 +45,13 @@ MAX_WIDTH_PX = 340
 
 BAG_LIST_PERIOD_S = 5.0
 MAX_STEP_S = 0.2
-"""Maximum time step of finger and replay; after a pause they continue where they were."""
+"""Maximum time step of finger and replay, so that they do not jump after a pause."""
 
 SIDES = ("left", "right")
 BOOKMARKS_SHOWN = 5
 REPLAYED = (
-    "the page shows a replay, and the finger belongs to the running graph: press "
-    '"Back to the running graph" in Record first'
+    "the page shows a replay, but the finger is part of the running graph: first press "
+    '"Back to the running graph" in Record'
 )
 MEASURED = "the finger is measured; the console can move a simulated finger only"
 NO_RECORDER = (
@@ -61,7 +61,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """Connect page and graph; runs on the node's own loop."""
+    """Connection of page and graph; runs on the node's own loop."""
 
     def __init__(
         self,
@@ -76,8 +76,8 @@ class Operator:
     ) -> None:
         """Build the page.
 
-        name: of the console's node.  with_finger: the graph simulates the finger, and the mouse
-        moves it.  with_eye: the graph simulates the eye.
+        name: name of the console's node. with_finger: the graph simulates the finger, and the mouse
+        moves it. with_eye: the graph simulates the eye.
         """
         self._name, self._live, self.controller = name, live, controller
         self._with_finger, self._with_eye = with_finger, with_eye
@@ -121,11 +121,11 @@ class Operator:
 
     @property
     def source(self) -> MessageSource:
-        """Return what is shown: a bag, else the running graph."""
+        """Return the source of the displayed messages: a bag or the running graph."""
         return self.controller.replay.timeline or self._live
 
     def handle_request(self, name: str, *values: Any) -> None:
-        """Carry out a request of a viewer; show an error on the page."""
+        """Execute a request of a viewer; show an error on the page."""
         try:
             self._handlers[name](*values)
         except (ValueError, BagError) as error:
@@ -139,7 +139,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Handle a message of a topic of which every message counts."""
+        """Handle a message of a topic whose messages are all needed."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -155,12 +155,12 @@ class Operator:
                 self._page.eye.show_image(name, reduce_image(image))
 
     def advance(self, now_s: float, has_viewers: bool) -> None:
-        """Advance what moves, and draw it if there are viewers."""
+        """Advance finger, sliders and replay; draw them if there are viewers."""
         step_s = min(now_s - self._now_s, MAX_STEP_S)
         self._now_s, controller = now_s, self.controller
         finger = self._live.latest("fingertip", Fingertip) if has_viewers else None
-        seen = finger[0].position_world_m if finger is not None and finger[0].valid else None
-        if controller.finger.advance(step_s, seen):
+        measured = finger[0].position_world_m if finger is not None and finger[0].valid else None
+        if controller.finger.advance(step_s, measured):
             controller.save_state()
         try:
             if controller.scenes.apply_sliders(now_s):
@@ -177,7 +177,7 @@ class Operator:
         self._follow_scene()
         self._follow_skin()
         if self._drawn_scene is not None:
-            self._page.view.draw(take_snapshot(self._drawn_scene, self.source))
+            self._page.view.draw(compute_snapshot(self._drawn_scene, self.source))
         self._show_frame()
         if replay.timeline is not None:
             self._page.record.show_replay(replay)
@@ -226,7 +226,7 @@ class Operator:
         self._show_eye_status(now_s)
         finger = self.source.latest("fingertip", Fingertip)
         if now_s >= self._finger_shown_s:
-            # A slider that moves is ahead of the last request.
+            # A moving slider must not jump back to the last request.
             self._page.touch.show_intent(self.controller.finger)
         self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
         if self._awaits_bag or now_s >= self._bags_s + BAG_LIST_PERIOD_S:
@@ -264,7 +264,7 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the soft body solver's note while it has no skin of this scene; else nothing."""
+        """Return the solver's note while it has no skin of this scene, or an empty text."""
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""
@@ -277,7 +277,7 @@ class Operator:
         eye_view = self.controller.eye_view
         text = panels.eye(
             possible=self._with_eye,
-            wanted=eye_view.wanted,
+            enabled=eye_view.enabled,
             state=eye_view.state,
             waited_s=eye_view.waited_s(now_s),
             ago_s=None if self._image_s is None else now_s - self._image_s,
@@ -289,7 +289,10 @@ class Operator:
         self._page.touch.show_position(self.controller.finger)
 
     def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
-        """Pass a command to the finger; if it is refused, show the state. ValueError."""
+        """Pass a command to the finger.
+
+        Raises ValueError if it is refused; the page then shows the state.
+        """
         finger = self.controller.finger
         self._finger_shown_s = self._now_s + SETTLE_S
         try:
@@ -304,7 +307,7 @@ class Operator:
         self._page.touch.show_lifted(finger)
 
     def _on_new_scene(self) -> None:
-        """Record that a scene was published after the last redraw."""
+        """Store the time of the new scene, and make its picker."""
         self._sent_ns = round(1e9 * self._now_s)
         self.controller.scenes.make_picker(self.controller.finger, self._page.show_problem)
 
@@ -317,15 +320,15 @@ class Operator:
 
     def _show_layer(self, layer: str, shown: bool) -> None:
         if layer not in LAYERS:
-            raise ValueError(f'there is no layer "{layer}"; there are: {", ".join(LAYERS)}')
+            raise ValueError(f'unknown layer "{layer}"; choose one of: {", ".join(LAYERS)}')
         self._page.view.show_layer(layer, shown)
 
-    def _enable_eye_view(self, wanted: bool) -> None:
-        self.controller.eye_view.wanted = wanted
+    def _enable_eye_view(self, enabled: bool) -> None:
+        self.controller.eye_view.enabled = enabled
         self.controller.eye_view.request_now()
 
     def _correct(self, correction: Correction) -> None:
-        self.controller.eye_view.picked = correction
+        self.controller.eye_view.chosen_correction = correction
         self.controller.eye_view.request_now()
 
     def _record(self) -> None:
@@ -341,11 +344,11 @@ class Operator:
             self.controller.record(True)
 
     def _show_bags(self) -> None:
-        """List the bags, the newest first, and choose one that was just recorded."""
+        """List the bags, the newest first, and select one that was just recorded."""
         bags = self.controller.replay.bags()
-        made = next((bag for bag in bags if bag not in self._bags_before), None)
-        self._page.record.show_bags(bags, made if self._awaits_bag else None)
-        self._awaits_bag = self._awaits_bag and made is None
+        recorded = next((bag for bag in bags if bag not in self._bags_before), None)
+        self._page.record.show_bags(bags, recorded if self._awaits_bag else None)
+        self._awaits_bag = self._awaits_bag and recorded is None
 
     def _bookmark(self, label: str) -> None:
         facts = self.controller.facts
@@ -353,14 +356,14 @@ class Operator:
             raise ValueError(NO_RECORDER)
         if facts.records_on_request and not self.controller.recording:
             raise ValueError(
-                "nothing is recorded now, so a bookmark would be lost: start recording first"
+                "recording is off, so the bookmark would be lost: start recording first"
             )
         label = self.controller.add_bookmark(label)
         self._bookmarks = (*self._bookmarks, label)[-BOOKMARKS_SHOWN:]
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:
-            raise ValueError("there is no bag to show; record one first")
+            raise ValueError("there is no bag; record one first")
         self.controller.replay.open(name)
         self._page.record.show_replay(self.controller.replay, opened=True)
 

@@ -24,7 +24,7 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
 class Page:
-    """Hold all panels; the operator sets what they show."""
+    """All panels of the page; the operator updates their contents."""
 
     def __init__(
         self,
@@ -34,7 +34,10 @@ class Page:
         with_finger: bool,
         others_may: tuple[str, ...],
     ) -> None:
-        """Build the panels. others_may: hosts that may reset an e-stop; empty: the console may."""
+        """Build the panels.
+
+        others_may: hosts that may reset an e-stop; empty if the console's host may.
+        """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may
         self.view = SceneView(server)
@@ -57,11 +60,11 @@ class Page:
             self.record = RecordTab(self._gui, request)
 
     def _add_stop(self) -> None:
-        """Add the e-stop in its own window, which no tab and no scrolling hides."""
+        """Add the e-stop in a separate window, which tabs and scrolling cannot hide."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
             stop = self._gui.add_button(
-                "E-STOP  (Esc)", color=STOP_COLOR, hint="Stop both arms at once. Key: Escape"
+                "E-STOP  (Esc)", color=STOP_COLOR, hint="Stop both arms immediately. Key: Escape"
             )
             self._state = Html(self._gui)
             self._release = self._gui.add_button(
@@ -85,12 +88,13 @@ class Page:
         self.eye.show_correction(controller.eye_view.correction)
 
     def show_problem(self, text: str) -> None:
+        """Show an error; an empty text removes it."""
         self._problem.show(panels.problem(text))
 
     def show_state(self, state: GraphState) -> None:
-        """Show the banner, and whether there is an e-stop to release or a fault to reset."""
+        """Show the banner, and enable the button that releases the e-stop or resets a fault."""
         self._state.show(banner.render(state))
-        # Always visible, so that nothing moves under the pointer.
+        # The button is always visible, so that no other control moves under the pointer.
         self._release.disabled = not state.resettable
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:

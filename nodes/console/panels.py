@@ -16,10 +16,10 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""A topic below this fraction of its minimum rate in the table of topics is slow."""
+"""Fraction of a topic's minimum rate below which the topic is slow."""
 
 MAX_STATUS_AGE_S = 3.0
-"""A node without a status message for this time is silent."""
+"""Age of the last status message above which a node is silent."""
 
 MODES = {
     "starting": "starting",
@@ -37,7 +37,7 @@ MODES = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Hold the style of a series: a colour for light and dark pages, and dashes (px)."""
+    """Style of a series: colour for light and dark pages, and dashes (px)."""
 
     color: str
     dash: tuple[int, ...] = ()
@@ -60,13 +60,13 @@ def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
     """Make a table. numbers: indices of right-aligned columns."""
-    flushed = dict.fromkeys(numbers, ' class="fs-number"')
+    alignments = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
-        f'<th scope="col"{flushed.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
+        f'<th scope="col"{alignments.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
     )
     body = "".join(
         "<tr>"
-        + "".join(f"<td{flushed.get(i, '')}>{value}</td>" for i, value in enumerate(row))
+        + "".join(f"<td{alignments.get(i, '')}>{value}</td>" for i, value in enumerate(row))
         + "</tr>"
         for row in rows
     )
@@ -76,25 +76,25 @@ def _table(
     )
 
 
-def words(html: str) -> str:
-    """Return a paragraph of the page."""
+def make_paragraph(html: str) -> str:
+    """Make a paragraph of the page."""
     return f'<p class="fs-words">{html}</p>'
 
 
 def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
-    """Make the legend of the chart, with numbers.
+    """Make the legend of the chart with numbers.
 
-    latencies: by series, the latest and the maximum (ms); NaN: no value.
+    latencies: by series, the latest and the maximum value (ms); NaN without a value.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
         dashes = f' stroke-dasharray="{" ".join(map(str, line.dash))}"' if line.dash else ""
-        drawn = (
+        sample = (
             '<svg width="34" height="8" aria-hidden="true"><line x1="0" y1="4" x2="30" y2="4" '
             f'stroke="{line.color}" stroke-width="2.5"{dashes}/></svg>'
         )
         texts = ["–" if isnan(value) else f"{value:.0f}" for value in (newest, worst)]
-        rows.append((f"{drawn} {escape(name)}", *texts))
+        rows.append((f"{sample} {escape(name)}", *texts))
     head = ("from the exposure until", "now, ms", "worst, ms")
     return _table("Latencies", head, rows, numbers=(1, 2))
 
@@ -102,7 +102,7 @@ def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
 def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     """Make a table of the nodes: state, processor load, last error or note.
 
-    statuses: by node, its latest status and the age of that (s).
+    statuses: by node, its latest status and its age (s).
     """
     rows = []
     for name, (status, age_s) in sorted(statuses.items()):
@@ -125,10 +125,10 @@ def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
 def topics_table(
     statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
 ) -> str:
-    """Return a table of the topics: rate, oldest message among the readers, losses.
+    """Make a table of the topics: rate, maximum age at the readers, losses.
 
-    statuses: as of `nodes_table`.  sampling_readers: nodes that skip messages by design and are
-    not counted as readers.
+    statuses: as in `nodes_table`. sampling_readers: nodes that skip messages by design and are not
+    counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
@@ -163,15 +163,17 @@ def topics_table(
         rate = "" if topic.rate_hz is None else f"{rate_hz:.0f}"
         rows.append((escape(name), state, rate, oldest, str(dropped), str(lost)))
     head = ("topic", "state", "Hz", "age, ms", "skipped", "lost")
-    return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + words(
-        "Age: time since the exposure, of the oldest message among the readers. Skipped: replaced "
-        "by a newer message before it was read. Lost: in transit. Both since the start."
+    return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + make_paragraph(
+        "Age: time since the exposure, maximum of the readers. Skipped: replaced by a newer "
+        "message before it was read. Lost: in transit. Both since the start."
     )
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Describe the position of the fingertip, or why it is unknown; the height is constant."""
-    return f'<div class="fs-finger">{words(_finger(fingertip))}</div>'
+    """Describe the position of the fingertip, or why it is unknown, in a box of constant
+    height.
+    """
+    return f'<div class="fs-finger">{make_paragraph(_finger(fingertip))}</div>'
 
 
 def _finger(fingertip: Fingertip | None) -> str:
@@ -182,47 +184,54 @@ def _finger(fingertip: Fingertip | None) -> str:
     x, y, z = (round(1e3 * metres) for metres in fingertip.position_world_m.tolist())
     return (
         f"{_mark(GOOD, 'tracked')} {abs(x)} mm {'left' if x < 0 else 'right'} and {abs(y)} mm "
-        f"{'below' if y < 0 else 'above'} the screen's middle, {abs(z)} mm "
-        f"{'behind' if z < 0 else 'before'} it"
+        f"{'below' if y < 0 else 'above'} the screen's centre, {abs(z)} mm "
+        f"{'behind' if z < 0 else 'in front of'} it"
     )
 
 
 def eye(
-    *, possible: bool, wanted: bool, state: EyeViewState, waited_s: float, ago_s: float | None
+    *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe what the images of the eye wait for.
+    """Describe the state of the images of the eye.
 
-    waited_s: since `state` began. ago_s: since the latest image; None: there is none.
+    waited_s: duration of `state`. ago_s: age of the latest image; None without an image.
     """
     if not possible:
-        return words("This graph has no simulated eye (a node of type twin_eye).")
-    if not wanted:
-        return words("Tick the box to see what the user's eye sees.")
-    last = "" if ago_s is None else f" The last image came {ago_s:.0f} s ago."
+        return make_paragraph("This graph has no simulated eye (a node of type twin_eye).")
+    if not enabled:
+        return make_paragraph("Tick the box to show images of the user's eye.")
+    last = "" if ago_s is None else f" The last image is {ago_s:.0f} s old."
     match state:
         case EyeViewState.DRAWING:
-            return words(f"Waits for the renderer to draw a frame: {waited_s:.0f} s.{last}")
+            return make_paragraph(f"Waiting for a frame of the renderer: {waited_s:.0f} s.{last}")
         case EyeViewState.TRACING:
-            return words(
-                "Waits for the simulated eye to trace the image, which takes one second of "
-                f"processor time, and longer on a busy computer: {waited_s:.0f} s.{last}"
+            return make_paragraph(
+                "Waiting for the simulated eye, which needs a second of processor time, and longer "
+                f"on a busy computer: {waited_s:.0f} s.{last}"
             )
         case EyeViewState.RESTING if ago_s is None:
-            return words("Waits for the next request: no frame or no image came in time.")
+            return make_paragraph(
+                "No frame or image arrived in time. Waiting for the next request."
+            )
         case EyeViewState.RESTING:
-            return words(f"Rendered {ago_s:.0f} s ago; the next image follows within six seconds.")
+            return make_paragraph(
+                f"Rendered {ago_s:.0f} s ago; a new image follows within six seconds."
+            )
 
 
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
-    """Return the recorder's note and the newest bookmarks.  note: None without a recorder."""
+    """Describe the recorder's note and the newest bookmarks.
+
+    note: None without a recorder.
+    """
     if note is None:
-        return words(_mark(WARN, "this graph has no recorder"))
+        return make_paragraph(_mark(WARN, "this graph has no recorder"))
     listed = f"<br>Bookmarks: {escape(', '.join(bookmarks))}." if bookmarks else ""
-    return words(f"Recorder: {escape(note)}.{listed}")
+    return make_paragraph(f"Recorder: {escape(note)}.{listed}")
 
 
 def problem(text: str) -> str:
-    """Show the error of a request; an empty text removes it."""
+    """Make the box of an error; an empty text removes it."""
     if not text:
         return ""
     sentence = escape(text[:1].upper() + text[1:])

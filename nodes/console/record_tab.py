@@ -14,11 +14,11 @@ PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"
 NO_BOOKMARK = "-"
 RECORDING_COLOR = (146, 64, 14)
-"""Differs from the colour of the e-stop."""
+"""This colour differs from that of the e-stop."""
 
 
 class RecordTab:
-    """Show the controls of recording and replay; the timeline is visible while a bag is shown."""
+    """Controls of recording and replay; the timeline is visible while a bag is shown."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._request = request
@@ -27,7 +27,7 @@ class RecordTab:
             self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
             self._label = gui.add_text("Name", "", hint="Label of the next bookmark")
             bookmark = gui.add_button("Add a bookmark (M)", hint="Key: M")
-            self._words = Html(gui)
+            self._text = Html(gui)
         with gui.add_folder("Replay"):
             self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="Newest first")
             opened = gui.add_button("Show the bag")
@@ -57,21 +57,27 @@ class RecordTab:
             self._bookmarks.value = NO_BOOKMARK
 
     def show_state(self, html: str, *, recording: bool) -> None:
-        """Show what the recorder does."""
-        self._words.show(html)
+        """Show the state of the recorder."""
+        self._text.show(html)
         self._record.label = "Stop recording" if recording else "Start recording"
         self._record.color = RECORDING_COLOR if recording else None
 
-    def show_bags(self, names: Sequence[str], made: str | None = None) -> None:
-        """List the bags. made: a bag to choose, since it was just recorded."""
+    def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
+        """List the bags.
+
+        recorded: a bag to select, because it was just recorded.
+        """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
             self._bag.options = options
-        if made is not None:
-            show_value(self._bag, made)
+        if recorded is not None:
+            show_value(self._bag, recorded)
 
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
-        """Show the position of the timeline; `opened`: another bag is shown, or none."""
+        """Show the position of the timeline.
+
+        opened: another bag, or none, is shown now.
+        """
         timeline = replay.timeline
         if opened:
             for handle in (self._play, self._time, self._rate, self._bookmarks, self._live):

@@ -20,7 +20,7 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """Read a bag at a position; `seconds` counts from its beginning.
+    """Reader of a bag at a position; `seconds` counts from its start.
 
     Raises BagError for a file that is not a bag, or contains nothing that the page shows.
     """
@@ -32,9 +32,7 @@ class Timeline:
         self.duration_s, self._start_ns = summary.duration_s, summary.start_ns
         self._readable = {one.name for one in summary.topics if one.readable and one.count}
         if not self._readable & {"arm_left", "arm_right", "fingertip", "soft_body"}:
-            raise BagError(
-                f"{path}: has no topic that the page shows, such as arm_left or fingertip"
-            )
+            raise BagError(f"{path}: contains no topic that the page shows, for example arm_left")
         self._channels = {one.topic: one.id for one in self._reader.channels.values()}
         self._positions = {name: self._times(name) for name in self._readable}
         self._chunks: OrderedDict[int, dict[tuple[int, int], Record]] = OrderedDict()
@@ -68,7 +66,7 @@ class Timeline:
         times, chunks = self._positions[name]
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
-            raise BagError(f'{self.path}: topic "{name}": no message where its index says')
+            raise BagError(f'{self.path}: topic "{name}": its index points to no message')
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
@@ -89,7 +87,7 @@ class Timeline:
         return cached
 
     def _find_bookmarks(self) -> list[tuple[float, str]]:
-        """Return (seconds, label) of the bookmarks."""
+        """Return the bookmarks as (seconds, label)."""
         found = []
         for i, time_ns in enumerate(self._positions.get("bookmark", ([], []))[0]):
             message, _ = self._open("bookmark", i)

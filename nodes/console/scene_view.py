@@ -1,4 +1,4 @@
-"""Draw the 3D view, and update what has changed."""
+"""Draw the 3D view, and update its changed parts."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ GRID_SECTION: Color = (128, 135, 146)
 """Both grid colours are visible on light and dark pages."""
 
 SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
-"""Distance by which the sheet and its lines are drawn nearer to the viewer. A flat object lies in
-the plane of the sheet, and equal depths would flicker."""
+"""Distance by which the sheet and its lines are drawn nearer to the viewer.
+
+A flat object is in the plane of the sheet, and equal depths would flicker."""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
@@ -59,7 +60,7 @@ Drag = Callable[[Floats, Floats], None]
 
 
 class SceneView:
-    """Hold the 3D scene of all viewers; `draw` sends what has changed."""
+    """The 3D scene of all viewers; `draw` sends changes."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
@@ -74,7 +75,7 @@ class SceneView:
         # Without a graphics card, shadows would take most of the time of a frame.
         self._scene.configure_default_lights(cast_shadow=False)
         first = next(iter(VIEWPOINTS.values()))
-        assert first is not None  # which needs no scene
+        assert first is not None  # the first viewpoint needs no scene
         server.initial_camera.position, server.initial_camera.look_at = first
         server.initial_camera.fov = 0.75
 
@@ -91,11 +92,12 @@ class SceneView:
             client.camera.position, client.camera.look_at = position, target
 
     def show_layer(self, layer: str, shown: bool) -> None:
+        """Show or hide a layer."""
         self._shown[layer] = shown
         for handle in self._layers.get(layer, []):
             handle.visible = shown
         for side, frames in self._links.items():
-            # An arm is visible once its pose is known.
+            # An arm is visible after its first pose.
             for handle in frames:
                 handle.visible = self._shown["Arms"] and side in self._posed
 
@@ -130,7 +132,7 @@ class SceneView:
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for a press or drag on sheet or object, and for the release."""
+        """Set the callbacks for a press or drag on sheet or object, and for its end."""
         self._touched, self._released = touched, released
 
     def draw(self, snapshot: SceneSnapshot) -> None:
@@ -222,7 +224,7 @@ class SceneView:
             fingertip=None,
             finger_radius_m=scene.finger.radius_m,
         )
-        assert points is not None  # the scene's sheet is wider than nothing
+        assert points is not None  # the width of the scene's sheet is positive
         self._sheet = self._add(
             "Sheet",
             self._scene.add_mesh_simple(
@@ -365,7 +367,7 @@ def line_segments(points: Floats) -> Floats:
 
 
 def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Make a fingertip (n, 3) and its triangles, tip at the origin, pointing away from the user."""
+    """Make a fingertip (n, 3) and its triangles: tip at the origin, axis away from the user."""
     rings, around = 8, 20
     tilt = np.linspace(0.0, 0.5 * np.pi, rings)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])

@@ -24,17 +24,17 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """Report a scene that cannot be used, and why."""
+    """A scene that cannot be used; the text gives the reason."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
 
 
 def first_scene(plan_file: Path) -> Scene:
-    """Return the scene of the run's plan; SceneChoiceError without one."""
+    """Return the scene of the run's plan.  Raises SceneChoiceError without one."""
     values = json.loads(plan_file.read_text())["scene"]
     if values is None:
-        raise SceneChoiceError('the launch file names no scene; the console needs its key "scene"')
+        raise SceneChoiceError('the launch file has no scene; set its key "scene" for the console')
     return Scene.model_validate(values)
 
 
@@ -43,10 +43,10 @@ def scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene of the run's folder by its name; SceneChoiceError lists the scenes."""
+    """Load a scene of the run's folder by its name.  Raises SceneChoiceError."""
     names = scene_names(folder)
     if name not in names:
-        raise SceneChoiceError(f'there is no scene "{name}"; there are: {", ".join(names)}')
+        raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
     return Scene.model_validate_json((folder / f"{name}.json").read_text())
 
 
@@ -55,8 +55,8 @@ def edit_scene(
 ) -> Scene:
     """Change the stiffness, the minimum stretch of the sheet and the size of the object.
 
-    The object grows away from the user: its front stays where it is. SceneChoiceError for invalid
-    values.
+    The front of the object is fixed; it grows away from the user. Raises SceneChoiceError for
+    invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -86,7 +86,7 @@ def edit_scene(
 
 
 def max_stretch_ratio(scene: Scene) -> float:
-    """Return the upper end of the slider: by the scene's limits of length and of force."""
+    """Return the upper end of the slider, from the scene's limits of stretch and force."""
     sheet = scene.sheet
     strongest = stretch_for_edge_force(
         sheet.max_edge_force_n,
@@ -116,9 +116,9 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent (m) of the touchable surface towards the user (world z) from its origin.
+    """Return the extent of the touchable surface towards the user (world z) from its origin, m.
 
-    world_from_object: rotation (3, 3). A cylinder is measured at its side: its ends are not
+    world_from_object: rotation (3, 3). A cylinder is measured at its side, as its ends are not
     touched.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

@@ -1,4 +1,4 @@
-"""Compute the sheet as the page draws it: ruled between its edges, deflected by the finger.
+"""Compute the drawn sheet: a ruled surface between its edges, deflected by the finger.
 
 The deflection is that of a soap film, for display only. See `flexsheet.nodes.models.sheet` for the
 mechanics of the sheet.
@@ -20,7 +20,7 @@ Indices = NDArray[np.int32]
 COLUMNS, ROWS = 41, 41
 MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""Number of cells along each side around a vertex that are searched for a hit of a ray."""
+"""Number of cells along each side around a vertex that are tested for a hit of a ray."""
 
 MIRRORED = 2
 """Number of images of the finger in each free edge."""
@@ -60,12 +60,12 @@ def sheet_points(
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Compute the deflection (n,), over the depth of the finger, of a film clamped at x = +-width /
-    2.
+    """Compute the deflection (n,) of a film clamped at x = +-width / 2, over the finger's depth.
 
     x, y: (n,). The film solves Laplace's equation with a point force in an infinite strip. The
-    conformal map of the strip gives its Green's function in closed form. Free edges at y = +-height
-    / 2 are made by mirroring the finger. Within `radius_m` of the finger the deflection is 1.
+    conformal map of the strip yields its Green's function in closed form. Free edges at y =
+    +-height / 2 are modelled by mirroring the finger. Within `radius_m` of the finger the
+    deflection is 1.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger
@@ -104,10 +104,10 @@ def sheet_triangles() -> Indices:
 
 
 def hit_by_ray(points: Floats, origin: Floats, towards: Floats) -> Floats:
-    """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet; NaN: nowhere.
+    """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet.
 
-    points: of `sheet_points`. Method of Moeller and Trumbore (1997), on the triangles around the
-    vertex that is nearest to the ray as seen from its origin.
+    points: of `sheet_points`. A miss is NaN. Method of Moeller and Trumbore (1997), on the
+    triangles around the vertex whose direction is nearest to the ray.
     """
     direction = towards - origin
     seen = points - origin

@@ -1,4 +1,4 @@
-"""Compute what the 3D view shows at one time, as arrays in the world frame."""
+"""Compute the contents of the 3D view at one time, as arrays in the world frame."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def transform_from_pose(pose: Pose) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SceneSnapshot:
-    """Hold what is drawn at one time; unknown values are None.
+    """Contents of the 3D view at one time; unknown values are None.
 
     links: by side, world_from_link (7, 4, 4). edges: by side, world_from_edge. sheet: (n, 3), see
     `sheet_points`. skin: (n, 3), deformed. finger: (3,). finger_valid: whether it is tracked.
@@ -41,7 +41,7 @@ class SceneSnapshot:
     finger_valid: bool
 
 
-def take_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
+def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
     """Compute the snapshot of the latest messages."""
     links, edges = {}, {}
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
@@ -75,7 +75,7 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the deformed skin; at rest while the solver has published nothing for it."""
+    """Return the deformed skin; at rest before the solver's first result for it."""
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
         return None
@@ -101,7 +101,7 @@ def ray_vertices(rest: Floats) -> NDArray[np.int64]:
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Compute the light rays of points (n, 3) of the deformed skin.
 
-    Returns segments (m, 2, 3) from the eye to the sheet, and (m, 2, 3) from the sheet to the
+    Return segments (m, 2, 3) from the eye to the sheet, and (m, 2, 3) from the sheet to the
     projector. Points whose ray misses the sheet have none.
     """
     eye = scene.eyes.centre_world_m

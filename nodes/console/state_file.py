@@ -13,10 +13,10 @@ from flexsheet.nodes.console.scenes import SceneChoiceError
 
 
 class ConsoleState(BaseModel):
-    """Hold the state of the console.
+    """State of the console.
 
-    base: the chosen scene. sliders: their values, None: not moved. recording: whether recording was
-    requested. finger: the requested position of the finger, None: nobody has moved it.
+    base: the selected scene. sliders: their values; None if not moved. recording: whether recording
+    was requested. finger: the requested position of the finger; None if nobody has moved it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,7 +28,10 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the state; None without a file. SceneChoiceError for an invalid file."""
+    """Read the state; return None without a file.
+
+    Raises SceneChoiceError for an invalid file.
+    """
     try:
         return ConsoleState.model_validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -36,10 +39,10 @@ def load_state(path: Path) -> ConsoleState | None:
     except (OSError, ValidationError) as error:
         first = str(error).splitlines()[0]
         raise SceneChoiceError(
-            f"{path}: is no valid state, so the console starts with the first scene: {first}"
+            f"{path}: invalid state, so the console starts with the first scene: {first}"
         ) from error
 
 
-def save_state(path: Path, kept: ConsoleState) -> None:
+def save_state(path: Path, state: ConsoleState) -> None:
     """Write the state atomically."""
-    write_file(path, kept.model_dump_json())
+    write_file(path, state.model_dump_json())

@@ -15,11 +15,11 @@ from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
 
 MAX_OFFSET_MM = 80.0
 MAX_DEPTH_MM = 50.0
-LIFT, LOWER = "Lift the finger (L)", "Put the finger down (L)"
+LIFT, LOWER = "Lift the finger (L)", "Lower the finger (L)"
 
 
 class TouchTab:
-    """Show the controls of finger, scene and view."""
+    """Controls of finger, scene and view."""
 
     def __init__(self, gui: Any, request: Request, view: SceneView, *, with_finger: bool) -> None:
         self._gui, self._request, self._view = gui, request, view
@@ -28,7 +28,7 @@ class TouchTab:
             "**Drag on the sheet** to stroke the object. Drag beside it to rotate the view, scroll "
             "to zoom."
             if with_finger
-            else "The finger is measured; it cannot be moved from here."
+            else "The finger is measured, so it cannot be moved here."
         )
         with gui.add_folder("Finger"):
             if with_finger:
@@ -36,7 +36,7 @@ class TouchTab:
             self._finger = Html(gui)
         with gui.add_folder("Object and sheet"):
             self._add_scene()
-        with gui.add_folder("SceneView"):
+        with gui.add_folder("View"):
             self._add_view()
 
     def _add_finger(self) -> None:
@@ -55,20 +55,22 @@ class TouchTab:
         self._up = gui.add_slider(
             "Up, mm", -MAX_OFFSET_MM, MAX_OFFSET_MM, 1.0, 0.0, hint="Above the centre of the screen"
         )
-        self._lift = gui.add_button(LOWER, hint="Onto the object, and off it. Key: L")
+        self._lift = gui.add_button(
+            LOWER, hint="Lower the finger to the object, or lift it. Key: L"
+        )
         on_value(self._depth, lambda value: request("push", 1e-3 * value))
         for slider in (self._across, self._up):
             on_value(
                 slider, lambda _: request("place", 1e-3 * self._across.value, 1e-3 * self._up.value)
             )
         self._lift.on_click(make_callback(request, "lift"))
-        gui.add_command("Lift the finger, or put it down", hotkey="L").on_trigger(
+        gui.add_command("Lift or lower the finger", hotkey="L").on_trigger(
             make_callback(request, "lift")
         )
 
     def _add_scene(self) -> None:
         gui, request = self._gui, self._request
-        self._scene = gui.add_dropdown("Scene", ("-",), hint="Object, sheet and their sizes")
+        self._scene = gui.add_dropdown("Scene", ("-",), hint="Object and sheet")
         self._stiffness = gui.add_slider(
             "Stiffness, kPa", 0.5, 30.0, 0.1, 4.0, hint="Young's modulus of the object"
         )
@@ -78,7 +80,7 @@ class TouchTab:
             hint="Minimum stretch of the sheet; the arms of this scene limit it",
         )
         self._size = gui.add_slider(
-            "Size, %", 50, 150, 1, 100, hint="Of the object; its front stays where it is"
+            "Size, %", 50, 150, 1, 100, hint="Size of the object; its front side is fixed"
         )
         on_value(self._scene, lambda name: request("choose", name))
         on_value(self._stiffness, lambda value: request("slide", "young_modulus_pa", 1e3 * value))
@@ -87,7 +89,7 @@ class TouchTab:
 
     def _add_view(self) -> None:
         seen_from = self._gui.add_button_group(
-            "View from", tuple(VIEWPOINTS), hint="Changes your own view only"
+            "View from", tuple(VIEWPOINTS), hint="Changes only your own view"
         )
         seen_from.on_click(lambda event: self._view.look_from(event.client, event.target.value))
         with self._gui.add_folder("Show", expand_by_default=False):
@@ -96,7 +98,10 @@ class TouchTab:
                 on_value(box, partial(self._request, "show_layer", layer))
 
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
-        """Show a scene of the graph. base: the scene that the sliders change."""
+        """Show a scene of the graph.
+
+        base: the scene that the sliders change.
+        """
         if names:
             self._scene.options = tuple(names)
             if scene.name in names:
@@ -114,12 +119,12 @@ class TouchTab:
             self.show_lifted(finger)
 
     def show_position(self, finger: FingerController) -> None:
-        """Show the requested position; beyond the sliders: their nearest end."""
+        """Show the requested position, clipped to the sliders."""
         for slider, value_m in zip((self._across, self._up), finger.position_m, strict=True):
             show_value(slider, _within(1e3 * value_m, -MAX_OFFSET_MM, MAX_OFFSET_MM, 0))
 
     def show_lifted(self, finger: FingerController) -> None:
-        """Offer to lift the finger, or to put it down."""
+        """Show the label of the button: lift the finger, or lower it."""
         label = LOWER if finger.intent.lifted else LIFT
         if self._lift.label != label:
             self._lift.label = label

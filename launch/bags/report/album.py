@@ -18,7 +18,7 @@ QUALITY = 82
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Hold JPEG images of one time, each with its title; marked: label of its bookmark."""
+    """JPEG images of one time, each with its title; marked: label of its bookmark."""
 
     seconds: float
     title: str
@@ -28,10 +28,10 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """Store at most `limit` shots at regular intervals, and the first shot after each bookmark.
+    """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
-    bookmarks: (seconds, label), in order. seen: number of shots. left_out: shots at bookmarks
-    beyond the first `MAX_BOOKMARK_SHOTS`.
+    bookmarks: (seconds, label), in order. seen: number of shots. left_out: number of shots at
+    bookmarks beyond the first `MAX_BOOKMARK_SHOTS`.
     """
 
     limit: int
@@ -42,10 +42,10 @@ class Album:
     _held: list[Shot] = field(default_factory=list)
     _marked: list[Shot] = field(default_factory=list)
 
-    def take(
+    def add(
         self, seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]]
     ) -> None:
-        """Look at a shot; it is made small only if it is kept."""
+        """Add a shot; encode its images only if it is stored."""
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._marked) >= MAX_BOOKMARK_SHOTS:

@@ -32,7 +32,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""Hatches that distinguish grave states without colours."""
+"""Hatches that distinguish faults without colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -42,7 +42,7 @@ EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Hold a chart. svg: image. text: its content in words. caption: how to read it."""
+    """A chart. svg: image. text: description of its content. caption: how to read it."""
 
     svg: str
     text: str
@@ -76,14 +76,14 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Set the axes to the time of the bag, after the lines are drawn."""
+    """Set the axes to the time of the bag; call it after the lines are drawn."""
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Mark each value without neighbours: no line would show it."""
+    """Add markers to values without neighbours, which a line does not show."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         beside = np.zeros_like(known)
@@ -117,21 +117,21 @@ def timeline(session: Session) -> Chart | None:
     figure, grid = _figure(1, 1, 0.5 * rows + 1.5)
     axes: Axes = grid[0][0]
     axes.set_axisbelow(True)
-    looks: dict[tuple[str, str | None], list[str]] = {}
+    styles: dict[tuple[str, str | None], list[str]] = {}
     for row, (name, states) in enumerate(strips):
         lasting = name == "e-stop"
         for state, begin_s, end_s in find_intervals(states, session.fine, lasting=lasting):
-            colour, hatch = look = STATE_COLOURS.get(state, MIDDLE), HATCHES.get(state)
+            colour, hatch = style = STATE_COLOURS.get(state, MIDDLE), HATCHES.get(state)
             axes.barh(
                 row, end_s - begin_s, left=begin_s, height=0.7, color=colour, hatch=hatch,
                 edgecolor="#ffffff" if hatch else colour, linewidth=0.0,
             )  # fmt: skip
-            texts = looks.setdefault(look, [])
+            texts = styles.setdefault(style, [])
             if state not in texts:
                 texts.append(state)
     for kind in kinds:
         marker, colour = MARKS[kind]
-        at = [seconds for seconds, _ in session.events.of(kind)]
+        at = [seconds for seconds, _ in session.events.select(kind)]
         axes.plot(at, [len(strips)] * len(at), marker, color=colour, label=kind, markersize=8)
     names = [name for name, _ in strips] + (["events"] if kinds else [])
     axes.set_yticks(range(len(names)), names)
@@ -140,25 +140,26 @@ def timeline(session: Session) -> Chart | None:
     axes.set_xlabel("time in the bag, s")
     patches = [
         Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(texts))
-        for (colour, hatch), texts in looks.items()
+        for (colour, hatch), texts in styles.items()
     ]
     handles, _ = axes.get_legend_handles_labels()
     figure.legend(handles=[*patches, *handles], ncols=5, fontsize=8, loc="outside lower center")
     spent = [
-        f"{name}: " + ", ".join(f"{state} {seconds:.1f} s" for state, seconds in spent_in(states))
+        f"{name}: "
+        + ", ".join(f"{state} {seconds:.1f} s" for state, seconds in sort_by_duration(states))
         for name, states in strips
     ]
     counts = [f"{session.events.counts[kind]} × {kind}" for kind in kinds]
     return Chart(
         render_svg(figure),
         "Timeline. " + "; ".join([*spent, *counts]) + ".",
-        "What the sheet, the arms and the finger's tracker did; white: nothing was recorded. Of "
-        "states that share a stretch of the picture the gravest is drawn.",
+        "States of the sheet, the arms and the finger's tracker; white: nothing was recorded. The "
+        "most severe state of each interval is drawn.",
     )
 
 
-def spent_in(states: States) -> list[tuple[str, float]]:
-    """Describe the states, the longest first."""
+def sort_by_duration(states: States) -> list[tuple[str, float]]:
+    """Return the states and their durations in s, the longest first."""
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
@@ -166,17 +167,18 @@ def spent_in(states: States) -> list[tuple[str, float]]:
 def find_intervals(
     states: States, grid: Grid, *, lasting: bool = False
 ) -> Iterator[tuple[str, float, float]]:
-    """Find intervals of one state: (state, from s, to s). lasting: up to the next state, not up to
-    silence.
+    """Yield the intervals of constant state: (state, start s, end s).
+
+    lasting: an interval ends at the next state, not at a gap without messages.
     """
     width_s = grid.duration_s / grid.count
-    # A message every second leaves holes in a fine grid, which are none in what it says.
-    holes = max(int(0.5 / width_s), 1)
+    # Messages that are rarer than the grid's intervals leave gaps, which are bridged.
+    max_gap = max(int(0.5 / width_s), 1)
     codes = states.codes.tolist()
     begin, code, last = 0, States.NOTHING, -1
     for i, one in enumerate([*codes, States.NOTHING]):
         if one == States.NOTHING:
-            if code != States.NOTHING and (i == len(codes) or (i - last > holes and not lasting)):
+            if code != States.NOTHING and (i == len(codes) or (i - last > max_gap and not lasting)):
                 end = len(codes) if lasting else last + 1
                 yield states.names[code], begin * width_s, end * width_s
                 code = States.NOTHING
@@ -189,7 +191,7 @@ def find_intervals(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Draw median and 99 % of each step after the exposure, over time."""
+    """Draw the median and 99 % quantile of each latency after the exposure over time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -210,7 +212,7 @@ def latencies(session: Session) -> Chart | None:
         axes.set_title(event, fontsize=10)
         _over_time(axes, session)
         axes.set_ylabel("ms")
-        whole = [spread.quantile_s(share) or 0.0 for share in (0.5, 0.99)]
+        whole = [spread.quantile_s(fraction) or 0.0 for fraction in (0.5, 0.99)]
         texts.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
     grid[0][0].legend(fontsize=8)
     for axes in grid[-1]:
@@ -219,18 +221,18 @@ def latencies(session: Session) -> Chart | None:
         grid[i // 2][i % 2].set_visible(False)
     return Chart(
         render_svg(figure),
-        "From the exposure to each step, over the whole bag, median and 99 %: "
+        "Latency from the exposure to each step over the whole bag, median and 99 %: "
         + "; ".join(texts)
         + ".",
-        "From the middle of the exposure until the message was sent, the command written, the "
-        "frame drawn.",
+        "Time from the middle of the exposure until the message is sent, the command is written "
+        "or the frame is drawn.",
     )
 
 
 def paths(session: Session) -> Chart | None:
     """Draw the paths of finger and sheet centre, from the front and from the side."""
-    finger, true = 1e3 * session.finger_place.points, 1e3 * session.true_place.points
-    sheet = 1e3 * session.sheet_place.points
+    finger, true = 1e3 * session.finger_path.points, 1e3 * session.true_path.points
+    sheet = 1e3 * session.sheet_path.points
     known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
     if not known:
         return None
@@ -238,7 +240,7 @@ def paths(session: Session) -> Chart | None:
     views = (("from the front", 0, "x (right), mm"), ("from the side", 2, "z (to the user), mm"))
     for axes, (title, across, label) in zip(grid[0], views, strict=True):
         for points, name, style, colour in (
-            (sheet, "sheet's middle, as planned", "-", COLOURS[4]),
+            (sheet, "planned sheet centre", "-", COLOURS[4]),
             (true, "true finger", "-", COLOURS[2]),
             (finger, "measured finger", ".", COLOURS[0]),
         ):
@@ -262,7 +264,7 @@ def paths(session: Session) -> Chart | None:
     return Chart(
         render_svg(figure),
         f"Paths of finger and sheet in the world: {spans}.",
-        "In the world's frame, its origin in the middle of the imaginary screen.",
+        "Positions in the world frame, whose origin is the centre of the virtual screen.",
     )
 
 
@@ -284,7 +286,7 @@ def sheet_errors(session: Session) -> Chart | None:
     ):
         for i, (name, texts) in enumerate(shown):
             axes.plot(
-                seconds, scale * values[name].most, color=COLOURS[4 * i], linewidth=1.0,
+                seconds, scale * values[name].maximum, color=COLOURS[4 * i], linewidth=1.0,
                 linestyle=("-", "--")[i], label=f"against the {texts}",
             )  # fmt: skip
         axes.set_ylabel(label)
@@ -302,16 +304,16 @@ def sheet_errors(session: Session) -> Chart | None:
     ]
     return Chart(
         render_svg(figure),
-        "Errors of the sheet in contact, as the paper defines them; greatest: "
+        "Errors of the sheet in contact, as the paper defines them; maximum: "
         + ", ".join(worst)
         + ".",
-        f"The greatest of each {session.grid.duration_s / session.grid.count:.2g} s while the "
-        "sheet is in contact, less what it is meant to yield.",
+        f"Maximum of each {session.grid.duration_s / session.grid.count:.2g} s in contact, without "
+        "the commanded compliance of the sheet.",
     )
 
 
 def joint_speeds(session: Session) -> Chart | None:
-    """Draw each joint's maximum speed over its limit."""
+    """Draw each joint's maximum speed in percent of its limit."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
@@ -322,25 +324,25 @@ def joint_speeds(session: Session) -> Chart | None:
         for i, (range_, limit) in enumerate(
             zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
         ):
-            share = 100.0 * range_.most / limit
-            axes.plot(seconds, share, linewidth=1.0, color=COLOURS[i], label=f"J{i + 1}")
+            percent = 100.0 * range_.maximum / limit
+            axes.plot(seconds, percent, linewidth=1.0, color=COLOURS[i], label=f"J{i + 1}")
         axes.axhline(100.0, linestyle="--", color=INK, linewidth=1.0, label="limit")
         axes.set_title(f"{side} arm", fontsize=10)
         axes.set_ylabel("% of the limit")
         axes.set_ylim(bottom=0.0)
         _over_time(axes, session)
-        shares = [
+        percents = [
             100.0 * overall[1] / limit
             for range_, limit in zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
             if (overall := range_.overall())
         ]
-        texts.append(f"{side} arm at most {max(shares):.0f} %")
+        texts.append(f"{side} arm at most {max(percents):.0f} %")
     grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
     grid[-1][0].set_xlabel("time in the bag, s")
     return Chart(
         render_svg(figure),
-        f"Joint speeds over their limits: {', '.join(texts)}.",
-        "The greatest of each stretch of time, from the measured joints over 25 ms.",
+        f"Joint speeds in percent of their limits: {', '.join(texts)}.",
+        "Maximum of each interval, from the measured joints over 25 ms.",
     )
 
 
@@ -354,7 +356,7 @@ def forces(session: Session) -> Chart | None:
     upper, lower = grid[0][0], grid[1][0]
     texts = []
     for i, (side, arm) in enumerate(arms.items()):
-        upper.plot(seconds, arm.edge_force.most, color=COLOURS[4 * i], linewidth=1.2,
+        upper.plot(seconds, arm.edge_force.maximum, color=COLOURS[4 * i], linewidth=1.2,
                    linestyle=("-", "--")[i], label=f"{side} edge")  # fmt: skip
         overall = arm.edge_force.overall()
         texts.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
@@ -362,11 +364,11 @@ def forces(session: Session) -> Chart | None:
         most_n = session.scene.sheet.max_edge_force_n
         upper.axhline(most_n, linestyle="--", color=INK, linewidth=1.0, label="limit")
     upper.set_ylabel("edge force, N")
-    lower.plot(seconds, 1e3 * session.push.most, color=COLOURS[2], label="push, mm")
-    lower.plot(seconds, session.force.most, color=COLOURS[4], linestyle="--", label="force, N")
+    lower.plot(seconds, 1e3 * session.push.maximum, color=COLOURS[2], label="push, mm")
+    lower.plot(seconds, session.force.maximum, color=COLOURS[4], linestyle="--", label="force, N")
     lower.set_ylabel("push, mm; force, N")
     for axes in (upper, lower):
-        # Room for the legend.
+        # The legend needs space above the lines.
         axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])
         axes.legend(fontsize=8, ncols=3, loc="upper right")
         _over_time(axes, session)
@@ -374,6 +376,6 @@ def forces(session: Session) -> Chart | None:
     return Chart(
         render_svg(figure),
         f"Forces: {', '.join(texts)}.",
-        "Above, the pull of the sheet at its edges, by the bridges; below, how deep the finger is "
-        "in the object, and the object's force on it by the solver.",
+        "Top: forces at the sheet's edges, from the bridges. Bottom: push depth of the finger, and "
+        "the object's force on it, from the solver.",
     )

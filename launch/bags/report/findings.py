@@ -1,4 +1,4 @@
-"""Describe the problems of a session in sentences; each names its section of the page."""
+"""Find the problems of a recorded session, each with its section of the report."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ SLOW_RATIO = 0.5
 """Fraction of a topic's minimum rate below which it counts as slow, as in the console."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""Largest fraction of the time without a valid fingertip that is no finding."""
+"""Maximum fraction of images without a valid fingertip."""
 
-FULL_RATIO = 1.0
+MAX_LIMIT_RATIO = 1.0
 """Ratio to a limit above which a value is a finding."""
 
 ROUNDING = 1.02
@@ -25,9 +25,9 @@ ROUNDING = 1.02
 
 @dataclass(frozen=True, slots=True)
 class SessionFinding:
-    """Hold a problem of a session.
+    """A problem of a session.
 
-    gravity: bad, a failure; doubtful, to be checked. section: id on the page.
+    gravity: "bad" for a failure, "doubtful" for something to check. section: id on the page.
     """
 
     gravity: Gravity
@@ -39,31 +39,31 @@ BRIEFLY_BUSY_FRACTION = 0.05
 """Fraction of the time above which an overloaded computer is a fault."""
 
 CHECKED = (
-    "whether the computers were busy; "
-    "the bag's end, its types and the state of the code; e-stops, faults and modes of the arms; "
+    "overload of the computers; "
+    "completeness and types of the bag; state of the code; e-stops, faults and modes of the arms; "
     "joint speed, tool speed and edge force against their limits; nodes' errors and restarts; "
     "each topic's rate, silences, losses and refusals; latency, sheet position and the soft body's "
-    "range against the scene's tolerances; whether the finger was seen and, in contact, followed; "
+    "range against the scene's tolerances; tracking of the finger and following in contact; "
     "late frames"
 )
 
 
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
-    """Find all problems: a busy computer first, which explains most others, then the bad ones."""
+    """Find all problems: overload first, as it causes most others, then failures."""
     found = [
-        *_of_the_bag(numbers),
-        *_of_the_arms(numbers),
-        *_of_the_nodes(numbers),
-        *_of_the_topics(numbers),
-        *_of_tolerances(numbers),
-        *_of_the_finger(numbers),
+        *_check_bag(numbers),
+        *_check_arms(numbers),
+        *_check_nodes(numbers),
+        *_check_topics(numbers),
+        *_check_tolerances(numbers),
+        *_check_finger(numbers),
     ]
     others = sorted(found, key=lambda one: one.gravity != "bad")
-    return [*_of_the_load(numbers, others), *others]
+    return [*_check_load(numbers, others), *others]
 
 
-def _of_the_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
-    """Report a busy computer. others: the other findings."""
+def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
+    """Report an overloaded computer. others: the other findings."""
     stopped = numbers["events"]["counts"].get("arm", 0)
     for host in numbers["hosts"].values():
         if not host["busy_fraction"]:
@@ -71,9 +71,9 @@ def _of_the_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Itera
         text = f"In {host['busy_fraction']:.0%} of the time {host['busy_at_worst']} (at worst). "
         if stopped:
             times = "once" if stopped == 1 else f"{stopped} times"
-            text += f"An arm dropped out {times}; this is the probable cause. "
+            text += f"An arm stopped following {times}; overload is the probable cause. "
         elif others:
-            text += "This is the probable cause of what was late. "
+            text += "Overload is the probable cause of the delays. "
         often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
         gravity: Gravity = "bad" if stopped or often else "doubtful"
         yield SessionFinding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
@@ -82,11 +82,13 @@ def _of_the_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Itera
 MAX_TOPICS_LISTED = 10
 
 
-def _of_the_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     bag = numbers["bag"]
     if not bag["complete"]:
         yield SessionFinding(
-            "bad", f"The bag is not whole ({bag['problem']}); this is what can be read.", "bag"
+            "bad",
+            f"The bag is incomplete ({bag['problem']}); its readable part is shown.",
+            "bag",
         )
     if lost := int(bag["recording"].get("lost_messages", 0)):
         yield SessionFinding(
@@ -103,18 +105,18 @@ def _of_the_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         text = f"{len(unreadable) - MAX_TOPICS_LISTED} more topics cannot be read."
         yield SessionFinding("doubtful", text, "topics")
     if numbers["git"].get("changed"):
-        text = "The code had been changed since its commit: this run cannot be repeated exactly."
+        text = "The code has changes after its commit, so this run cannot be reproduced exactly."
         yield SessionFinding("doubtful", text, "bag")
     for name, host in numbers["hosts"].items():
         if host["missing_devices"]:
             devices = ", ".join(host["missing_devices"])
-            text = f"{name}: its nodes name devices that do not exist: {devices}."
+            text = f"{name}: devices of its nodes do not exist: {devices}."
             yield SessionFinding("bad", text, "bag")
 
 
-def _of_the_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     counts, first = numbers["events"]["counts"], numbers["events"]["first"]
-    for kind, what in (("estop", "E-stop"), ("fault", "Arm's fault"), ("arm", "Arm not at work")):
+    for kind, what in (("estop", "E-stop"), ("fault", "Arm fault"), ("arm", "Arm not operating")):
         if kind in counts:
             event = next(one for one in first if one["kind"] == kind)
             times = "once" if counts[kind] == 1 else f"{counts[kind]} times"
@@ -122,23 +124,23 @@ def _of_the_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             yield SessionFinding("bad", text, "timeline")
     scene = numbers["scene"] or {}
     for side, arm in numbers["arms"].items():
-        shares = [share for share in arm["joint_speed_ratio"] if share is not None]
-        if shares and max(shares) > ROUNDING * FULL_RATIO:
-            joint = arm["joint_speed_ratio"].index(max(shares)) + 1
-            text = f"{side} arm: joint {joint} went at {max(shares):.0%} of its greatest speed."
+        ratios = [ratio for ratio in arm["joint_speed_ratio"] if ratio is not None]
+        if ratios and max(ratios) > ROUNDING * MAX_LIMIT_RATIO:
+            joint = arm["joint_speed_ratio"].index(max(ratios)) + 1
+            text = f"{side} arm: joint {joint} reached {max(ratios):.0%} of its maximum speed."
             yield SessionFinding("bad", text, "arms")
         for key, limit, scale, unit, what in (
-            ("tool_speed_mm_per_s", "max_tool_speed_m_per_s", 1e3, "mm/s", "its tool went at"),
-            ("edge_force_n", "max_edge_force_n", 1.0, "N", "its edge was pulled with"),
+            ("tool_speed_mm_per_s", "max_tool_speed_m_per_s", 1e3, "mm/s", "tool speed"),
+            ("edge_force_n", "max_edge_force_n", 1.0, "N", "edge force"),
         ):
             most = arm[key]
             if most is not None and limit in scene and most > ROUNDING * scale * scene[limit]:
                 allowed = scale * scene[limit]
-                text = f"{side} arm: {what} {most:.3g} {unit}; {allowed:.3g} {unit} are allowed."
+                text = f"{side} arm: {what} {most:.3g} {unit}, limit {allowed:.3g} {unit}."
                 yield SessionFinding("bad", text, "arms")
 
 
-def _of_the_nodes(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_nodes(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, node in numbers["nodes"].items():
         if node["errors"]:
             count = "an error" if node["errors"] == 1 else f"{node['errors']} errors"
@@ -148,32 +150,32 @@ def _of_the_nodes(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         if node["starts"] > 1:
             yield SessionFinding("bad", f"{name} was started {node['starts']} times.", "nodes")
         if node["degraded"] and not node["errors"]:
-            text = f"{name} called itself degraded {node['degraded']} times: {node['last_error']}"
+            text = f"{name} was degraded {node['degraded']} times: {node['last_error']}"
             yield SessionFinding("doubtful", f"{text.rstrip(' :')}.", "nodes")
 
 
-def _of_the_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, topic in numbers["topics"].items():
         expected, rate = topic["expected_hz"], topic["rate_hz"]
         if topic["refused"]:
             text = f"{name}: {topic['refused']} messages were refused by their readers."
             yield SessionFinding("bad", text, "topics")
         if topic["lost"]:
-            text = f"{name}: {topic['lost']} messages were lost on the way to readers."
+            text = f"{name}: {topic['lost']} messages were lost between writer and readers."
             yield SessionFinding("doubtful", text, "topics")
         if topic["missing"]:
             text = f"{name}: {topic['missing']} messages never reached the recorder."
             yield SessionFinding("doubtful", text, "topics")
         if expected and rate and topic["messages"] > 10 and rate < SLOW_RATIO * expected[0]:
-            text = f"{name} came at {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
+            text = f"{name} had {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
             yield SessionFinding("doubtful", text, "topics")
         if topic["silences"]:
             times = "once" if topic["silences"] == 1 else f"{topic['silences']} times"
-            text = f"{name} fell silent {times}, for {topic['longest_silence_s']:.2f} s at most."
+            text = f"{name} stopped {times}, for at most {topic['longest_silence_s']:.2f} s."
             yield SessionFinding("doubtful", text, "topics")
 
 
-def _of_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     if numbers["scene"] is None:
         return
     tolerances = numbers["scene"]["tolerances"]
@@ -193,36 +195,36 @@ def _of_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         if errors is not None:
             if errors["mean"] > most_mm:
                 text = (
-                    f"In contact the sheet was {errors['mean']:.3g} mm off the {what} finger "
-                    f"in the mean; the scene allows {most_mm:.3g} mm."
+                    f"In contact the mean position error of the sheet to the {what} finger was "
+                    f"{errors['mean']:.3g} mm; the scene allows {most_mm:.3g} mm."
                 )
                 yield SessionFinding("doubtful", text, "sheet")
             break
     body = numbers["soft_body"]
     if body["out_of_range"]:
-        share = body["out_of_range"] / sum(body["methods"].values())
-        text = f"The soft body's method was out of its range in {share:.1%} of its answers."
+        ratio = body["out_of_range"] / sum(body["methods"].values())
+        text = f"The soft body's method was outside its valid range in {ratio:.1%} of its results."
         yield SessionFinding("doubtful", text, "nodes")
 
 
-def _of_the_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     reasons = numbers["finger"]["reasons"]
     total = sum(reasons.values())
     missed = {reason: count for reason, count in reasons.items() if reason != "ok"}
     if total and sum(missed.values()) > MAX_UNSEEN_RATIO * total:
         worst = max(missed, key=lambda reason: missed[reason])
-        share = sum(missed.values()) / total
-        text = f"In {share:.1%} of the pictures there was no valid finger, mostly: {worst}."
+        ratio = sum(missed.values()) / total
+        text = f"{ratio:.1%} of the images had no valid finger; the main reason is: {worst}."
         yield SessionFinding("doubtful", text, "sheet")
     for path in numbers["sheet"]["followed"]:
         if path["drop_outs"]:
             times = "once" if path["drop_outs"] == 1 else f"{path['drop_outs']} times"
             text = (
-                f'The finger on its path "{path["path"]}" was not followed in contact {times}; '
-                f"it was followed for {path['following_ratio']:.1%} of its contact."
+                f'On the path "{path["path"]}" the arms stopped following in contact {times}; '
+                f"they followed for {path['following_ratio']:.1%} of the contact."
             )
             yield SessionFinding("doubtful", text, "sheet")
     frames = numbers["frames"]
     if frames["late"]:
-        text = f"{frames['late']} of {frames['count']} frames were late by more than half a frame."
+        text = f"{frames['late']} of {frames['count']} frames were late by over half a period."
         yield SessionFinding("doubtful", text, "latency")

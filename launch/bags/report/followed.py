@@ -12,8 +12,9 @@ from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 Floats = NDArray[np.float64]
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""At most so far above the undeformed object, the true finger is in contact: a fingertip's pad is
-that soft, and the stroke's wander has a standard deviation of half of it."""
+"""Maximum height of the true finger above the undeformed object in contact.
+
+A fingertip's pad deforms by about this much."""
 
 
 class Sizes:
@@ -24,9 +25,9 @@ class Sizes:
 
     def add(self, values: Floats) -> None:
         """Add values (n,)."""
-        self._moments.take(values)
+        self._moments.add(values)
         for value in values.tolist():
-            self._spread.take(0, value)
+            self._spread.add(0, value)
 
     def summary(self, scale: float) -> dict[str, float] | None:
         """Return the three figures times `scale`; None without a value."""
@@ -37,9 +38,9 @@ class Sizes:
 
 
 class FollowedFinger:
-    """Accumulates the errors of the true sheet against the true finger, exposure by exposure.
+    """Accumulator of the errors of the true sheet against the true finger.
 
-    A drop-out is a time without following that overlaps contact.
+    A drop-out is an interval without following that overlaps contact.
     """
 
     def __init__(self) -> None:
@@ -53,8 +54,8 @@ class FollowedFinger:
     ) -> None:
         """Add consecutive exposures (n,).
 
-        heights_m: of the true finger above the undeformed object, negative below.  following: bool
-        (n,), whether both arms follow a target that follows the finger.
+        heights_m: height of the true finger above the undeformed object, negative below. following:
+        bool (n,), whether both arms follow a target that follows the finger.
         """
         contact = heights_m <= MAX_CONTACT_HEIGHT_M
         self.exposures += len(contact)
@@ -72,7 +73,8 @@ class FollowedFinger:
     def figures(self) -> dict[str, Any]:
         """Return the figures; None where the finger was never in contact.
 
-        contact_ratio: of the exposures on the path.  following_ratio: of those in contact.
+        contact_ratio: fraction of the exposures on the path. following_ratio: fraction of those in
+        contact.
         """
         return {
             "contact_ratio": self._in_contact / self.exposures if self.exposures else None,

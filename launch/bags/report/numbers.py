@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.bags.report.series import Range, Spread, States
-from flexsheet.launch.bags.report.session import Arm, HostLoad, NodeSaid, Session
+from flexsheet.launch.bags.report.session import Arm, HostLoad, NodeSummary, Session
 from flexsheet.launch.bags.report.strokes import FingerRun
 from flexsheet.messages.busy import describe_busy
 from flexsheet.messages.methods import Methods
@@ -23,7 +23,7 @@ METHODS = ("method", *Methods.model_fields)
 
 
 def compute_numbers(session: Session) -> dict[str, Any]:
-    """Compute all figures; None where the bag lacks the data."""
+    """Compute all figures; None where the bag does not contain the data."""
     info, scene = session.info, session.scene
     return {
         "bag": {
@@ -84,7 +84,7 @@ def compute_numbers(session: Session) -> dict[str, Any]:
             "corrections": session.corrections,
             "draw_ms": _spread_ms(session.draw),
         },
-        "nodes": {name: _node(session, name, said) for name, said in session.nodes.items()},
+        "nodes": {name: _node(session, name, one) for name, one in session.nodes.items()},
         "events": {
             "counts": session.events.counts,
             "first": [
@@ -183,25 +183,24 @@ def _stroke(session: Session, stroke: FingerRun) -> dict[str, Any]:
     return row
 
 
-def _node(session: Session, name: str, said: NodeSaid) -> dict[str, Any]:
+def _node(session: Session, name: str, summary: NodeSummary) -> dict[str, Any]:
     planned = None if session.plan is None else session.plan.nodes.get(name)
-    cpu = said.cpu.summary(1.0)
+    cpu = summary.cpu.summary(1.0)
     return {
         "method": None if planned is None else describe_methods(planned.parameters, session.scene),
         "cpu_mean": None if cpu is None else cpu["mean"],
         "cpu_max": None if cpu is None else cpu["max"],
-        "resident_mb": 1e-6 * said.resident_bytes,
-        "starts": said.starts,
-        "degraded": said.degraded,
-        "errors": said.errors,
-        "last_error": said.last_error,
-        "note": said.note,
-        "notes": said.notes,
+        "resident_mb": 1e-6 * summary.resident_bytes,
+        "starts": summary.starts,
+        "degraded": summary.degraded,
+        "errors": summary.errors,
+        "last_error": summary.last_error,
+        "note": summary.note,
     }
 
 
 def describe_methods(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
-    """Describe the methods of a node by family; for `auto` those of the scene."""
+    """Describe the methods that a node uses; `auto` selects those of the scene."""
     by_scene = scene.methods.model_dump() if scene is not None else {}
     by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")
     found = []

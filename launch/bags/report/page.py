@@ -1,4 +1,4 @@
-"""Render the report as one HTML file that needs no network, for screen and print."""
+"""Render the report as one self-contained HTML file for screen and print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
-"""A file that has it may be written over by a later report."""
+"""Marks a file that a later report may overwrite."""
 
 COLOURS = {
     "light": {"ground": "#ffffff", "text": "#1f2328", "quiet": "#57606a", "line": "#d0d7de",
@@ -27,20 +27,20 @@ COLOURS = {
 }  # fmt: skip
 
 SECTIONS = {
-    "findings": "What was wrong",
-    "bag": "What the bag is",
+    "findings": "Problems",
+    "bag": "Recording",
     "timeline": "Timeline",
     "topics": "Topics",
     "latency": "Latency",
     "sheet": "Finger and sheet",
     "arms": "Arms",
     "nodes": "Nodes and methods",
-    "pictures": "Pictures",
+    "pictures": "Images",
 }
 
 EVENTS_SHOWN = 60
 BRIEF_S = 0.02
-"""Shorter states are left out of the page's table; a chart and --json have them."""
+"""Shorter states are omitted from the page's table; the chart and --json contain them."""
 
 _CSS = """
 * { box-sizing: border-box; }
@@ -88,13 +88,13 @@ pre { background: var(--panel); padding: .75rem; overflow-x: auto; }
 
 
 def render_page(session: Session) -> str:
-    """Render the whole page."""
+    """Render the report of a session as HTML."""
     numbers, charts = compute_numbers(session), draw_charts(session)
     name = Path(numbers["bag"]["path"]).name
     body = [
-        '<a class="skip" href="#findings">To what was wrong</a>',
+        '<a class="skip" href="#findings">Skip to the problems</a>',
         f"<header><h1>{escape(name)}</h1>",
-        f'<p class="quiet">{_first_line(numbers)}</p></header>',
+        f'<p class="quiet">{_subtitle(numbers)}</p></header>',
         '<nav aria-label="Sections"><ul>',
         *(f'<li><a href="#{key}">{title}</a></li>' for key, title in SECTIONS.items()),
         "</ul></nav><main>",
@@ -134,7 +134,7 @@ def _section(key: str, content: Iterable[str]) -> Iterator[str]:
     yield "</section>"
 
 
-def _first_line(numbers: Mapping[str, Any]) -> str:
+def _subtitle(numbers: Mapping[str, Any]) -> str:
     bag, scene = numbers["bag"], numbers["scene"]
     parts = [
         bag["recording"].get("started", "recorded at an unknown time")[:19].replace("T", " "),
@@ -148,9 +148,9 @@ def _first_line(numbers: Mapping[str, Any]) -> str:
 
 def _findings(findings: Sequence[SessionFinding]) -> Iterator[str]:
     if not findings:
-        yield '<p class="good">✓ Nothing was found.</p>'
+        yield '<p class="good">✓ No problem was found.</p>'
     else:
-        marks = {"bad": "✕ Wrong:", "doubtful": "▲ Doubtful:"}
+        marks = {"bad": "✕ Failure:", "doubtful": "▲ Check:"}
         yield '<ul class="findings">'
         for one in findings:
             yield (
@@ -158,7 +158,7 @@ def _findings(findings: Sequence[SessionFinding]) -> Iterator[str]:
                 f'<a href="#{one.section}">{SECTIONS[one.section]}</a></li>'
             )
         yield "</ul>"
-    yield f'<p class="quiet">Looked at: {CHECKED}.</p>'
+    yield f'<p class="quiet">Checked: {CHECKED}.</p>'
 
 
 def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
@@ -166,8 +166,8 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
     code = git.get("commit")
     rows = [
         ("File", bag["path"]),
-        ("Whole", "yes" if bag["complete"] else f"no: {bag['problem']}"),
-        ("Begun", bag["recording"].get("started", "unknown")),
+        ("Complete", "yes" if bag["complete"] else f"no: {bag['problem']}"),
+        ("Started", bag["recording"].get("started", "unknown")),
         ("Clock", bag["recording"].get("clock_id", "unknown")),
         ("Code", "unknown" if code is None else code + (", changed" if git.get("changed") else "")),
     ]
@@ -180,20 +180,20 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
             ("Plan", graph["hash"]),
             ("Hosts", ", ".join(f"{name} ({at})" for name, at in graph["hosts"].items())),
             ("Calibrations", "; ".join(f"{k}: {v}" for k, v in graph["calibrations"].items())
-             or "none: the scene's optics and geometry hold"),
+             or "none: the nodes use the scene's optics and geometry"),
         ]  # fmt: skip
     if scene is None:
-        yield _missing("No scene was recorded: nothing can be judged by its tolerances.")
+        yield _missing("No scene was recorded, so no tolerances can be checked.")
     else:
         rows += [
             ("Scenes", ", ".join(scene["all"])),
             ("Object", scene["shape"]),
             ("Camera", scene["camera"]),
         ]
-    yield table("The recording", ("what", "value"), rows)
+    yield table("The recording", ("property", "value"), rows)
     if numbers["hosts"]:
         yield table(
-            "Computers, at the end",
+            "Computers at the end of the recording",
             ("host", "busy, % of the time", "code", "Python", "load per core", "free disk, GB",
              "missing devices"),
             [
@@ -203,7 +203,7 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
                 for name, one in numbers["hosts"].items()
             ],
         )  # fmt: skip
-    yield "<h3>To go on</h3>"
+    yield "<h3>Further commands</h3>"
     path = escape(bag["path"])
     yield (
         f"<pre>flexsheet bag info {path}\nflexsheet bag verify planner {path}\n"
@@ -212,7 +212,7 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
-    yield figure(charts.get("timeline"), "Neither arms nor finger nor sheet were recorded.")
+    yield figure(charts.get("timeline"), "No arm, finger or sheet was recorded.")
     rows = [
         (what, ", ".join(f"{state} {duration(s)}" for state, s in spent.items() if s > BRIEF_S))
         for what, spent in (
@@ -223,24 +223,24 @@ def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterat
         if spent
     ]
     if rows:
-        yield table("How long in which state", ("what", "state and time"), rows)
+        yield table("Time in each state", ("part", "state and time"), rows)
     events, counts = numbers["events"]["first"], numbers["events"]["counts"]
     if not events:
         yield "<p>No scene, bookmark, gap, fault, restart or e-stop was recorded.</p>"
         return
     texts = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
-    title = f"What happened ({texts})"
+    title = f"Events ({texts})"
     if len(events) > EVENTS_SHOWN:
-        title += f"; the first {EVENTS_SHOWN}, all are in --json"
-    told_of = [(one["seconds"], one["kind"], one["text"]) for one in events[:EVENTS_SHOWN]]
-    yield table(title, ("at, s", "kind", "what"), told_of)
+        title += f"; the first {EVENTS_SHOWN}; --json contains all"
+    event_rows = [(one["seconds"], one["kind"], one["text"]) for one in events[:EVENTS_SHOWN]]
+    yield table(title, ("time, s", "kind", "event"), event_rows)
 
 
 def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
     rows = []
     for name, one in numbers["topics"].items():
         expected = one["expected_hz"]
-        # How old what is said once is, is no news.
+        # The age of a message that is published once has no meaning.
         flows = expected is not None or (one["rate_hz"] or 0.0) > 1.0
         rows.append(
             (
@@ -248,8 +248,8 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
                 one["messages"] if one["recorded"] else "not recorded",
                 one["rate_hz"] if flows else None,
                 None if expected is None else f"{expected[0]:g} to {expected[1]:g}",
-                _of(one["readers_age_ms"] or one["age_ms"], "p50") if flows else None,
-                _of(one["readers_age_ms"] or one["age_ms"], "p99") if flows else None,
+                _lookup(one["readers_age_ms"] or one["age_ms"], "p50") if flows else None,
+                _lookup(one["readers_age_ms"] or one["age_ms"], "p99") if flows else None,
                 one["longest_silence_s"] if expected else None,
                 one["skipped"],
                 one["lost"],
@@ -258,45 +258,46 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
             )
         )
     yield table(
-        "Per topic. Age: from the source stamp, at its readers (at the recorder where nobody else "
-        "reads). Skipped: superseded before a reader came to it, which is meant to be; lost: on "
-        "the way to readers; missing: in the bag.",
+        "Age: time since the source stamp at the readers, or at the recorder if there is no other "
+        "reader. Skipped: replaced by a newer message before it was read, by design. Lost: "
+        "between writer and readers. Missing: not in the bag.",
         ("topic", "messages", "Hz", "expected, Hz", "age, ms", "age 99 %, ms",
          "longest silence, s", "skipped", "lost", "missing", "refused"),
         rows,
     )  # fmt: skip
     if not any(name == "status" and one["messages"] for name, one in numbers["topics"].items()):
-        yield _missing("Without the topic status, nothing is known of readers.")
+        yield _missing("The topic status was not recorded, so the readers are unknown.")
 
 
 def _latency(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
-    yield figure(charts.get("latency"), "No recorded topic has a latency.")
+    yield figure(charts.get("latency"), "No topic with a latency was recorded.")
     rows = [
         (event, one["p50"], one["p99"], one["max"], one["count"])
         for event, one in numbers["latency_ms"].items()
     ]
     if rows:
-        head = ("from the exposure to", "median, ms", "99 %, ms", "longest, ms", "times")
+        head = ("from the exposure to", "median, ms", "99 %, ms", "maximum, ms", "count")
         yield table("Latency over the whole bag (quantiles to 2.3 %)", head, rows)
     frames = numbers["frames"]
     if frames["count"]:
+        median_ms = _format(_lookup(frames["draw_ms"], "p50"))
         yield (
-            f"<p>{frames['count']} frames, drawn in {_said(_of(frames['draw_ms'], 'p50'))} ms "
-            f"(median), {frames['late']} of them late.</p>"
+            f"<p>{frames['count']} frames, drawn in {median_ms} ms (median), {frames['late']} of "
+            "them late.</p>"
         )
     else:
         yield _missing("No frame was recorded.")
 
 
 def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
-    yield figure(charts.get("path"), "Neither finger nor sheet were recorded.")
+    yield figure(charts.get("path"), "No finger or sheet was recorded.")
     contact = numbers["sheet"]["contact"]
     strokes = numbers["sheet"]["strokes"]
     if "errors" in charts:
         yield figure(charts["errors"], "")
         yield table(
             "In contact, over the whole bag",
-            ("error", "mean", "standard deviation", "greatest"),
+            ("error", "mean", "standard deviation", "maximum"),
             [_summary(name, contact[key]) for name, key in (
                 ("Δd to the measured finger, mm", "delta_d_mm"),
                 ("Δθ to the measured finger, degrees", "delta_theta_deg"),
@@ -306,13 +307,12 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
         )  # fmt: skip
     else:
         yield _missing(
-            "No Δd and Δθ: the bag holds no contact with scene, finger and both arms recorded."
+            "No Δd and Δθ: the bag does not contain scene, finger and both arms in contact."
         )
     if strokes:
         yield table(
-            "Strokes of the experiment: means (and greatest), as flexsheet experiment stroke has "
-            "them",
-            ("stroke, s", "begins at, s", "Δd, mm", "Δθ, degrees", "true Δd, mm",
+            "Strokes of the experiment: mean (maximum), as from flexsheet experiment stroke",
+            ("stroke, s", "start, s", "Δd, mm", "Δθ, degrees", "true Δd, mm",
              "true Δθ, degrees"),
             [
                 (one["seconds"], one["begins_s"], *(_mean(one[key]) for key in (
@@ -323,16 +323,16 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
     if followed := numbers["sheet"]["followed"]:
         yield table(
             "The true finger along each path. In contact: at most 1 mm above the object. Followed: "
-            "both arms followed a target that followed the finger. Δd and Δθ: of the true sheet, "
-            "in contact, mean (95 %, greatest)",
-            ("path", "begins at, s", "lasted, s", "in contact, %", "followed in contact, %",
+            "both arms followed a target that followed the finger. Δd and Δθ: errors of the true "
+            "sheet in contact, mean (95 %, maximum)",
+            ("path", "start, s", "duration, s", "in contact, %", "followed in contact, %",
              "drop-outs", "true Δd, mm", "true Δθ, degrees"),
             [
                 (
                     one["path"], one["begins_s"], one["seconds"], 100.0 * one["contact_ratio"],
                     None if one["following_ratio"] is None else 100.0 * one["following_ratio"],
                     one["drop_outs"],
-                    *(_sizes(one["contact"][key]) for key in (
+                    *(_format_sizes(one["contact"][key]) for key in (
                         "true_delta_d_mm", "true_delta_theta_deg")),
                 )
                 for one in followed
@@ -341,27 +341,27 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
     reasons = numbers["finger"]["reasons"]
     if reasons:
         texts = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
-        yield f"<p>Results of the images: {escape(texts)}.</p>"
+        yield f"<p>Tracking results: {escape(texts)}.</p>"
 
 
 def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[str]:
     if not numbers["arms"]:
         yield _missing("No arm was recorded.")
         return
-    yield figure(charts.get("joints"), "Too few states to tell joint speeds.")
+    yield figure(charts.get("joints"), "Too few arm states for joint speeds.")
     yield figure(charts.get("force"), "No edge force was recorded.")
     scene = numbers["scene"]
     yield table(
-        "Greatest values",
+        "Maximum values",
         ("arm", "joint speed, % of its limit", "tool speed, mm/s", "edge force, N",
-         "exchange with the arm 99 %, ms"),
+         "cycle of the arm 99 %, ms"),
         [
             (
                 side,
                 max((100.0 * s for s in one["joint_speed_ratio"] if s is not None), default=None),
                 one["tool_speed_mm_per_s"],
                 one["edge_force_n"],
-                _of(one["cycle_ms"], "p99"),
+                _lookup(one["cycle_ms"], "p99"),
             )
             for side, one in numbers["arms"].items()
         ],
@@ -375,12 +375,12 @@ def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[s
 
 def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
     if not numbers["nodes"]:
-        yield _missing("Without the topic status, nothing is known of the nodes.")
+        yield _missing("The topic status was not recorded, so the nodes are unknown.")
     else:
         yield table(
-            "What each node said of itself",
-            ("node", "method", "CPU mean, %", "CPU most, %", "memory, MB", "starts", "errors",
-             "last word"),
+            "Status of the nodes",
+            ("node", "method", "CPU mean, %", "CPU maximum, %", "memory, MB", "starts", "errors",
+             "last error or note"),
             [
                 (name, one["method"] or "", 100.0 * one["cpu_mean"], 100.0 * one["cpu_max"],
                  one["resident_mb"], one["starts"], one["errors"],
@@ -392,13 +392,13 @@ def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
     chosen = [
         (what, ", ".join(f"{name} ({count})" for name, count in counts.items()))
         for what, counts in (
-            ("soft body, answers by method", body["methods"]),
-            ("picture, frames by correction", frames["corrections"]),
+            ("soft body, results by method", body["methods"]),
+            ("image, frames by correction", frames["corrections"]),
         )
         if counts
     ]
     if chosen:
-        yield table("Methods that were used", ("what", "methods"), chosen)
+        yield table("Methods used", ("part", "methods"), chosen)
     graph = numbers["graph"]
     if graph:
         rows = [
@@ -407,16 +407,16 @@ def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
             for name, one in graph["nodes"].items()
         ]  # fmt: skip
         yield "<details><summary>Parameters of all nodes</summary>"
-        yield table("As the launch file resolves", ("node", "type", "host", "parameters"), rows)
+        yield table("Resolved launch file", ("node", "type", "host", "parameters"), rows)
         yield "</details>"
 
 
 def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
     albums = (
-        ("What the camera saw", session.stereo, "stereo",
+        ("Stereo camera", session.stereo, "stereo",
          "Record stereo images with: flexsheet bag record BAG --include stereo."),
-        ("Through the user's eye", session.eye, "eye", "The twin's eye took no picture."),
-        ("What the projector was given", session.drawn, "frame",
+        ("User's eye", session.eye, "eye", "The simulated eye recorded no image."),
+        ("Projector", session.drawn, "frame",
          "No frame was recorded with its pixels."),
     )  # fmt: skip
     for title, album, key, missing in albums:
@@ -426,7 +426,7 @@ def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             yield _missing(missing)
             continue
         if numbers["pictures"][key] > len(shots):
-            rest = f", {album.left_out} shots at bookmarks left out" if album.left_out else ""
+            rest = f", without {album.left_out} shots at bookmarks" if album.left_out else ""
             yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
         yield from _album(title, album)
 
@@ -437,10 +437,10 @@ def _album(title: str, album: Album) -> Iterator[str]:
         images = "".join(_image(title, shot, *one) for one in shot.pictures)
         yield f'<figure><div class="pair">{images}</div>'
         marked = f" <strong>Bookmark: {escape(shot.marked)}.</strong>" if shot.marked else ""
-        said = " | ".join(name for name, _ in shot.pictures)
+        names = " | ".join(name for name, _ in shot.pictures)
         yield (
             f"<figcaption>{shot.seconds:.2f} s. {escape(shot.title)}{marked}<br>"
-            f"{escape(said)}</figcaption></figure>"
+            f"{escape(names)}</figcaption></figure>"
         )
     yield "</div>"
 
@@ -451,7 +451,7 @@ def _image(title: str, shot: Shot, name: str, jpeg: bytes) -> str:
 
 
 def figure(chart: Chart | None, missing: str) -> str:
-    """Render a chart with its caption, or the reason why there is none."""
+    """Render a chart with its caption, or the text `missing` without a chart."""
     if chart is None:
         return _missing(missing)
     data = b64encode(chart.svg.encode()).decode()
@@ -463,14 +463,14 @@ def figure(chart: Chart | None, missing: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Render a table whose first column heads its rows; numbers to three digits, right-aligned."""
+    """Render a table: the first column contains row headers, numbers have three digits."""
     body = []
     for first, *rest in rows:
         cells = "".join(_cell(value) for value in rest)
-        body.append(f'<tr><th scope="row">{escape(_said(first))}</th>{cells}</tr>')
+        body.append(f'<tr><th scope="row">{escape(_format(first))}</th>{cells}</tr>')
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     return (
-        # Wide tables scroll by themselves; by keyboard, too.
+        # A wide table scrolls separately from the page; tabindex allows the keyboard.
         f'<div class="scroll" role="region" aria-label="{escape(caption, quote=True)}" '
         f'tabindex="0"><table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
@@ -480,11 +480,11 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> s
 def _cell(value: Any) -> str:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     kind = ' class="number"' if number else ""
-    return f"<td{kind}>{escape(_said(value))}</td>"
+    return f"<td{kind}>{escape(_format(value))}</td>"
 
 
-def _said(value: Any) -> str:
-    """Format a value for people."""
+def _format(value: Any) -> str:
+    """Format a value for display."""
     match value:
         case None:
             return "–"
@@ -495,7 +495,7 @@ def _said(value: Any) -> str:
     return str(value)
 
 
-def _of(values: Mapping[str, Any] | None, key: str) -> float | None:
+def _lookup(values: Mapping[str, Any] | None, key: str) -> float | None:
     return None if values is None else values[key]
 
 
@@ -509,7 +509,7 @@ def _mean(values: Mapping[str, float] | None) -> str:
     return "–" if values is None else f"{values['mean']:.3g} ({values['max']:.3g})"
 
 
-def _sizes(values: Mapping[str, float] | None) -> str:
+def _format_sizes(values: Mapping[str, float] | None) -> str:
     if values is None:
         return "–"
     return f"{values['mean']:.3g} ({values['p95']:.3g}, {values['max']:.3g})"
@@ -520,7 +520,7 @@ def _missing(text: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration for people: 3.2 s, 4 min 10 s, 2 h 5 min."""
+    """Format a duration for display: 3.2 s, 4 min 10 s, 2 h 5 min."""
     if seconds < 60.0:
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)

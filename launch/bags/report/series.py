@@ -24,7 +24,7 @@ MAX_STATE_AGE_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Divide the time of a bag into equal intervals."""
+    """Division of the time of a bag into equal intervals."""
 
     start_ns: int
     duration_s: float
@@ -32,8 +32,8 @@ class Grid:
 
     def index(self, at_ns: int) -> int:
         """Return the interval of a time; times outside belong to the first or the last one."""
-        share = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
-        return min(max(int(share * self.count), 0), self.count - 1)
+        fraction = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
+        return min(max(int(fraction * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
         """Return the centres (count,) of the intervals, s since the start of the bag."""
@@ -42,35 +42,36 @@ class Grid:
 
 
 class Range:
-    """Store minimum and maximum of each interval; NaN without a value."""
+    """Minimum and maximum of each interval; NaN without a value."""
 
     def __init__(self, grid: Grid) -> None:
-        self.least = np.full(grid.count, np.nan)
-        self.most = np.full(grid.count, np.nan)
+        self.minimum = np.full(grid.count, np.nan)
+        self.maximum = np.full(grid.count, np.nan)
 
-    def take(self, index: int, value: float) -> None:
-        # NaN fails every comparison.
-        if not value >= self.least[index]:
-            self.least[index] = value
-        if not value <= self.most[index]:
-            self.most[index] = value
+    def add(self, index: int, value: float) -> None:
+        """Add a value to an interval."""
+        # A comparison with NaN is false.
+        if not value >= self.minimum[index]:
+            self.minimum[index] = value
+        if not value <= self.maximum[index]:
+            self.maximum[index] = value
 
     def overall(self) -> tuple[float, float] | None:
         """Return minimum and maximum of all; None without a value."""
-        if np.isnan(self.most).all():
+        if np.isnan(self.maximum).all():
             return None
-        return float(np.nanmin(self.least)), float(np.nanmax(self.most))
+        return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
 
 
 class Spread:
-    """Store a logarithmic histogram of durations for each interval."""
+    """Logarithmic histogram of durations for each interval."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
         self.longest_s = 0.0
 
-    def take(self, index: int, duration_s: float) -> None:
-        """Add a duration; below `MIN_DURATION_S` (or negative) it counts as that."""
+    def add(self, index: int, duration_s: float) -> None:
+        """Add a duration; a shorter one counts as `MIN_DURATION_S`."""
         self.longest_s = max(self.longest_s, duration_s)
         cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
@@ -79,42 +80,42 @@ class Spread:
     def count(self) -> int:
         return int(self.counts.sum())
 
-    def quantile_s(self, share: float) -> float | None:
+    def quantile_s(self, fraction: float) -> float | None:
         """Return a quantile of all durations, to 2.3 %; None without a value."""
-        found = _quantiles(self.counts.sum(axis=0, keepdims=True), share)[0]
+        found = _quantiles(self.counts.sum(axis=0, keepdims=True), fraction)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
-    def quantiles_s(self, share: float) -> Floats:
+    def quantiles_s(self, fraction: float) -> Floats:
         """Return the quantile of each interval, (count,); NaN without a value."""
-        return _quantiles(self.counts, share)
+        return _quantiles(self.counts, fraction)
 
 
-def _quantiles(counts: NDArray[np.int32], share: float) -> Floats:
+def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
     """Return quantiles (n,) of rows (n, CELLS) of counts."""
     sums = np.cumsum(counts, axis=1)
-    wanted = share * sums[:, -1:]
-    cell = np.argmax(sums >= np.maximum(wanted, 1), axis=1)
+    rank = fraction * sums[:, -1:]
+    cell = np.argmax(sums >= np.maximum(rank, 1), axis=1)
     before = np.take_along_axis(sums - counts, cell[:, None], axis=1)[:, 0]
     inside = np.take_along_axis(counts, cell[:, None], axis=1)[:, 0]
-    part = np.clip((wanted[:, 0] - before) / np.maximum(inside, 1), 0.0, 1.0)
+    part = np.clip((rank[:, 0] - before) / np.maximum(inside, 1), 0.0, 1.0)
     found = MIN_DURATION_S * 10.0 ** ((cell + part) / CELLS_PER_DECADE)
     return np.where(sums[:, -1] > 0, found, np.nan)
 
 
 class PointSeries:
-    """Store the last point of each interval, (count, 3); NaN without a point."""
+    """Last point of each interval, (count, 3); NaN without a point."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
 
-    def take(self, index: int, point: Floats) -> None:
+    def add(self, index: int, point: Floats) -> None:
         self.points[index] = point
 
 
 class States:
-    """Store the gravest state of each interval, and the total time in each state.
+    """Most severe state of each interval, and total time in each state.
 
-    order: the known states, from the least to the most important.
+    order: the expected states, from the least to the most severe.
     """
 
     NOTHING = -1
@@ -127,8 +128,8 @@ class States:
         self.state: str | None = None
         self._since_ns = 0
 
-    def take(self, index: int, at_ns: int, state: str) -> bool:
-        """Be in that state at `at_ns`; says whether it was another one before."""
+    def add(self, index: int, at_ns: int, state: str) -> bool:
+        """Set the state at `at_ns`; return whether it has changed."""
         if state not in self.seconds:
             self.names.append(state)
             self.seconds[state] = 0.0
@@ -144,19 +145,19 @@ class States:
 
 @dataclass(slots=True)
 class RunningMoments:
-    """Accumulate mean, standard deviation and maximum of values that are not stored."""
+    """Mean, standard deviation and maximum of values that are not stored."""
 
     count: int = 0
     total: float = 0.0
     squares: float = 0.0
-    most: float = 0.0
+    maximum: float = 0.0
 
-    def take(self, values: Floats) -> None:
+    def add(self, values: Floats) -> None:
         if len(values):
             self.count += len(values)
             self.total += float(values.sum())
             self.squares += float((values**2).sum())
-            self.most = max(self.most, float(values.max()))
+            self.maximum = max(self.maximum, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
         """Return the three figures times `scale`; None without a value."""
@@ -164,12 +165,12 @@ class RunningMoments:
             return None
         mean = self.total / self.count
         variance = max(self.squares / self.count - mean**2, 0.0)
-        return {"mean": scale * mean, "std": scale * variance**0.5, "max": scale * self.most}
+        return {"mean": scale * mean, "std": scale * variance**0.5, "max": scale * self.maximum}
 
 
 @dataclass(slots=True)
 class Events:
-    """Store events in order, at most `limit` of each kind; count all."""
+    """Events in order, at most `limit` of each kind, and the count of all."""
 
     limit: int = 100
     held: list[tuple[float, str, str]] = field(default_factory=list)
@@ -180,5 +181,5 @@ class Events:
         if self.counts[kind] <= self.limit:
             self.held.append((seconds, kind, text))
 
-    def of(self, kind: str) -> list[tuple[float, str]]:
+    def select(self, kind: str) -> list[tuple[float, str]]:
         return [(seconds, text) for seconds, its, text in self.held if its == kind]

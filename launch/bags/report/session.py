@@ -52,14 +52,13 @@ from flexsheet.messages.types import (
 Floats = NDArray[np.float64]
 Progress = Callable[[float, float], None]
 
-STRETCHES, FINE_STRETCHES = 240, 1200
+MAX_INTERVALS, FINE_INTERVALS = 240, 1200
 MIN_INTERVAL_S = 0.25
 STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
-NOTES_KEPT = 8
-LIVED_BEFORE_S = 10.0
+MIN_EARLIER_UPTIME_S = 10.0
 SILENT_PERIODS, MIN_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
-"""Joint and tool speeds are taken over so long: single stamps are not even enough."""
+"""Interval over which speeds are averaged, because single stamps are irregular."""
 
 PHASES = ("wait", "approach", "contact", "hold")
 MODES = (
@@ -71,10 +70,10 @@ FAULTY = ("fault", "estop", "disconnected", "stopping")
 
 @dataclass(slots=True)
 class Flow:
-    """What the bag holds of a topic: how evenly it came and what is missing in its numbering.
+    """Regularity of a topic, and its missing sequence numbers.
 
-    messages: that the bag holds.  lost: by gaps in the writers' numbering.  silences: longer than
-    ten of the slowest expected period.  age: from the source stamp to the recorder.
+    lost: messages missing from the writers' numbering. silences: intervals longer than ten of the
+    slowest expected period. age: time from the source stamp to the recorder.
     """
 
     age: Spread
@@ -88,8 +87,11 @@ class Flow:
 
 @dataclass(slots=True)
 class PortTotals:
-    """What the readers of a topic said of it; what earlier starts of a node counted is in
-    skipped, lost and refused, and taken from them what it had counted before the bag began."""
+    """Counts of the messages that the readers of a topic skipped, lost and refused.
+
+    The counters contain earlier starts of a node. Counts from before the start of the bag are
+    subtracted.
+    """
 
     age: Spread
     newest: dict[str, tuple[int, PortStatus]] = field(default_factory=dict)
@@ -97,24 +99,27 @@ class PortTotals:
     lost: int = 0
     refused: int = 0
 
-    def take(self, node: str, epoch: int, port: PortStatus, *, lived_before: bool) -> None:
-        """lived_before: the node had been counting long before the bag began."""
+    def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
+        """Add a reader's counters.
+
+        started_earlier: the node had been counting long before the start of the bag.
+        """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
-            self._add(before[1], 1)
-        if before is None and lived_before:
-            self._add(port, -1)
+            self._add_counts(before[1], 1)
+        if before is None and started_earlier:
+            self._add_counts(port, -1)
         self.newest[node] = (epoch, port)
         if port.age_s is not None:
-            self.age.take(0, port.age_s)
+            self.age.add(0, port.age_s)
 
-    def _add(self, port: PortStatus, sign: int) -> None:
+    def _add_counts(self, port: PortStatus, sign: int) -> None:
         self.skipped += sign * port.dropped
         self.lost += sign * port.gaps
         self.refused += sign * port.rejected
 
     def totals(self) -> tuple[int, int, int]:
-        """Skipped, lost and refused messages of all readers."""
+        """Return the skipped, lost and refused messages of all readers."""
         now = [port for _, port in self.newest.values()]
         return (
             self.skipped + sum(port.dropped for port in now),
@@ -125,7 +130,7 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """Count how often a host was reported busy, and store the worst report."""
+    """How often a host was reported busy, and its worst report."""
 
     reports: int = 0
     busy: int = 0
@@ -145,8 +150,8 @@ def _pressure(host: HostStatus) -> float:
 
 
 @dataclass(slots=True)
-class NodeSaid:
-    """Summarize a node's status messages."""
+class NodeSummary:
+    """Summary of a node's status messages."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -156,11 +161,10 @@ class NodeSaid:
     errors: int = 0
     last_error: str = ""
     note: str = ""
-    notes: list[str] = field(default_factory=list)
 
-    def take(self, status: Status, epoch: int) -> bool:
-        """Heed a status; says whether there is an error that was not there before."""
-        self.cpu.take(np.array([status.cpu_ratio]))
+    def add(self, status: Status, epoch: int) -> bool:
+        """Add a status message; return whether it contains a new error."""
+        self.cpu.add(np.array([status.cpu_ratio]))
         self.resident_bytes = max(self.resident_bytes, status.resident_bytes)
         if epoch != self.epoch:
             self.epoch, self.starts = epoch, self.starts + 1
@@ -169,14 +173,11 @@ class NodeSaid:
         self.errors = max(self.errors, status.errors)
         self.last_error = status.last_error or self.last_error
         self.note = status.note
-        head = "".join("#" if one.isdigit() else one for one in status.note)
-        if head and head not in self.notes and len(self.notes) < NOTES_KEPT:
-            self.notes.append(head)
         return news
 
 
 class Arm:
-    """One arm over time: its mode, its speeds over the limits, the pull at its edge."""
+    """Summary of one arm: modes, speeds and edge force."""
 
     def __init__(self, grid: Grid, fine: Grid) -> None:
         self.modes = States(fine, MODES)
@@ -184,33 +185,33 @@ class Arm:
         self.tool_speed, self.edge_force = Range(grid), Range(grid)
         self.cycle = Spread(Grid(0, 1.0, 1))
         self.faults: tuple[str, ...] = ()
-        self._lately: deque[tuple[int, Floats, Floats]] = deque()
+        self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
-    def take(self, arm: ArmState, source_ns: int, index: int) -> None:
-        """Heed a state whose joints were measured at `source_ns`."""
-        self.cycle.take(0, arm.cycle_s)
+    def add(self, arm: ArmState, source_ns: int, index: int) -> None:
+        """Add a state whose joints were measured at `source_ns`."""
+        self.cycle.add(0, arm.cycle_s)
         if arm.edge_force_n is not None:
-            self.edge_force.take(index, arm.edge_force_n)
-        lately = self._lately
-        if lately and not 0 < source_ns - lately[-1][0] < 4 * SPEED_OVER_NS:
-            if source_ns == lately[-1][0]:
+            self.edge_force.add(index, arm.edge_force_n)
+        recent = self._recent
+        if recent and not 0 < source_ns - recent[-1][0] < 4 * SPEED_OVER_NS:
+            if source_ns == recent[-1][0]:
                 return
-            lately.clear()
-        lately.append((source_ns, arm.joints_rad, arm.world_from_flange[:3, 3]))
-        while len(lately) > 2 and source_ns - lately[1][0] >= SPEED_OVER_NS:
-            lately.popleft()
-        passed_s = (source_ns - lately[0][0]) * 1e-9
+            recent.clear()
+        recent.append((source_ns, arm.joints_rad, arm.world_from_flange[:3, 3]))
+        while len(recent) > 2 and source_ns - recent[1][0] >= SPEED_OVER_NS:
+            recent.popleft()
+        passed_s = (source_ns - recent[0][0]) * 1e-9
         if passed_s * 1e9 < SPEED_OVER_NS:
             return
-        speeds = np.abs(arm.joints_rad - lately[0][1]) / passed_s
+        speeds = np.abs(arm.joints_rad - recent[0][1]) / passed_s
         for range_, speed in zip(self.joint_speed, speeds.tolist(), strict=True):
-            range_.take(index, speed)
-        way_m = float(np.linalg.norm(lately[-1][2] - lately[0][2]))
-        self.tool_speed.take(index, way_m / passed_s)
+            range_.add(index, speed)
+        distance_m = float(np.linalg.norm(recent[-1][2] - recent[0][2]))
+        self.tool_speed.add(index, distance_m / passed_s)
 
 
 class Session:
-    """Hold the summary of a bag. `scene`: the last one."""
+    """Summary of a bag. `scene`: the last one."""
 
     def __init__(
         self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
@@ -218,16 +219,16 @@ class Session:
         self.info, self.metadata = info, reader.metadata
         self.plan, self.git = _read_plan(reader), _read_json(reader, "git.json")
         length_s = max(info.duration_s, 1e-3)
-        stretches = int(np.clip(length_s / MIN_INTERVAL_S, 1, STRETCHES))
+        stretches = int(np.clip(length_s / MIN_INTERVAL_S, 1, MAX_INTERVALS))
         self.grid = Grid(info.start_ns, length_s, stretches)
-        self.fine = Grid(info.start_ns, length_s, FINE_STRETCHES)
+        self.fine = Grid(info.start_ns, length_s, FINE_INTERVALS)
         self.clock_id = reader.metadata.get("recording", {}).get("clock_id", "")
         self.scene: Scene | None = None
         self.scenes: list[str] = []
         self.events = Events()
         self.flows: dict[str, Flow] = {}
         self.ports: dict[str, PortTotals] = {}
-        self.nodes: dict[str, NodeSaid] = {}
+        self.nodes: dict[str, NodeSummary] = {}
         self.hosts: dict[str, HostStatus] = {}
         self.loads: dict[str, HostLoad] = {}
         self.latencies: dict[str, Spread] = {}
@@ -235,8 +236,8 @@ class Session:
         self.estop = States(self.fine, ("released", "engaged"))
         self.arms = {side: Arm(self.grid, self.fine) for side in ("left", "right")}
         self.reasons: dict[str, int] = {}
-        self.finger_place, self.true_place = PointSeries(self.fine), PointSeries(self.fine)
-        self.sheet_place = PointSeries(self.fine)
+        self.finger_path, self.true_path = PointSeries(self.fine), PointSeries(self.fine)
+        self.sheet_path = PointSeries(self.fine)
         self.push, self.force = Range(self.grid), Range(self.grid)
         self.body_methods: dict[str, int] = {}
         self.out_of_range = 0
@@ -250,51 +251,50 @@ class Session:
         self._table = ClockTable(self.clock_id)
         self._exposures: dict[str, int] = {}
         self._restarts: dict[str, int] = {}
-        self._finger_said = ""
+        self._finger_text = ""
         self._late_before: int | None = None
 
-    def take(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
-        """Heed one message of the bag."""
-        self._take_flow(topic, header, log_ns)
+    def add(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
+        """Add one message of the bag."""
+        self._add_flow(topic, header, log_ns)
         if isinstance(message, Clocks) and header.clock_id == self.clock_id:
             self._table.update(message)
-        # What a message says of durations stands on its own writer's clock alone; only what is
-        # brought together with others must be put into the recorder's.
+        # Durations inside a message use the writer's clock alone, so they need no conversion.
         seconds, index = self.seconds(log_ns), self.grid.index(log_ns)
         for event, exposure_ns, at_ns in list_events(message, header):
             if self._exposures.get(event) != exposure_ns:
                 self._exposures[event] = exposure_ns
                 if event not in self.latencies:
                     self.latencies[event] = Spread(self.grid)
-                self.latencies[event].take(index, (at_ns - exposure_ns) * 1e-9)
+                self.latencies[event].add(index, (at_ns - exposure_ns) * 1e-9)
         if header.clock_id != self.clock_id:
             message, header, _ = self._table.localised(message, header, log_ns)
-        self.errors.take(message, header.source_ns)
+        self.errors.add(message, header.source_ns)
         match message:
             case ArmState():
-                self._take_arm(message, header.source_ns, log_ns)
+                self._add_arm(message, header.source_ns, log_ns)
             case SheetTarget():
-                self._take_target(message, log_ns)
+                self._add_target(message, log_ns)
             case Fingertip():
-                self._take_fingertip(message, log_ns)
+                self._add_fingertip(message, log_ns)
             case TwinFinger():
-                self.true_place.take(self.fine.index(log_ns), message.position_world_m)
+                self.true_path.add(self.fine.index(log_ns), message.position_world_m)
             case Status():
-                self._take_status(message, header, seconds)
+                self._add_status(message, header, seconds)
             case SoftBody():
                 self.body_methods[message.method] = self.body_methods.get(message.method, 0) + 1
                 self.out_of_range += not message.in_range
-                self.force.take(index, float(np.linalg.norm(message.force_world_n)))
+                self.force.add(index, float(np.linalg.norm(message.force_world_n)))
             case Frame() | StereoPair() | TwinEye():
-                self._take_picture(message, seconds)
+                self._add_picture(message, seconds)
             case _:
-                self._take_rare(message, header, log_ns)
+                self._add_rare(message, header, log_ns)
 
     def seconds(self, at_ns: int) -> float:
-        """Since the bag began."""
+        """Return the time since the start of the bag, s."""
         return (at_ns - self.info.start_ns) * 1e-9
 
-    def _take_flow(self, topic: str, header: Header, log_ns: int) -> None:
+    def _add_flow(self, topic: str, header: Header, log_ns: int) -> None:
         flow = self.flows.get(topic)
         if flow is None:
             flow = self.flows[topic] = Flow(Spread(Grid(0, 1.0, 1)))
@@ -304,67 +304,67 @@ class Session:
             flow.lost += header.sequence - before[1] - 1
         flow.sequences[header.writer] = (header.epoch, header.sequence)
         if header.clock_id == self.clock_id:
-            flow.age.take(0, (log_ns - header.source_ns) * 1e-9)
-        if flow.last_ns is not None and topic in silent_after_s:
+            flow.age.add(0, (log_ns - header.source_ns) * 1e-9)
+        if flow.last_ns is not None and topic in SILENCE_LIMITS_S:
             silence_s = (log_ns - flow.last_ns) * 1e-9
             flow.longest_silence_s = max(flow.longest_silence_s, silence_s)
-            if silence_s > silent_after_s[topic]:
+            if silence_s > SILENCE_LIMITS_S[topic]:
                 flow.silences += 1
                 text = f"{topic} silent for {silence_s:.2f} s"
                 self.events.add(self.seconds(flow.last_ns), "gap", text)
         flow.last_ns = log_ns
 
-    def _take_arm(self, arm: ArmState, source_ns: int, log_ns: int) -> None:
+    def _add_arm(self, arm: ArmState, source_ns: int, log_ns: int) -> None:
         mine = self.arms[arm.side]
-        if mine.modes.take(self.fine.index(log_ns), log_ns, arm.mode) and arm.mode in FAULTY:
+        if mine.modes.add(self.fine.index(log_ns), log_ns, arm.mode) and arm.mode in FAULTY:
             text = f"{arm.side} arm: {arm.mode}" + (f", {arm.reason}" if arm.reason else "")
             self.events.add(self.seconds(log_ns), "arm", text)
         for fault in arm.faults:
             if fault not in mine.faults:
                 self.events.add(self.seconds(log_ns), "fault", f"{arm.side} arm: {fault}")
         mine.faults = arm.faults
-        mine.take(arm, source_ns, self.grid.index(log_ns))
+        mine.add(arm, source_ns, self.grid.index(log_ns))
 
-    def _take_target(self, target: SheetTarget, log_ns: int) -> None:
+    def _add_target(self, target: SheetTarget, log_ns: int) -> None:
         fine = self.fine.index(log_ns)
-        self.phases.take(fine, log_ns, target.phase)
-        self.sheet_place.take(fine, target.world_from_sheet[:3, 3])
-        self.push.take(self.grid.index(log_ns), target.push_depth_m)
+        self.phases.add(fine, log_ns, target.phase)
+        self.sheet_path.add(fine, target.world_from_sheet[:3, 3])
+        self.push.add(self.grid.index(log_ns), target.push_depth_m)
 
-    def _take_fingertip(self, finger: Fingertip, log_ns: int) -> None:
+    def _add_fingertip(self, finger: Fingertip, log_ns: int) -> None:
         fine = self.fine.index(log_ns)
-        self.finger.take(fine, log_ns, finger.state)
+        self.finger.add(fine, log_ns, finger.state)
         self.reasons[finger.reason] = self.reasons.get(finger.reason, 0) + 1
-        self._finger_said = f"finger {finger.state}" + (
+        self._finger_text = f"finger {finger.state}" + (
             "" if finger.reason == "ok" else f" ({finger.reason})"
         )
         if finger.valid:
-            self.finger_place.take(fine, finger.position_world_m)
+            self.finger_path.add(fine, finger.position_world_m)
 
-    def _take_status(self, status: Status, header: Header, seconds: float) -> None:
-        said = self.nodes.setdefault(status.node, NodeSaid())
-        starts = said.starts
-        if said.take(status, header.epoch):
+    def _add_status(self, status: Status, header: Header, seconds: float) -> None:
+        summary = self.nodes.setdefault(status.node, NodeSummary())
+        starts = summary.starts
+        if summary.add(status, header.epoch):
             self.events.add(seconds, "error", f"{status.node}: {status.last_error}")
-        if starts and said.starts > starts:
-            self.events.add(seconds, "restart", f"{status.node} was started again")
-        lived_before = status.uptime_s - seconds > LIVED_BEFORE_S
+        if starts and summary.starts > starts:
+            self.events.add(seconds, "restart", f"{status.node} was restarted")
+        earlier = status.uptime_s - seconds > MIN_EARLIER_UPTIME_S
         for port in status.inputs:
             if port.topic not in self.ports:
                 self.ports[port.topic] = PortTotals(Spread(Grid(0, 1.0, 1)))
-            self.ports[port.topic].take(status.node, header.epoch, port, lived_before=lived_before)
+            self.ports[port.topic].add(status.node, header.epoch, port, started_earlier=earlier)
 
-    def _take_picture(self, message: Frame | StereoPair | TwinEye, seconds: float) -> None:
+    def _add_picture(self, message: Frame | StereoPair | TwinEye, seconds: float) -> None:
         match message:
             case StereoPair():
                 pair = (("left camera", message.left), ("right camera", message.right))
-                self.stereo.take(seconds, self._finger_said, pair)
+                self.stereo.add(seconds, self._finger_text, pair)
             case TwinEye():
                 pair = (
-                    ("what the eye sees", message.seen),
-                    ("what it should see", message.expected),
+                    ("seen by the eye", message.seen),
+                    ("expected by the eye", message.expected),
                 )
-                self.eye.take(seconds, named(message.label, message.correction), pair)
+                self.eye.add(seconds, add_correction(message.label, message.correction), pair)
             case Frame():
                 self.frames += 1
                 if self._late_before is None:
@@ -373,12 +373,12 @@ class Session:
                 self.late_frames = max(self.late_frames, late)
                 name = message.correction
                 self.corrections[name] = self.corrections.get(name, 0) + 1
-                self.draw.take(0, message.draw_s)
+                self.draw.add(0, message.draw_s)
                 if message.pixels:
-                    shown = f"{named(message.label, message.correction)}, {message.stereo}"
-                    self.drawn.take(seconds, shown, (("projector", message.pixels[0]),))
+                    shown = f"{add_correction(message.label, message.correction)}, {message.stereo}"
+                    self.drawn.add(seconds, shown, (("projector", message.pixels[0]),))
 
-    def _take_rare(self, message: Message, header: Header, log_ns: int) -> None:
+    def _add_rare(self, message: Message, header: Header, log_ns: int) -> None:
         seconds = self.seconds(log_ns)
         match message:
             case Scene():
@@ -388,8 +388,8 @@ class Session:
                     self.events.add(seconds, "scene", f'scene "{message.name}"')
             case EStop():
                 state = "engaged" if message.engaged else "released"
-                # A latched word is said again for those who come late.
-                if self.estop.take(self.fine.index(log_ns), log_ns, state) or (
+                # A latched e-stop is published again for late subscribers.
+                if self.estop.add(self.fine.index(log_ns), log_ns, state) or (
                     message.engaged and "estop" not in self.events.counts
                 ):
                     text = f"e-stop {state} by {header.writer}: {message.reason}"
@@ -402,18 +402,18 @@ class Session:
                 for node in message.nodes:
                     key = f"{message.run} {node.name}"
                     if node.restarts > self._restarts.get(key, 0):
-                        why = "it hung" if node.hangs else "it had ended"
-                        text = f"{node.name} started again on {message.host}: {why}"
+                        why = "it hung" if node.hangs else "its process ended"
+                        text = f"{node.name} was restarted on {message.host}: {why}"
                         self.events.add(seconds, "restart", text)
                     self._restarts[key] = node.restarts
 
 
-def named(label: str, correction: str) -> str:
+def add_correction(label: str, correction: str) -> str:
     """Add the correction to the label of an image, unless it contains it."""
     return label if correction in label else ", ".join(filter(None, (label, correction)))
 
 
-def _silent_after_s() -> dict[str, float]:
+def _list_silence_limits() -> dict[str, float]:
     """Return the silence limit of topics with a rate and one writer."""
     return {
         topic.name: max(SILENT_PERIODS / topic.rate_hz[0], MIN_SILENCE_S)
@@ -422,11 +422,11 @@ def _silent_after_s() -> dict[str, float]:
     }
 
 
-silent_after_s = _silent_after_s()
+SILENCE_LIMITS_S = _list_silence_limits()
 
 
 def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
-    """Read a bag as far as possible, cut or whole; BagError if nothing can be read."""
+    """Read a bag, even an incomplete one; raise BagError if nothing can be read."""
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}
@@ -438,7 +438,7 @@ def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -
     session = Session(reader, info, bookmarks)
     selected = BagReader(bag, readable)
     for number, (topic, message, header, log_ns) in enumerate(selected):
-        session.take(topic, message, header, log_ns)
+        session.add(topic, message, header, log_ns)
         if number % 200 == 0:
             progress(session.seconds(log_ns), info.duration_s)
     session.errors.finish()
@@ -449,7 +449,7 @@ def _read_plan(reader: BagReader) -> ResolvedGraph | None:
     try:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except (BagError, ValidationError):
-        return None  # a bag of one's own making, or of other code: the page says that it is missing
+        return None  # written by other code; the page reports that the plan is missing
 
 
 def _read_json(reader: BagReader, name: str) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""Compute the paper's errors (its Fig. 9) at every exposure in contact, a block at a time.
+"""Compute the paper's sheet errors (its Fig. 9) at every exposure in contact.
 
-The definitions are those of `launch.experiments.stroke`; here they are applied to any session, in
-memory that does not grow with it.  Where the planner has the sheet comply, the reference is the
-object's surface lowered by the commanded `normal_offset_m`.  In the experiment's own strokes it
-is the surface itself, as in the paper.
+The definitions are those of `launch.experiments.stroke`. They are applied in blocks, so the memory
+does not depend on the duration of the bag. Where the planner makes the sheet comply, the reference
+is the object's surface lowered by the commanded `normal_offset_m`. In the experiment's own strokes
+the reference is the surface itself, as in the paper.
 """
 
 from __future__ import annotations
@@ -34,24 +34,25 @@ from flexsheet.nodes.models.shapes import Shape, make_shape
 Floats = NDArray[np.float64]
 
 BLOCK = 2000
-"""Samples of the finger that are worked out together."""
+"""Number of finger samples that are processed together."""
 
 TOPICS_READ = ("scene", "sheet_target", "twin/finger", "arm_left", "arm_right", "twin/arms")
-"""That the true finger is compared by; a simulator's bag has them on one clock."""
+"""Topics needed for the errors against the true finger; a simulator's bag has them on one
+clock."""
 
 SAME_RUN_NS = 1_000_000_000
 
 SILENT_NS = 100_000_000
-"""An arm that reported nothing for longer does not follow."""
+"""Maximum age of an arm's state; an arm with an older state does not follow."""
 
 
 @dataclass(slots=True)
 class FingerRun:
     """One run of the simulator's finger along a path.
 
-    zero_ns: when the path began.  done_ns: the last exposure on the path.  end_ns: the last
-    exposure that names the path.  stroke_s: moving time of a stroke of the experiment; None for
-    another path.  sums: errors of such a stroke, measured and true.
+    zero_ns: start of the path. done_ns: last exposure on the path. end_ns: last exposure that names
+    the path. stroke_s: moving time of a stroke of the experiment; None for another path. sums:
+    errors of that stroke, measured and true.
     """
 
     label: str
@@ -64,7 +65,7 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """The stroke's time as `stroke_span_ns` computes it; empty for another path."""
+        """Return start and end of the stroke, ns; an empty interval for another path."""
         if self.stroke_s is None:
             return self.zero_ns, self.zero_ns
         begin_s, finish_s = stroke_window_s(self.stroke_s)
@@ -77,17 +78,17 @@ class FingerRun:
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
 
-class Side:
-    """What a finger and both edges did lately, until the errors are worked out."""
+class MotionBuffer:
+    """Samples of a finger and of both sheet edges, until the errors can be computed."""
 
     def __init__(self) -> None:
         self.finger: list[tuple[int, Floats]] = []
         self.edges: tuple[list[tuple[int, Floats]], ...] = ([], [])
 
-    def take_complete(
+    def pop_complete(
         self,
     ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
-        """Tracks, and the times at which everything is known; what is not, stays for later."""
+        """Return the motions and the times that all of them cover; later samples remain."""
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
         finger = make_motion(self.finger, "finger")
@@ -102,14 +103,14 @@ class Side:
 
 
 class SheetErrors:
-    """Takes messages in order; `finish` at the end."""
+    """Accumulator of sheet errors; add messages in order and call `finish` at the end."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
         self._scene: Scene | None = None
         self._shape: Shape | None = None
         self._edge_poses: dict[str, Floats] = {}
-        self.measured, self.true = Side(), Side()
+        self.measured, self.true = MotionBuffer(), MotionBuffer()
         self._contact: list[tuple[int, Floats]] = []
         self._following: list[tuple[int, Floats]] = []
         self._arms: dict[str, tuple[int, bool]] = {}
@@ -119,15 +120,15 @@ class SheetErrors:
         self.contact = {name: RunningMoments() for name in ("d", "theta", "true_d", "true_theta")}
         self.runs: list[FingerRun] = []
 
-    def take(self, message: Any, source_ns: int) -> None:
-        """Heed a message; all stamps are of one clock."""
+    def add(self, message: Any, source_ns: int) -> None:
+        """Add a message; all stamps are of one clock."""
         match message:
             case Scene():
                 self.finish()
                 self._scene, self._shape = message, make_shape(dict(message.object.geometry))
                 arms = message.arms
                 self._edge_poses = {"left": _edge(arms.left), "right": _edge(arms.right)}
-                self.measured, self.true = Side(), Side()
+                self.measured, self.true = MotionBuffer(), MotionBuffer()
                 self._contact, self._following = [], []
             case SheetTarget():
                 touches = float(message.phase == "contact")
@@ -139,29 +140,29 @@ class SheetErrors:
                 self.measured.finger.append((source_ns, message.position_world_m))
             case TwinFinger():
                 self.true.finger.append((source_ns, message.position_world_m))
-                self._following.append((source_ns, np.array([self._follows(source_ns)])))
-                self._take_run(message, source_ns)
+                self._following.append((source_ns, np.array([self._is_following(source_ns)])))
+                self._add_run(message, source_ns)
             case ArmState():
                 self._arms[message.side] = source_ns, message.mode == "follow"
-                self._take_edge(self.measured, message.side, message.world_from_flange, source_ns)
+                self._add_edge(self.measured, message.side, message.world_from_flange, source_ns)
             case TwinArms():
-                self._take_edge(self.true, "left", message.world_from_flange_left, source_ns)
-                self._take_edge(self.true, "right", message.world_from_flange_right, source_ns)
+                self._add_edge(self.true, "left", message.world_from_flange_left, source_ns)
+                self._add_edge(self.true, "right", message.world_from_flange_right, source_ns)
         if max(len(self.measured.finger), len(self.true.finger)) >= BLOCK:
             self.finish()
 
-    def _take_edge(self, side: Side, name: str, flange: Floats, source_ns: int) -> None:
+    def _add_edge(self, side: MotionBuffer, name: str, flange: Floats, source_ns: int) -> None:
         if self._scene is not None:
             row = edge_row(flange, self._edge_poses[name])
             side.edges[name == "right"].append((source_ns, row))
 
-    def _follows(self, at_ns: int) -> float:
-        """1 if both arms follow a target that follows the finger, else 0."""
+    def _is_following(self, at_ns: int) -> float:
+        """Return 1 if both arms follow a target that follows the finger, else 0."""
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
         return float(both and not self._target_holds)
 
-    def _take_run(self, finger: TwinFinger, source_ns: int) -> None:
+    def _add_run(self, finger: TwinFinger, source_ns: int) -> None:
         if not finger.path_label or finger.path_time_s < 0.0:
             return
         zero_ns = source_ns - round(finger.path_time_s * 1e9)
@@ -178,26 +179,26 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Work out what is take_complete."""
+        """Compute the errors of all complete samples."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
-            self.measured, self.true = Side(), Side()
+            self.measured, self.true = MotionBuffer(), MotionBuffer()
             self._contact, self._following = [], []
             return
         for name, side in (("measured", self.measured), ("true", self.true)):
-            take_complete = side.take_complete()
-            if take_complete is None:
-                # Without edges nothing ever gets take_complete.
+            complete = side.pop_complete()
+            if complete is None:
+                # Without edges the buffer would grow without limit.
                 del side.finger[:-BLOCK]
                 continue
-            finger, edges, times_ns = take_complete
+            finger, edges, times_ns = complete
             if len(times_ns):
                 if any(run.stroke_s is not None for run in self.runs):
                     found = sheet_errors(scene, finger, edges, times_ns, shape=shape)
                     self._add_strokes(name, times_ns, *found)
-                touches, normal_offset_m = self._touched(times_ns)
+                touches, normal_offset_m = self._read_contact(times_ns)
                 found = sheet_errors(scene, finger, edges, times_ns, normal_offset_m, shape=shape)
-                self._add(name, times_ns[touches], found[0][touches], found[1][touches])
+                self._add_errors(name, times_ns[touches], found[0][touches], found[1][touches])
                 if name == "true":
                     local = apply(inverse(object_pose(scene)), finger.at(times_ns))
                     self._add_followed(times_ns, *found, shape.closest(local).height_m)
@@ -206,16 +207,16 @@ class SheetErrors:
         del self._contact[: -2 * BLOCK]
         del self._following[: -2 * BLOCK]
 
-    def _add(self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats) -> None:
+    def _add_errors(self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats) -> None:
         prefix = "true_" if name == "true" else ""
-        self.contact[f"{prefix}d"].take(d)
-        self.contact[f"{prefix}theta"].take(theta)
+        self.contact[f"{prefix}d"].add(d)
+        self.contact[f"{prefix}theta"].add(theta)
         for at_ns, one_d, one_theta in zip(
             times_ns.tolist(), d.tolist(), theta.tolist(), strict=True
         ):
             index = self._grid.index(at_ns)
-            self.distance[name].take(index, one_d)
-            self.angle[name].take(index, one_theta)
+            self.distance[name].add(index, one_d)
+            self.angle[name].add(index, one_theta)
 
     def _add_strokes(
         self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats
@@ -225,8 +226,8 @@ class SheetErrors:
             begin_ns, finish_ns = run.stroke_window_ns
             inside = (times_ns >= begin_ns) & (times_ns <= finish_ns)
             if run.stroke_s is not None and inside.any():
-                run.sums.setdefault(f"{prefix}delta_d", RunningMoments()).take(d[inside])
-                run.sums.setdefault(f"{prefix}delta_theta", RunningMoments()).take(theta[inside])
+                run.sums.setdefault(f"{prefix}delta_d", RunningMoments()).add(d[inside])
+                run.sums.setdefault(f"{prefix}delta_theta", RunningMoments()).add(theta[inside])
 
     def _add_followed(
         self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats
@@ -237,8 +238,8 @@ class SheetErrors:
             if inside.any():
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
-    def _touched(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Floats]:
-        """Whether the target was in contact (n,), and the commanded retreat (n,) m, else 0."""
+    def _read_contact(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Floats]:
+        """Return whether the target was in contact (n,), and its normal offset (n,), m."""
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = make_motion(self._contact, "sheet_target")
@@ -251,7 +252,7 @@ def read_followed(bag: Path) -> list[dict[str, Any]]:
     """Return how well the finger was followed along each path of a bag, in order."""
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
-        errors.take(message, header.source_ns)
+        errors.add(message, header.source_ns)
     errors.finish()
     return [run.figures() for run in errors.runs if run.followed.exposures]
 

@@ -16,15 +16,15 @@ from flexsheet.messages.files import DISK_ERRORS, write_error
 
 
 def default_output(bag: Path) -> Path:
-    """Return the path beside the bag, with its name."""
+    """Return the default path of the page: that of the bag with the suffix .html."""
     return bag.with_suffix(".html")
 
 
 def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
     """Read the bag, write its page to `output` (None: no page), and return the numbers.
 
-    Raises BagError for a bag of which nothing can be read, and for a file that cannot be written or
-    is something else than an earlier report.
+    Raises BagError if the bag cannot be read, if the file cannot be written, or if the file exists
+    and is not a report.
     """
     if output is not None:
         _check(output)
@@ -49,8 +49,8 @@ def make_result(session: Session) -> dict[str, Any]:
 
 def _draft_path(output: Path) -> Path:
     """Return the temporary path of the page: readers see the old or the new page."""
-    place = output.resolve()
-    return place.with_name(f".{place.name}.{os.getpid()}.tmp")
+    path = output.resolve()
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def _check(output: Path) -> None:
@@ -67,8 +67,8 @@ def _check(output: Path) -> None:
         raise _unwritable(output, error) from error
     if MARK not in head:
         raise BagError(
-            f"{output}: exists already and is no report, so it is not written over; name another "
-            "file with -o"
+            f"{output}: exists and is not a report, so it is not overwritten; name another file "
+            "with -o"
         )
 
 
@@ -76,6 +76,6 @@ def _unwritable(output: Path, error: OSError) -> BagError:
     if error.errno in DISK_ERRORS:
         return BagError(str(write_error(output, error)))
     return BagError(
-        f"{output}: cannot be written: {error.strerror or error}; name a file with -o in a folder "
-        "that is there and may be written to"
+        f"{output}: cannot be written: {error.strerror or error}; name a file in a writable "
+        "folder with -o"
     )
