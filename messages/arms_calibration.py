@@ -14,7 +14,7 @@ from flexsheet.messages.scene import NonNegative, Part, Pose
 ARMS_CALIBRATION_VERSION = 1
 
 
-class ArmPlace(Part):
+class ArmPoseFit(Part):
     """How one place of the arm fits."""
 
     name: str
@@ -49,7 +49,7 @@ class ArmBase(Part):
     corner_sigma_px: NonNegative = Field(description="of one coordinate of a corner")
     arm_sigma_m: NonNegative = Field(description="of one component of the flange's own error")
     arm_sigma_rad: NonNegative
-    places: tuple[ArmPlace, ...]
+    places: tuple[ArmPoseFit, ...]
 
 
 class ArmsCalibration(Part):

@@ -41,15 +41,15 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from flexsheet.messages.base import Header, Message, schema_fingerprint
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_error
-from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, migration_for
-from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
+from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, find_migration
+from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, find_topic
 from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
 
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
-SUMMARY_RECORD_BYTES_MAX = 64 << 20
-CHUNK_BYTES_MAX = 256 << 20
+MAX_SUMMARY_RECORD_BYTES = 64 << 20
+MAX_CHUNK_BYTES = 256 << 20
 """Largest uncompressed chunk; a writer closes a chunk with the message that exceeds 1 MiB."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
@@ -526,7 +526,7 @@ class BagReader:
             Opcode.MESSAGE_INDEX,
         ):
             return
-        if length > SUMMARY_RECORD_BYTES_MAX:
+        if length > MAX_SUMMARY_RECORD_BYTES:
             raise ValueError(f"a record of {length} bytes")
         stream = ReadDataStream(BytesIO(_read_at(file, offset, length)))
         if opcode == Opcode.HEADER:
@@ -595,7 +595,7 @@ class BagReader:
         recorded = {channel.topic for channel in self.channels.values()}
         for name in (self._topics or frozenset()) - recorded:
             try:
-                topic_named(name)
+                find_topic(name)
             except UnknownTopicError as error:
                 raise BagError(f"{self.path}: {error}") from None
 
@@ -615,7 +615,7 @@ class BagReader:
             bytes.fromhex(fingerprint)
         except (ValueError, KeyError, RecursionError):
             return None  # damaged
-        return migration_for(topic.message, fingerprint, recorded)
+        return find_migration(topic.message, fingerprint, recorded)
 
     def _reading_of(self, channel: mcap_records.Channel) -> Reading:
         """Return how a channel's messages are read; BagError where no migration is known."""
@@ -763,8 +763,8 @@ def _unpacked(chunk: mcap_records.Chunk) -> bytes:
     A few bytes of a packed chunk can stand for any number: no more is unpacked than is claimed.
     """
     claimed = chunk.uncompressed_size
-    if claimed > CHUNK_BYTES_MAX:
-        raise ValueError(f"claims {claimed} bytes, at most {CHUNK_BYTES_MAX} are allowed")
+    if claimed > MAX_CHUNK_BYTES:
+        raise ValueError(f"claims {claimed} bytes, at most {MAX_CHUNK_BYTES} are allowed")
     match chunk.compression:
         case "":
             data = chunk.data

@@ -36,7 +36,7 @@ from zmq.utils.monitor import parse_monitor_message
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
+from flexsheet.messages.security import KeyChange, KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 
@@ -168,7 +168,7 @@ class Publisher:
         self._on_refused = on_refused
         self._domain: bytes | None = None
         if self._keys is not None:
-            self._domain = Gatekeeper.admit(self._keys, on_refused)
+            self._domain = ZapAuthenticator.register(self._keys, on_refused)
         try:
             self._open(bind)
         except BaseException:
@@ -193,7 +193,7 @@ class Publisher:
                     for option, value in HEARTBEATS.items():
                         self._socket.setsockopt(option, value)
                     if self._keys is not None and self._domain is not None:
-                        self._keys.serve(self._socket, self._domain)
+                        self._keys.set_server_keys(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
             self._socket.disable_monitor()
@@ -286,7 +286,7 @@ class Publisher:
 
     def _unregister_keys(self) -> None:
         if self._domain is not None:
-            Gatekeeper.dismiss(self._domain)
+            ZapAuthenticator.unregister(self._domain)
             self._domain = None
 
 
@@ -300,7 +300,7 @@ class Subscriber:
         topics, which may lose messages), for the first rejection of each cause, and for an
         exception in `on_message`, after which the subscriber continues.
     on_handshake_failed: called with the problem of each failed handshake; None: `on_problem`.
-    unopened: call `on_message(frames, header)` with every message, whatever the topic's
+    raw: call `on_message(frames, header)` with every message, whatever the topic's
         delivery; the fields are not validated.
     keys: this host's key and those of the others; without it tcp connects to loopback only.
     plan: accept only messages of this plan; None: of any.
@@ -316,7 +316,7 @@ class Subscriber:
         *,
         on_problem: Problem = _log.error,
         on_handshake_failed: Problem | None = None,
-        unopened: bool = False,
+        raw: bool = False,
         keys: KeyRing | None = None,
         plan: str | None = None,
         message_filter: MessageFilter | None = None,
@@ -325,7 +325,7 @@ class Subscriber:
         self.on_handshake_failed = on_handshake_failed or on_problem
         self._on_message, self._message_filter, self._plan = on_message, message_filter, plan
         self._latched = topic.delivery is Delivery.LATCHED
-        latest_only = topic.delivery is Delivery.LATEST and not unopened
+        latest_only = topic.delivery is Delivery.LATEST and not raw
         self._writers_seen: dict[str, _Writer] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
@@ -335,7 +335,7 @@ class Subscriber:
             source = one if isinstance(one, Source) else Source(one)
             by_host.setdefault(source.host, []).append(source)
         self._connections = [
-            _HostConnection(self, host, sources, keys, latest_only=latest_only, unopened=unopened)
+            _HostConnection(self, host, sources, keys, latest_only=latest_only, raw=raw)
             for host, sources in (by_host or {None: []}).items()
         ]
 
@@ -494,10 +494,10 @@ class _HostConnection:
         keys: KeyRing | None,
         *,
         latest_only: bool,
-        unopened: bool,
+        raw: bool,
     ) -> None:
         self._subscriber, self.host, self._sources, self._keys = subscriber, host, sources, keys
-        self._latest_only, self._unopened = latest_only, unopened
+        self._latest_only, self._raw = latest_only, raw
         rate_hz = subscriber.topic.rate_hz
         self._fresh_ns = 0 if rate_hz is None else int(0.5e9 / rate_hz[1])
         known = [one.writer for one in sources if one.writer is not None]
@@ -523,7 +523,7 @@ class _HostConnection:
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
         try:
-            if self._unopened:
+            if self._raw:
                 # A recorder has low priority and may not run for seconds on a busy computer.  A
                 # full queue would leave the publisher's heartbeats unread, so that it disconnects,
                 # and libzmq would abort as `HEARTBEATS` describes.
@@ -536,7 +536,7 @@ class _HostConnection:
             for source in self._sources:
                 _check_endpoint(topic, source.endpoint)
                 if self._keys is not None and self.host is not None:
-                    self._keys.seek(self._socket, self.host)
+                    self._keys.set_client_keys(self._socket, self.host)
                 else:
                     _refuse_beyond_loopback(topic, source.endpoint)
                 try:
@@ -645,7 +645,7 @@ class _HostConnection:
             if frames is None:
                 return True
             envelope = self._subscriber.accept(frames, self._writers)
-            if envelope is not None and self._unopened:
+            if envelope is not None and self._raw:
                 self._subscriber.call(frames, envelope.header)
             elif envelope is not None:
                 self._deliver(envelope)

@@ -17,12 +17,12 @@ class Clock(Protocol):
     def now_ns(self) -> int: ...
 
 
-def boot_id() -> str:
+def read_boot_id() -> str:
     """The kernel's random identity of this boot; CLOCK_MONOTONIC restarts with it."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return Path("/proc/sys/kernel/random/read_boot_id").read_text().strip()
 
 
-def namespace_offset() -> str:
+def read_namespace_offset() -> str:
     """By what a time namespace moves CLOCK_MONOTONIC, as "+36000.0"; empty outside of one."""
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()
@@ -38,7 +38,7 @@ class SystemClock:
     """CLOCK_MONOTONIC of this host: shared by all its processes, never set back."""
 
     def __init__(self) -> None:
-        self._id = f"{host_name()}-{boot_id()[:8]}{namespace_offset()}"
+        self._id = f"{host_name()}-{read_boot_id()[:8]}{read_namespace_offset()}"
 
     @property
     def id(self) -> str:

@@ -32,7 +32,7 @@ class ClockTable:
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
-    def trouble(self, clock_id: str, now_ns: int) -> str:
+    def find_problem(self, clock_id: str, now_ns: int) -> str:
         """Why stamps of a clock cannot be trusted; empty when they can."""
         if clock_id == self._own:
             return ""
@@ -60,7 +60,7 @@ class ClockTable:
         drift = offset.drift_ratio
         return -offset.offset_ns - round(since_ns * drift / (1.0 + drift))
 
-    def localised(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
+    def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
         """The message and its header with stamps of our clock, and why not to trust them.
 
         Of a clock that is not measured yet, a message counts as if it had arrived in no time.
@@ -72,18 +72,18 @@ class ClockTable:
         if shift_ns is None:
             shift_ns = now_ns - header.publish_ns
         return (
-            shifted(message, shift_ns),
+            shift_stamps(message, shift_ns),
             replace(
                 header,
                 source_ns=max(0, header.source_ns + shift_ns),
                 publish_ns=max(0, header.publish_ns + shift_ns),
                 clock_id=self._own,
             ),
-            self.trouble(clock_id, now_ns),
+            self.find_problem(clock_id, now_ns),
         )
 
 
-def shifted(message: M, shift_ns: int) -> M:
+def shift_stamps(message: M, shift_ns: int) -> M:
     """Move the message's instants (fields of type `Stamp`) by a shift; 0 means none and stays."""
     moved = {
         name: max(1, value + shift_ns)

@@ -116,14 +116,18 @@ class LimitedModel(BaseModel):
                     _check_number(one, name)
         elif isinstance(value, int | float):
             _check_number(value, name)
-            if 0.0 < value < min_of(name) and _refuses_zero(cls, name):
-                raise ValueError(f"give at least {min_of(name):g}{_unit_text(name)}, not {value:g}")
+            if 0.0 < value < find_min_positive(name) and _refuses_zero(cls, name):
+                raise ValueError(
+                    f"give at least {find_min_positive(name):g}{_unit_text(name)}, not {value:g}"
+                )
         return value
 
 
 def _check_number(value: float, name: str) -> None:
-    if not abs(value) <= max_of(name):
-        raise ValueError(f"give at most {max_of(name):g}{_unit_text(name)}, and a finite number")
+    if not abs(value) <= find_max_magnitude(name):
+        raise ValueError(
+            f"give at most {find_max_magnitude(name):g}{_unit_text(name)}, and a finite number"
+        )
 
 
 def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
@@ -138,7 +142,7 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 
 @cache
-def max_of(name: str) -> float:
+def find_max_magnitude(name: str) -> float:
     """The largest magnitude of a field's numbers."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
@@ -146,7 +150,7 @@ def max_of(name: str) -> float:
 
 
 @cache
-def min_of(name: str) -> float:
+def find_min_positive(name: str) -> float:
     """The smallest value of a field that must be above zero."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)

@@ -47,7 +47,7 @@ class Methods(BaseModel):
     soft_body: SoftBodyChoice | None = None
 
 
-def chosen(asked: T | Literal["auto"], by_scene: T | None, default: T) -> T:
+def resolve_method(asked: T | Literal["auto"], by_scene: T | None, default: T) -> T:
     """What a node takes: what its parameter says, else the scene's choice, else its default."""
     if asked != "auto":
         return asked

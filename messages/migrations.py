@@ -2,7 +2,7 @@
 
 Every bag holds the JSON Schema of its messages.  Where a type has since only gained (fields with
 defaults, further values of a literal, further members of a union), the recorded fields are valid
-as they are, and `fits` finds that out by comparing the two schemas.
+as they are, and `is_compatible` finds that out by comparing the two schemas.
 
 A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`, a removed
 field one in `REMOVED_FIELDS`.  These hold for every recorded version of the type.  Any other change
@@ -112,7 +112,7 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
                        "items", "prefixItems"})  # fmt: skip
 
 
-def migration_for(
+def find_migration(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
     """Return the function from recorded fields to those of today's type; None without one.
@@ -126,7 +126,7 @@ def migration_for(
         return MIGRATIONS[message_type.__name__, fingerprint]
     today = message_type.model_json_schema()
     renamed_schema = _rename_in_schema(message_type, recorded_schema)
-    if not fits(_literal_schema(message_type.__name__, renamed_schema, today), today):
+    if not is_compatible(_literal_schema(message_type.__name__, renamed_schema, today), today):
         return None
     return lambda fields: _rename_in_fields(message_type, fields)
 
@@ -225,10 +225,12 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return models[0] if len(models) == 1 else None
 
 
-def fits(recorded: Schema, today: Schema) -> bool:
+def is_compatible(recorded: Schema, today: Schema) -> bool:
     """Return whether everything that the recorded schema allows is valid by today's."""
     try:
-        return _Comparison(recorded.get("$defs", {}), today.get("$defs", {})).fits(recorded, today)
+        return _Comparison(recorded.get("$defs", {}), today.get("$defs", {})).is_compatible(
+            recorded, today
+        )
     except (KeyError, TypeError, AttributeError, RecursionError):
         return False  # damaged: no JSON Schema at all, or one without an end
 
@@ -244,7 +246,7 @@ class _Comparison:
         self._old_parts, self._new_parts = old_parts, new_parts
         self._known: dict[tuple[int, int], bool] = {}
 
-    def fits(self, old: Any, new: Any) -> bool:
+    def is_compatible(self, old: Any, new: Any) -> bool:
         old, new = _resolved(old, self._old_parts), _resolved(new, self._new_parts)
         if not (isinstance(old, Mapping) and isinstance(new, Mapping)):
             return bool(old == new)
@@ -258,7 +260,10 @@ class _Comparison:
     def _fit(self, old: Schema, new: Schema) -> bool:
         was, now = _options(old), _options(new)
         if was or now:
-            return all(any(self.fits(one, other) for other in now or [new]) for one in was or [old])
+            return all(
+                any(self.is_compatible(one, other) for other in now or [new])
+                for one in was or [old]
+            )
         old_fields, new_fields = old.get("properties", {}), new.get("properties", {})
         old_items, new_items = old.get("prefixItems", []), new.get("prefixItems", [])
         return (
@@ -266,10 +271,12 @@ class _Comparison:
             and _values(old) <= _values(new)
             and set(new.get("required", ())) <= old_fields.keys()
             and old_fields.keys() <= new_fields.keys()
-            and all(self.fits(field, new_fields[name]) for name, field in old_fields.items())
-            and self.fits(old.get("items"), new.get("items"))
+            and all(
+                self.is_compatible(field, new_fields[name]) for name, field in old_fields.items()
+            )
+            and self.is_compatible(old.get("items"), new.get("items"))
             and len(old_items) == len(new_items)
-            and all(map(self.fits, old_items, new_items))
+            and all(map(self.is_compatible, old_items, new_items))
         )
 
 

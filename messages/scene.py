@@ -364,7 +364,7 @@ class UnfitGeometryError(FlexsheetError, ValueError):
     remedy = "Choose an object of a shape that this command supports."
 
 
-def cylinder_of(scene: Scene) -> Cylinder:
+def require_cylinder(scene: Scene) -> Cylinder:
     """The scene's geometry, for who can handle no other than a cylinder; UnfitGeometryError."""
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):

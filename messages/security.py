@@ -32,7 +32,7 @@ ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 ZAP_VERSION = b"1.0"
 CURVE_KEY_BYTES = 32
 
-Refused = Callable[[str], None]
+RefusalHandler = Callable[[str], None]
 """Told in a sentence of a connection that was refused."""
 
 
@@ -54,7 +54,7 @@ def new_key_pair() -> tuple[str, str]:
             return public.decode(), secret.decode()
 
 
-def public_of(secret: str) -> str:
+def derive_public_key(secret: str) -> str:
     """The public key that belongs to a secret one."""
     public: bytes = zmq.curve_public(secret.encode())
     return public.decode()
@@ -138,19 +138,19 @@ class KeyRing:
         self._stamps: tuple[Any, ...] = ()
         self.host, self.public_key, self.secret_key = "", "", ""
         self.public: dict[str, str] = {}
-        self._host_of: dict[str, str] = {}
+        self._host_by_key: dict[str, str] = {}
         self.reload()
 
-    def key_of(self, host: str) -> str:
+    def get_public_key(self, host: str) -> str:
         """The public key of a host; SecurityError for one that has none."""
         key = self.public.get(host)
         if key is None:
             raise SecurityError(f'host "{host}" has no key in the launch file')
         return key
 
-    def host_of(self, key: str) -> str | None:
+    def find_host(self, key: str) -> str | None:
         """The host that has this public key; None for a stranger."""
-        return self._host_of.get(key)
+        return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
         """Read the files again if they have changed; what that changes, or None for nothing.
@@ -166,7 +166,7 @@ class KeyRing:
         if stamps == self._stamps:
             return None
         secret = read_secret(secret_file)
-        own = public_of(secret)
+        own = derive_public_key(secret)
         if public.get(host) != own:
             raise SecurityError(
                 f'{secret_file}: is not the key that the launch file has for host "{host}"; there: '
@@ -179,11 +179,11 @@ class KeyRing:
         )
         self.host, self.secret_key, self.public_key = host, secret, own
         self.public = dict(public)
-        self._host_of = {key: name for name, key in self.public.items()}
+        self._host_by_key = {key: name for name, key in self.public.items()}
         self._stamps = stamps
         return change
 
-    def serve(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
+    def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
         """Let what is bound from now on take in only hosts of this ring."""
         opened.setsockopt(zmq.CURVE_SERVER, 1)
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
@@ -191,9 +191,9 @@ class KeyRing:
         # Without this, a gatekeeper that is not there would let everybody in.
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
-    def seek(self, opened: zmq.Socket[bytes], host: str) -> None:
+    def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
         """Let what is connected from now on speak to that host alone."""
-        opened.setsockopt(zmq.CURVE_SERVERKEY, self.key_of(host).encode())
+        opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
 
@@ -204,17 +204,17 @@ def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, st
     write_file(file, text)
 
 
-class Gatekeeper:
+class ZapAuthenticator:
     """Answers ZeroMQ's question whether a key may come in; one per process, while it is needed.
 
     Each bound socket has a domain of its own, and with it its ring and who is told of refusals.
     """
 
-    _present: ClassVar[Gatekeeper | None] = None
+    _present: ClassVar[ZapAuthenticator | None] = None
     _numbers = count(1)
 
     def __init__(self) -> None:
-        self._doors: dict[bytes, tuple[KeyRing, Refused]] = {}
+        self._domains: dict[bytes, tuple[KeyRing, RefusalHandler]] = {}
         self._loop = asyncio.get_running_loop()
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -223,21 +223,21 @@ class Gatekeeper:
         self._loop.call_soon(self._answer)
 
     @classmethod
-    def admit(cls, keys: KeyRing, on_refused: Refused) -> bytes:
-        """Open a door; its domain, for `KeyRing.serve` and `dismiss`."""
+    def register(cls, keys: KeyRing, on_refused: RefusalHandler) -> bytes:
+        """Open a door; its domain, for `KeyRing.set_server_keys` and `unregister`."""
         if cls._present is None:
-            cls._present = Gatekeeper()
+            cls._present = ZapAuthenticator()
         domain = f"flexsheet-{next(cls._numbers)}".encode()
-        cls._present._doors[domain] = (keys, on_refused)
+        cls._present._domains[domain] = (keys, on_refused)
         return domain
 
     @classmethod
-    def dismiss(cls, domain: bytes) -> None:
+    def unregister(cls, domain: bytes) -> None:
         """Close a door; with the last one the gatekeeper goes."""
         if cls._present is None:
             return
-        cls._present._doors.pop(domain, None)
-        if not cls._present._doors:
+        cls._present._domains.pop(domain, None)
+        if not cls._present._domains:
             cls._present._close()
             cls._present = None
 
@@ -260,11 +260,11 @@ class Gatekeeper:
     def reply(self, request: list[bytes]) -> list[bytes]:
         """The frames of an answer: 200 and the host's name, or 400."""
         version, number, domain, address, _, mechanism, *credentials = request
-        keys, on_refused = self._doors.get(domain, (None, lambda _: None))
+        keys, on_refused = self._domains.get(domain, (None, lambda _: None))
         host, why = None, "a mechanism without keys"
         if keys is not None and version == ZAP_VERSION and mechanism == b"CURVE":
             key = z85.encode(credentials[0]).decode()
-            host, why = keys.host_of(key), f"the key {key}, which no host of the plan has"
+            host, why = keys.find_host(key), f"the key {key}, which no host of the plan has"
         if host is None:
             on_refused(f"a connection from {address.decode(errors='replace')} was refused: {why}")
             return [ZAP_VERSION, number, b"400", b"not a host of the plan", b"", b""]

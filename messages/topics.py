@@ -108,7 +108,7 @@ class UnknownTopicError(FlexsheetError, KeyError):
     remedy = "`flexsheet topic list` prints all names."
 
 
-def topic_named(name: str) -> Topic:
+def find_topic(name: str) -> Topic:
     """The topic of that name; raises UnknownTopicError with the nearest name."""
     try:
         return TOPICS[name]

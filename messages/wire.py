@@ -50,11 +50,11 @@ DTYPES = tuple(
 )
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
-HEADER_BYTES_MAX = 1 << 20
+MAX_HEADER_BYTES = 1 << 20
 """Largest header frame; larger arrays have frames of their own.  Its smallest values, a byte each,
 take up to 64 times as much memory as objects."""
 
-ELEMENTS_MAX = 4096
+MAX_ELEMENTS = 4096
 """Most elements of an array or a map in the header.  A decoder allocates the announced length
 before it reads the elements, and arrays can be nested."""
 
@@ -93,7 +93,7 @@ class Codec:
         self.validate = message_type.__pydantic_validator__.validate_python
 
 
-codec_of = cache(Codec)
+get_codec = cache(Codec)
 
 
 def encode(
@@ -122,7 +122,7 @@ def encode(
             return value.__dict__
         raise TypeError(f"{type(value).__name__} has no form on the wire")
 
-    codec = codec_of(type(message))
+    codec = get_codec(type(message))
     try:
         frames[0] = Packer(default=pack).pack(
             (
@@ -141,9 +141,9 @@ def encode(
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError("field", f"{type(message).__name__} cannot be encoded: {error}") from error
-    if max_bytes is not None and size_of(frames) > max_bytes:
+    if max_bytes is not None and count_bytes(frames) > max_bytes:
         raise _too_large(frames, max_bytes, codec.name)
-    if len(frames[0]) > HEADER_BYTES_MAX:
+    if len(frames[0]) > MAX_HEADER_BYTES:
         raise _too_much_header(frames)
     return frames
 
@@ -178,11 +178,11 @@ def read_envelope(
     fingerprint, type_name: of the type as it was recorded; None: as it is today.
     """
     if isinstance(expected, Topic):
-        codec = codec_of(expected.message)
+        codec = get_codec(expected.message)
         if sum(map(len, frames)) > expected.max_bytes:
             raise _too_large(frames, expected.max_bytes, f'topic "{expected.name}"')
     else:
-        codec = codec_of(expected)
+        codec = get_codec(expected)
     wanted = codec.fingerprint if fingerprint is None else fingerprint
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
@@ -227,7 +227,7 @@ def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Mess
     return envelope.open(), envelope.header
 
 
-def size_of(frames: Sequence[Any]) -> int:
+def count_bytes(frames: Sequence[Any]) -> int:
     """Bytes of all frames together."""
     return sum(map(len, frames))
 
@@ -261,14 +261,14 @@ def _unpack(frames: Sequence[Any]) -> Any:
     try:
         # A zmq.Frame is no buffer to msgpack; its bytes are.
         first = frames[0] if isinstance(frames[0], _BUFFERS) else frames[0].buffer
-        if len(first) > HEADER_BYTES_MAX:
+        if len(first) > MAX_HEADER_BYTES:
             raise _too_much_header(frames)
         unpacked = unpackb(
             first,
             ext_hook=unpack,
             use_list=False,
-            max_array_len=ELEMENTS_MAX,
-            max_map_len=ELEMENTS_MAX,
+            max_array_len=MAX_ELEMENTS,
+            max_map_len=MAX_ELEMENTS,
         )
     except WireError:
         raise
@@ -283,7 +283,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
 
 def _too_much_header(frames: Sequence[Any]) -> WireError:
     return WireError(
-        "size", f"a header of {len(frames[0])} bytes, at most {HEADER_BYTES_MAX} are allowed"
+        "size", f"a header of {len(frames[0])} bytes, at most {MAX_HEADER_BYTES} are allowed"
     )
 
 
@@ -321,7 +321,7 @@ def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], 
 def _too_large(frames: Sequence[Any], max_bytes: int, what: str) -> WireError:
     return WireError(
         "size",
-        f"{what}: message of {size_of(frames)} bytes, at most {max_bytes} are allowed",
+        f"{what}: message of {count_bytes(frames)} bytes, at most {max_bytes} are allowed",
     )
 
 

@@ -43,7 +43,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import ArmState, PortStatus, Status
 from flexsheet.nodes import NodeRole
 
@@ -128,7 +128,7 @@ class ExecutionLog:
 class Input(Generic[M]):
     """Hold the latest message of a subscribed topic, with its header and counts.
 
-    All stamps are of this host's clock. clock_trouble: why they cannot be trusted; empty: they can.
+    All stamps are of this host's clock. clock_problem: why they cannot be trusted; empty: they can.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -136,7 +136,7 @@ class Input(Generic[M]):
         self.message: M | None = None
         self.header: Header | None = None
         self.received_ns: int = 0
-        self.clock_trouble = ""
+        self.clock_problem = ""
         self.counts = PortCounts()
         self.on_accept: Callable[[Header, int], None] | None = None
         self._clock = clock
@@ -152,8 +152,8 @@ class Input(Generic[M]):
             return float("inf")
         return (self._clock.now_ns() - self.header.source_ns) * 1e-9
 
-    def accept(self, message: M, header: Header, clock_trouble: str = "") -> None:
-        self.message, self.header, self.clock_trouble = message, header, clock_trouble
+    def accept(self, message: M, header: Header, clock_problem: str = "") -> None:
+        self.message, self.header, self.clock_problem = message, header, clock_problem
         self.received_ns = self._clock.now_ns()
         self.counts.count(header, self.received_ns)
         if self.on_accept is not None:
@@ -215,7 +215,7 @@ def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[...
     return mark
 
 
-def ports_of(node_class: type[Node]) -> dict[str, Port]:
+def find_ports(node_class: type[Node]) -> dict[str, Port]:
     """Return the declared ports of a node class, in the order of declaration.
 
     A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file may connect
@@ -235,22 +235,22 @@ def further_port(topic_name: str) -> str:
     return f"in/{topic_name}"
 
 
-def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
+def find_parameters_type(node_class: type[Node]) -> type[NodeParameters]:
     """Return the declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
-def role_of(node_class: type[Node]) -> NodeRole | None:
+def find_role(node_class: type[Node]) -> NodeRole | None:
     """Return the role of a node class; a class that publishes ArmState is an arm bridge."""
     publishes = {
-        port.message for port in ports_of(node_class).values() if port.direction == "output"
+        port.message for port in find_ports(node_class).values() if port.direction == "output"
     }
     if node_class.role is None and ArmState in publishes:
         return NodeRole.ARM_BRIDGE
     return node_class.role
 
 
-def timers_of(node_class: type[Node]) -> list[Timer]:
+def find_timers(node_class: type[Node]) -> list[Timer]:
     """Return the methods of a node class that are marked `@periodic`."""
     return [
         Timer(name, member.__periodic__)
@@ -322,9 +322,9 @@ class Node:
         self._execution_log = ExecutionLog(clock)
         if epoch is None:
             epoch = self.started_ns
-        declared = ports_of(type(self))
+        declared = find_ports(type(self))
         for port in declared.values():
-            topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
+            topic = find_topic((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
                     f"{name}.{port.name} carries {port.message.__name__}, "
@@ -345,7 +345,7 @@ class Node:
                 setattr(self, port.name, self.outputs[port.name])
         for further, topic_name in (topics or {}).items():
             if further not in declared:
-                self.inputs[further] = Input(topic_named(topic_name), clock)
+                self.inputs[further] = Input(find_topic(topic_name), clock)
         self._mailboxes = {
             port: Mailbox(self, port)
             for port in self.inputs
@@ -363,12 +363,12 @@ class Node:
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
         """Pass a message to the input; a plain handler runs now, a coroutine in its own task."""
-        message, header, clock_trouble = self._localised(message, header)
+        message, header, clock_problem = self._localised(message, header)
         mailbox = self._mailboxes.get(port)
         if mailbox is not None:
-            mailbox.put(message, header, clock_trouble)
+            mailbox.put(message, header, clock_problem)
             return
-        self.inputs[port].accept(message, header, clock_trouble)
+        self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             try:
@@ -383,11 +383,11 @@ class Node:
     def _localised(self, message: Message, header: Header) -> tuple[Message, Header, str]:
         if self.measures_clocks:
             return message, header, ""
-        return self.clock_table.localised(message, header, self.clock.now_ns())
+        return self.clock_table.localize(message, header, self.clock.now_ns())
 
-    async def take(self, port: str, message: Message, header: Header, clock_trouble: str) -> None:
+    async def take(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
         """Do as `step`, with a message whose stamps are of this clock already."""
-        self.inputs[port].accept(message, header, clock_trouble)
+        self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
@@ -406,7 +406,7 @@ class Node:
         return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
-        """Call the method of one of `timers_of` the node."""
+        """Call the method of one of `find_timers` the node."""
         if not self.opens_devices:
             self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
@@ -442,7 +442,7 @@ class Mailbox:
         self._waiting: deque[tuple[Message, Header, str]] = deque()
         self.task: asyncio.Task[None] | None = None
 
-    def put(self, message: Message, header: Header, clock_trouble: str) -> None:
+    def put(self, message: Message, header: Header, clock_problem: str) -> None:
         if len(self._waiting) >= self._capacity:
             self._waiting.popleft()
             self._input.counts.dropped += 1
@@ -450,7 +450,7 @@ class Mailbox:
                 self._node.report_error(
                     f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
                 )
-        self._waiting.append((message, header, clock_trouble))
+        self._waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():
             self.task = asyncio.get_running_loop().create_task(self._drain())
 

@@ -26,11 +26,11 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.security import KeyRing, SecurityError
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.log_limit import RepeatLimiter
-from flexsheet.nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from flexsheet.nodes.node import Node, PortCounts, Timer, find_parameters_type, find_timers
 from flexsheet.nodes.signals import handle_signals
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -89,7 +89,7 @@ class NodeTransport:
     def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
             if output.endpoints:
-                topic = topic_named(output.topic)
+                topic = find_topic(output.topic)
                 endpoints = [str(one) for one in output.endpoints]
                 refused = self._refusals(node.outputs[output.port].counts, topic)
                 self._publishers[topic.name] = Publisher(
@@ -108,7 +108,7 @@ class NodeTransport:
     def open_inputs(self, node: Node) -> None:
         if self._config.clocks is not None:
             subscriber = Subscriber(
-                topic_named(self._config.clocks.topic),
+                find_topic(self._config.clocks.topic),
                 self._config.clocks.endpoints,
                 lambda clocks, _: node.clock_table.update(clocks),
                 PortCounts(),
@@ -129,7 +129,7 @@ class NodeTransport:
                 deliver_to(config.port),
                 node_input.counts,
                 on_problem=partial(self._tell, node),
-                unopened=node.takes_frames,
+                raw=node.takes_frames,
                 keys=self.keys,
                 # The status of nodes with another plan must be shown as well.
                 plan=None
@@ -231,11 +231,11 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
-        node.status.publish(status_of(node, "running", process))
+        node.status.publish(make_status(node, "running", process))
         beat()
 
 
-def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
+def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
     """Make the status message with rates, ages, drops and errors of every port.
 
     Degraded: an error, a rejection or a gap since the last status, gaps of `latest` topics
@@ -272,7 +272,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     log = structlog.get_logger().bind(node=config.name)
     links = NodeTransport(config, log)
     node = class_(
-        parameters_of(class_).model_validate(config.parameters),
+        find_parameters_type(class_).model_validate(config.parameters),
         name=config.name,
         clock=SystemClock(),
         send=links.send,
@@ -291,7 +291,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         links.open_inputs(node)
         tasks = [
             asyncio.create_task(run_timer(node, number, timer))
-            for number, timer in enumerate(timers_of(class_))
+            for number, timer in enumerate(find_timers(class_))
         ]
         heartbeat = Heartbeat(config.ready_fd)
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
@@ -305,7 +305,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
-        node.status.publish(status_of(node, "stopping", process))
+        node.status.publish(make_status(node, "stopping", process))
     finally:
         await end_tasks([*tasks, *node.mailbox_tasks()])
         try:

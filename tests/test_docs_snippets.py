@@ -28,7 +28,7 @@ from flexsheet.launch.plans.launch_file import LaunchFile
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
-from flexsheet.nodes.node import parameters_of
+from flexsheet.nodes.node import find_parameters_type
 from tests.doc_pages import ROOT, Block, blocks, code_spans, name, pages
 from tests.test_cli_help import parse
 
@@ -146,14 +146,14 @@ def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -
     elif all(isinstance(one, dict) and "type" in one for one in values.values()):
         check_nodes(values)
     elif keys == {"source"}:
-        parameters_of(node_class("camera")).model_validate(values)
+        find_parameters_type(node_class("camera")).model_validate(values)
     else:
         pytest.fail(f"{place}: neither a launch file, nor nodes, nor parts of a scene: {keys}")
 
 
 def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
     for node in nodes.values():
-        parameters_of(node_class(node["type"])).model_validate(node.get("parameters") or {})
+        find_parameters_type(node_class(node["type"])).model_validate(node.get("parameters") or {})
 
 
 # Shell

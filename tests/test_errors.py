@@ -14,7 +14,7 @@ from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
-from flexsheet.messages.topics import UnknownTopicError, topic_named
+from flexsheet.messages.topics import UnknownTopicError, find_topic
 from flexsheet.messages.types import FingertipReason
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -76,7 +76,7 @@ def test_errors_of_users_end_a_command_with_a_code(error: Exception, code: int |
 
 def test_the_text_of_an_error_is_not_quoted() -> None:
     with pytest.raises(UnknownTopicError) as raised:
-        topic_named("fingr")
+        find_topic("fingr")
     assert str(raised.value).startswith('unknown topic "fingr"')
 
 

@@ -29,7 +29,7 @@ from flexsheet.messages.bag import (
     split_frames,
 )
 from flexsheet.messages.base import Header
-from flexsheet.messages.migrations import migration_for
+from flexsheet.messages.migrations import find_migration
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import EStop, StereoPair, TwinFinger
 from flexsheet.messages.wire import WireError, encode
@@ -380,8 +380,8 @@ def test_changed_type_is_refused_by_name_but_its_bytes_stay_readable(
 ) -> None:
     monkeypatch.setattr(
         bag_module,
-        "migration_for",
-        lambda kind, *recorded: None if kind is TwinFinger else migration_for(kind, *recorded),
+        "find_migration",
+        lambda kind, *recorded: None if kind is TwinFinger else find_migration(kind, *recorded),
     )
     with pytest.raises(BagError, match=r'topic "twin/finger" was recorded when TwinFinger had'):
         list(BagReader(whole))

@@ -502,7 +502,7 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 
     problems: list[str] = []
     ear = Subscriber(
-        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, unopened=True
+        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, raw=True
     )
     ear.start()
     room.closers.append(ear.close)

@@ -19,10 +19,10 @@ from flexsheet.nodes.node import (
     Node,
     NodeParameters,
     Output,
-    parameters_of,
+    find_parameters_type,
+    find_ports,
+    find_timers,
     periodic,
-    ports_of,
-    timers_of,
 )
 from flexsheet.nodes.runner import end_tasks, status_of
 from tests.fingertips import fingertip as even_fingertip
@@ -85,7 +85,7 @@ def build(topics: dict[str, str] | None = None) -> tuple[Echo, VirtualClock, Sen
 
 
 def test_ports_parameters_and_timers_are_read_from_the_class() -> None:
-    ports = ports_of(Echo)
+    ports = find_ports(Echo)
     assert [(port.name, port.direction, port.message) for port in ports.values()] == [
         ("status", "output", ports["status"].message),
         ("estop", "input", EStop),
@@ -93,8 +93,8 @@ def test_ports_parameters_and_timers_are_read_from_the_class() -> None:
         ("sheet_target", "output", SheetTarget),
         ("twin__finger_path", "input", FingerPath),
     ]
-    assert parameters_of(Echo) is EchoParameters
-    assert [(timer.method, timer.rate_parameter) for timer in timers_of(Echo)] == [
+    assert find_parameters_type(Echo) is EchoParameters
+    assert [(timer.method, timer.rate_parameter) for timer in find_timers(Echo)] == [
         ("tick", "rate_hz")
     ]
 
@@ -114,8 +114,8 @@ def test_unknown_parameters_are_refused() -> None:
 def test_every_node_of_the_table_imports_and_declares_its_ports() -> None:
     for name in NODES:
         class_ = node_class(name)
-        assert issubclass(parameters_of(class_), NodeParameters)
-        assert "status" in ports_of(class_)
+        assert issubclass(find_parameters_type(class_), NodeParameters)
+        assert "status" in find_ports(class_)
         assert class_.__doc__
     with pytest.raises(UnknownNodeError, match='did you mean "planner"'):
         node_class("planer")

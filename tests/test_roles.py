@@ -12,7 +12,7 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.host import list_arms, recording_folder
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes import NODES, NodeRole, node_class
-from flexsheet.nodes.node import Node, NodeParameters, Output, role_of
+from flexsheet.nodes.node import Node, NodeParameters, Output, find_role
 from flexsheet.nodes.recorder.node import Recorder
 
 
@@ -78,7 +78,7 @@ def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None
 
 
 def test_the_shipped_nodes_have_their_roles() -> None:
-    roles = {name: role_of(node_class(name)) for name in NODES}
+    roles = {name: find_role(node_class(name)) for name in NODES}
     assert {name: role for name, role in roles.items() if role is not None} == {
         "arm_bridge": NodeRole.ARM_BRIDGE,
         "camera": NodeRole.CAMERA,

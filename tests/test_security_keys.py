@@ -22,9 +22,9 @@ from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.security import (
     SecurityError,
+    derive_public_key,
     is_key,
     new_key_pair,
-    public_of,
     read_secret,
     write_secret,
 )
@@ -77,11 +77,11 @@ def test_a_secret_is_for_its_owner_alone(keys: Path) -> None:
     public = make(keys, "main")
     file = keys / "main.secret"
     assert (file.stat().st_mode & 0o777, keys.stat().st_mode & 0o777) == (0o600, 0o700)
-    assert public_of(read_secret(file)) == public
+    assert derive_public_key(read_secret(file)) == public
     with pytest.raises(SecurityError, match="there is a key already"):
         make(keys, "main")
-    assert public_of(read_secret(file)) == public
-    assert make(keys, "main", replace=True) == public_of(read_secret(file)) != public
+    assert derive_public_key(read_secret(file)) == public
+    assert make(keys, "main", replace=True) == derive_public_key(read_secret(file)) != public
     assert sorted(path.name for path in keys.iterdir()) == ["main.secret"]
 
 

@@ -30,7 +30,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles, ReleaseError
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
-from flexsheet.nodes.node import Node, NodeParameters, Output, parameters_of
+from flexsheet.nodes.node import Node, NodeParameters, Output, find_parameters_type
 from flexsheet.nodes.runner import NodeTransport
 from tests.arm_states import arm_state
 from tests.test_security import target
@@ -107,7 +107,7 @@ class Street:
         class_ = node_class(config.type)
         self.links = NodeTransport(config, structlog.get_logger())
         self.bridge = class_(
-            parameters_of(class_).model_validate(config.parameters),
+            find_parameters_type(class_).model_validate(config.parameters),
             name=config.name,
             clock=SystemClock(),
             send=self.links.send,

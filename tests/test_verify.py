@@ -19,7 +19,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import ClockEcho, ClockPing, Status, StereoPair
 from flexsheet.nodes import node_class
-from flexsheet.nodes.node import Node, parameters_of, timers_of
+from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 from flexsheet.nodes.runner import status_of
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
@@ -51,7 +51,7 @@ class Live:
         planned = self.plan.nodes[name]
         class_ = node_class(planned.type)
         node = class_(
-            parameters_of(class_).model_validate(planned.parameters),
+            find_parameters_type(class_).model_validate(planned.parameters),
             name=name,
             clock=self.clock,
             send=self.send,
@@ -227,7 +227,7 @@ async def test_a_clock_node_measures_the_same_again(tmp_path: Path) -> None:
             ping = ClockPing(echoes=(echo,))
             graph.send(TOPICS["clock_ping"], ping, header)
             await node.step("clock_ping", ping, header)
-            await node.call_timer(0, timers_of(type(node))[0])
+            await node.call_timer(0, find_timers(type(node))[0])
         graph.tell()
     result = await asyncio.to_thread(verify, bag, name)
     assert_as_live(result)

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from flexsheet.messages.field_types import field_type
 from flexsheet.nodes import NODES, node_class
-from flexsheet.nodes.node import parameters_of
+from flexsheet.nodes.node import find_parameters_type
 from website.messages_page import parts_of, type_section
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,7 +34,7 @@ prints the same with ports and timers.
 
 def reference() -> str:
     """Return the whole page."""
-    kinds = [parameters_of(node_class(name)) for name in NODES]
+    kinds = [find_parameters_type(node_class(name)) for name in NODES]
     parts = dict.fromkeys(part for kind in kinds for part in parts_of(kind))
     sections = [INTRODUCTION, *(_section(name) for name in NODES)]
     return "\n".join([*sections, "## Parts\n", *(type_section(part) for part in parts)])
@@ -51,7 +51,7 @@ def _section(name: str) -> str:
     rows = [
         f"| `{key}` | {field_type(field)} | {unit(key)} | {_default(field)} | "
         f"{field.description or ''} |"
-        for key, field in parameters_of(kind).model_fields.items()
+        for key, field in find_parameters_type(kind).model_fields.items()
     ]
     table = ["| parameter | type | unit | default | what |", "| --- | --- | --- | --- | --- |"]
     return f"## {name}\n\n{' '.join(about.split())}\n\n" + "\n".join([*table, *rows]) + "\n"

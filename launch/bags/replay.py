@@ -33,7 +33,7 @@ from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Clocks, Status
 from flexsheet.messages.wire import decode, encode
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
-from flexsheet.nodes.node import Node, parameters_of, timers_of
+from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 
 CLOCKS = "clocks"
 EPOCH = 0
@@ -186,7 +186,7 @@ def _read_plan(reader: BagReader) -> ResolvedGraph:
 def refusal(node: ResolvedNode) -> str:
     """Return why a node cannot be stepped through a bag; empty: it can."""
     class_ = node_class(node.type)
-    return class_.replay_refusal(parameters_of(class_).model_validate(node.parameters))
+    return class_.replay_refusal(find_parameters_type(class_).model_validate(node.parameters))
 
 
 async def replay(bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress) -> Pass:
@@ -217,7 +217,7 @@ def _build_node(planned: ResolvedNode, clock: VirtualClock, result: Pass) -> Nod
 
     class_ = node_class(planned.type)
     return class_(
-        parameters_of(class_).model_validate(planned.parameters),
+        find_parameters_type(class_).model_validate(planned.parameters),
         name=planned.name,
         clock=clock,
         send=keep,
@@ -273,7 +273,7 @@ async def _replay_run(
     """Step the node through its execution log of one run."""
     clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
     node = _build_node(planned, clock, result)
-    names, timers = list(node.inputs), timers_of(type(node))
+    names, timers = list(node.inputs), find_timers(type(node))
     async with _set_up(node, result):
         messages = RecordedInputs(bag, node)
         # Messages of before the recording are not in the execution log of the recorded statuses.
@@ -398,7 +398,7 @@ class Timers:
         self._node = node
         self._periods_ns = {
             (number, timer): round(1e9 / float(getattr(node.parameters, timer.rate_parameter)))
-            for number, timer in enumerate(timers_of(type(node)))
+            for number, timer in enumerate(find_timers(type(node)))
         }
         self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
 

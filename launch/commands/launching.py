@@ -202,9 +202,9 @@ def _format_settings(node: ResolvedNode) -> str:
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes import node_class
-    from flexsheet.nodes.node import parameters_of
+    from flexsheet.nodes.node import find_parameters_type
 
-    fields = parameters_of(node_class(node.type)).model_fields
+    fields = find_parameters_type(node_class(node.type)).model_fields
     # As plans store them; a default factory has no fixed value to compare with.
     defaults = {
         name: to_jsonable_python(field.default)

@@ -69,7 +69,7 @@ def describe(
 ) -> None:
     """Print the ports, timers and parameters of a node type."""
     from flexsheet.nodes import UnknownNodeError, node_class
-    from flexsheet.nodes.node import parameters_of, ports_of, timers_of
+    from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers
 
     try:
         class_ = node_class(node)
@@ -80,14 +80,15 @@ def describe(
         "about": (class_.__doc__ or "").strip(),
         "ports": [
             {"port": port.name, "direction": port.direction, "message": port.message.__name__}
-            for port in ports_of(class_).values()
+            for port in find_ports(class_).values()
         ],
         "timers": [
             {"method": timer.method, "rate_parameter": timer.rate_parameter}
-            for timer in timers_of(class_)
+            for timer in find_timers(class_)
         ],
         "parameters": [
-            _parameter(name, field) for name, field in parameters_of(class_).model_fields.items()
+            _parameter(name, field)
+            for name, field in find_parameters_type(class_).model_fields.items()
         ],
     }
     if as_json:

@@ -17,7 +17,7 @@ from flexsheet.launch.plans.documents import (
 )
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
-from flexsheet.nodes.node import role_of
+from flexsheet.nodes.node import find_role
 
 RECORDER_NICE = 5
 """The recorder's messages wait in queues, so its delay affects no other node."""
@@ -171,6 +171,6 @@ def apply_console(document: Document) -> None:
 def _find_role(type_name: object) -> NodeRole | None:
     """Return the role of a node type; None if it has none or cannot be imported."""
     try:
-        return role_of(node_class(str(type_name)))
+        return find_role(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):
         return None

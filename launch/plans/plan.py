@@ -52,7 +52,7 @@ from flexsheet.launch.plans.routing import (
     resolve_further_inputs,
 )
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.node import NodeParameters, role_of
+from flexsheet.nodes.node import NodeParameters, find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
@@ -175,7 +175,7 @@ def _make_node(
             for mark in (ParameterMark.CAMERA_CALIBRATION, ParameterMark.SHEET_CALIBRATION)
             for key in find_marked(entry.parameters, mark)
         },
-        role=role_of(entry.type),
+        role=find_role(entry.type),
         host=host,
         parameters=parameters,
         inputs=tuple(

@@ -29,9 +29,9 @@ from flexsheet.nodes.node import (
     Node,
     NodeParameters,
     Port,
+    find_parameters_type,
+    find_ports,
     further_port,
-    parameters_of,
-    ports_of,
 )
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
@@ -158,11 +158,11 @@ def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem])
 
     parameters_key = key if key in _PARAMETER_SECTIONS else (*key, "parameters")
     try:
-        entry.parameters = parameters_of(class_).model_validate(entry.spec.parameters)
+        entry.parameters = find_parameters_type(class_).model_validate(entry.spec.parameters)
     except ValidationError:
         _ensure_key(document, parameters_key, entry.spec.parameters)
         try:
-            validate(parameters_of(class_), document, at=parameters_key)
+            validate(find_parameters_type(class_), document, at=parameters_key)
         except BadInputError as error:
             problems.extend(error.problems)
 
@@ -178,7 +178,7 @@ def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
 def _connect_ports(
     entry: NodeEntry, class_: type[Node], document: Document, problems: list[Problem]
 ) -> None:
-    ports = ports_of(class_)
+    ports = find_ports(class_)
     for name in entry.spec.topics:
         if name not in ports:
             problems.append(

@@ -28,7 +28,7 @@ from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.security import KeyChange, KeyRing
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
@@ -88,7 +88,7 @@ class HostAgent:
             writer = plan.writer(topic, self._name)
             if writer is not None:
                 self.publishers[topic] = Publisher(
-                    topic_named(topic),
+                    find_topic(topic),
                     endpoints(writer.endpoints),
                     keys=keys,
                     on_refused=on_problem,
@@ -139,7 +139,7 @@ class HostAgent:
 
     def _subscribe(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
-            topic_named(topic),
+            find_topic(topic),
             self._sources(sources),
             handler,
             PortCounts(),
@@ -178,22 +178,22 @@ class HostAgent:
 
     def _latch_estop(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
-        _, header, clock_trouble = self._clock_table.localised(estop, header, now_ns)
+        _, header, clock_problem = self._clock_table.localize(estop, header, now_ns)
         if estop.engaged:
             if self._kept is not None and header.writer in self._launchers:
                 return
             if self._kept is None:
                 self._on_problem(f"e-stop of {header.writer}, kept until it is reset")
             # A stamp from the future would bar every reset to come.
-            self._engage(estop, now_ns if clock_trouble else min(header.source_ns, now_ns))
+            self._engage(estop, now_ns if clock_problem else min(header.source_ns, now_ns))
         elif header.writer in self._plan.may_reset_estop() and self._kept is not None:
             # A late reader is given each writer's last word: a reset may be older than the stop.
             if header.source_ns < self._engaged_ns:
                 return
             if header.source_ns > now_ns + MAX_STAMP_AHEAD_NS:
-                clock_trouble = clock_trouble or "stamped in the future"
-            if clock_trouble:
-                self._on_problem(f"e-stop not reset: by {header.writer}, {clock_trouble}")
+                clock_problem = clock_problem or "stamped in the future"
+            if clock_problem:
+                self._on_problem(f"e-stop not reset: by {header.writer}, {clock_problem}")
             elif self._resetting is None or self._resetting.done():
                 self._resetting = asyncio.create_task(self._reset(header.writer, self._kept))
 

@@ -37,13 +37,13 @@ WRIST_SINGULAR = 1e-7
 SHOULDER_SINGULAR_M = 1e-7
 """Distance of the wrist centre from the axis of J1 below which J1 keeps its angle."""
 
-WRIST_HELD_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
+WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
 """|J5| up to which J4 keeps its angle, and from which J4 is exact."""
 
-SHOULDER_HELD_M, SHOULDER_NEAR_M = 0.0007, 0.02
+SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
 """Distance of the wrist centre from the axis of J1, likewise."""
 
-HELD_ERROR = 1.4
+MAX_FIXED_ERROR_RATIO = 1.4
 """Largest error between both, as a multiple of the first of them: 1.05 degrees, 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
@@ -200,7 +200,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
     vector of length sin(J5), which rotates arbitrarily fast when it passes zero closely.  There J4
     may lag.  J5 takes the component of the vector along J4, which may be negative.  The rest is an
-    error of the flange's orientation of at most HELD_ERROR * WRIST_HELD_RAD.
+    error of the flange's orientation of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
 
     J1 does the same for a wrist centre near its axis.  A path that passes a singularity within the
     first length is therefore followed straight, with little motion of J4 or J1.  A path further
@@ -215,7 +215,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     q1 = present[0] + _held_rotation(
         x * cos(present[0]) + y * sin(present[0]),
         y * cos(present[0]) - x * sin(present[0]),
-        held=SHOULDER_HELD_M,
+        held=SHOULDER_FIXED_M,
         near=SHOULDER_NEAR_M,
     )
     out, height = x * cos(q1) + y * sin(q1), z - SHOULDER_HEIGHT_M
@@ -229,7 +229,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     q4 = present[3] + _held_rotation(
         c4 * wrist[0][2] + s4 * wrist[1][2],
         c4 * wrist[1][2] - s4 * wrist[0][2],
-        held=WRIST_HELD_RAD,
+        held=WRIST_FIXED_RAD,
         near=WRIST_NEAR_RAD,
     )
     c4, s4 = cos(q4), sin(q4)

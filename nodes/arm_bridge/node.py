@@ -79,7 +79,7 @@ class ArmBridge(Node):
 
     def on_estop(self, estop: EStop, header: Header) -> None:
         stamp_ns, now_ns = header.source_ns, self.clock.now_ns()
-        clock_problem = self.estop.clock_trouble
+        clock_problem = self.estop.clock_problem
         if refusal := self._control.on_estop(estop, stamp_ns, now_ns, clock_problem):
             self.log.warning("reset refused", reason=refusal)
 
@@ -126,7 +126,7 @@ class ArmBridge(Node):
 
     async def _exchange(self, geometry: ArmGeometry, other: OtherArm | None, step_s: float) -> None:
         control, last = self._control, self._last
-        clock_problem = self.sheet_target.clock_trouble or self.other_arm.clock_trouble
+        clock_problem = self.sheet_target.clock_problem or self.other_arm.clock_problem
         command = control.step(geometry, self._read_goal(), other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
             control.on_path_result(*result)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import chosen
+from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
@@ -175,7 +175,7 @@ class EyeViewRequester:
     @property
     def correction(self) -> Correction:
         """Return the correction that was chosen at the console, else that of the scene."""
-        return chosen(self.picked, self._by_scene, "two_pass")
+        return resolve_method(self.picked, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
         """Return how long the present state has lasted."""

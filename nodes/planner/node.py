@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import SheetForceMethod, chosen
+from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import Fingertip, SheetTarget, SoftBody
@@ -60,7 +60,7 @@ class Planner(Node):
         self._trajectory = self._compliance = None
         self._trajectory = SheetTrajectoryPlanner(scene, self.parameters.trajectory_settings())
         if self._calibration is None:
-            method: SheetForceMethod = chosen(
+            method: SheetForceMethod = resolve_method(
                 self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
             )
             model, self._model_note = load_force_model(scene, method, self.parameters.cache_dir)
