@@ -220,7 +220,7 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
         assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
         assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
-    told = "hung: no sign of life for 2 s; its log holds the stacks; starts again in 0.01 s"
+    told = "hung: no heartbeat for 2 s; its log holds the stacks; starts again in 0.01 s"
     assert f"stuck {told}" in said
     assert not any("launch_nodes.py" in line for line in said)
 

@@ -277,7 +277,7 @@ def test_causes_are_told_apart() -> None:
     assert refused([*good, b"more"], EStop).cause == "frames"
     other = refused(good, Fingertip)
     assert other.cause == "type"
-    assert str(other) == "carries 'EStop', wanted Fingertip"
+    assert str(other) == "expected type Fingertip, found 'EStop'"
     head = msgpack.unpackb(good[0])
     head[2] = bytes(8)
     assert refused([msgpack.packb(head)], EStop).cause == "fingerprint"
@@ -326,7 +326,7 @@ def test_huge_but_finite_arrays_pass(value: float) -> None:
     ],
 )
 def test_wrong_arrays_are_refused(array: Any) -> None:
-    with pytest.raises(ValueError, match="wanted"):
+    with pytest.raises(ValueError, match="expected"):
         ArraySpec("<f8", (3,)).validate(array)
 
 

@@ -118,7 +118,7 @@ async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> Non
     await street.speak(mouth, lambda: friend.heard and stranger.problems and street.refused)
     await street.speak(mouth, lambda: len(friend.heard) > 100)
     assert (stranger.heard, without.heard) == ([], [])
-    assert "refuses our key" in stranger.problems[0]
+    assert "rejects the key of this host" in stranger.problems[0]
     assert street.known.derive_public_key("stranger") in street.refused[0]
 
 

@@ -537,7 +537,7 @@ class RunningGraph:
             return f"was not ready within {node.start_deadline_s:g} s"
         if hangs:
             self.hangs[node.name] += 1
-            return f"hung: no sign of life for {node.liveness_s:g} s; its log holds the stacks"
+            return f"hung: no heartbeat for {node.liveness_s:g} s; its log holds the stacks"
         return describe_exit(code)
 
     async def _detect_hang(self, child: Child, node: ResolvedNode) -> bool:

@@ -118,8 +118,8 @@ class Planner(Node):
             return 0.0
         before_s = self._horizon_s
         max_s = (len(fingertip.predicted_path_world_m) - 1) * fingertip.prediction_step_s
-        wanted_s = age_s + self.parameters.actuation_delay_s
-        self._horizon_s = next_horizon_s(before_s, wanted_s, max_s)
+        needed_s = age_s + self.parameters.actuation_delay_s
+        self._horizon_s = next_horizon_s(before_s, needed_s, max_s)
         return self._horizon_s - before_s
 
     def _publish(self, planned: PlannedStep, source_ns: int) -> None:
