@@ -449,7 +449,7 @@ def test_queue_lengths_are_bounded_for_every_topic() -> None:
 
 async def test_twice_started(room: Room) -> None:
     ear = room.ear(TOPICS["estop"])
-    with pytest.raises(BusError, match="started already"):
+    with pytest.raises(BusError, match="is started already"):
         ear.subscriber.start()
 
 

@@ -112,7 +112,7 @@ def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[s
         ({"shape": "ellipsoid", "semi_axes_m": [0.1, 0.1, -0.1]}, "semi_axes_m.2: -0.1"),
         (
             {"shape": "rounded_box", "size_m": [0.1, 0.1, 0.02], "edge_radius_m": 0.02},
-            "round the edges less",
+            "reduce it",
         ),
         ({"shape": "mesh_file", "file": "a.stl"}, '"metres_per_unit" is missing'),
         (
