@@ -32,7 +32,7 @@ from flexsheet.launch.running.runs import local_endpoints
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Subscriber
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Status
 from flexsheet.nodes.node import PortCounts
 
@@ -164,7 +164,7 @@ async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(180)
         endpoints = local_endpoints(graph.run, plan.endpoints_to_read("status"))
-        subscriber = Subscriber(topic_named("status"), endpoints, statuses.take, PortCounts())
+        subscriber = Subscriber(find_topic("status"), endpoints, statuses.take, PortCounts())
         subscriber.start()
         await asyncio.sleep(SETTLE_S)
         result["load_before"] = os.getloadavg()[0]

@@ -42,7 +42,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Subscriber
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import Fingertip, StereoPair
-from flexsheet.messages.wire import INLINE_BYTES, decode, encode, size_of
+from flexsheet.messages.wire import INLINE_BYTES, count_bytes, decode, encode
 
 FLOOR = "blocking"
 NODES_USE = "flexsheet uvloop"
@@ -473,7 +473,7 @@ def codec_costs() -> list[dict[str, Any]]:
                     "payload": payload.name,
                     "inline_bytes": inline_bytes,
                     "frames": len(frames),
-                    "bytes": size_of(frames),
+                    "bytes": count_bytes(frames),
                     "construct_us": best_us(payload.make, 0),
                     "encode_us": best_us(
                         encode, message, make_header(1, 2), inline_bytes=inline_bytes

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import body, precompute, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
@@ -92,7 +92,7 @@ def evaluate_table(scene: Scene, spacing_m: float) -> None:
             f"{len(best.method.reach_m)} places reach {least:.1f} mm at least, nine in ten "
             f"{tenth:.1f} mm, half {half:.1f} mm; {deep} reach 20 mm"
         )
-    mesh, radius_m = build_mesh(best.spec.mesh), cylinder_of(scene).radius_m
+    mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
         sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
@@ -167,7 +167,7 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
     """Return Hertz's force of a sphere on a half-space with the cylinder's curvature, N."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
-    finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / cylinder_of(scene).radius_m
+    finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / require_cylinder(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
     return float(4.0 / 3.0 * modulus / (1.0 - nu**2) * np.sqrt(radius) * depth_m**1.5)
 
@@ -193,7 +193,7 @@ def measure(scene: Scene, spacing_m: float) -> None:
         flush=True,
     )
     for depth_m in DEPTHS_M:
-        print_slides(scene, slide(built, cylinder_of(scene).radius_m, depth_m), depth_m)
+        print_slides(scene, slide(built, require_cylinder(scene).radius_m, depth_m), depth_m)
 
 
 def print_slides(scene: Scene, slides: Slides, depth_m: float) -> None:

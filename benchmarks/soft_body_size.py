@@ -31,7 +31,7 @@ from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.code_state import git_state
-from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, SkinResponse
@@ -324,7 +324,7 @@ def make_points(kept: Sequence[dict[str, Any]]) -> list[Point]:
 def measure_all() -> dict[str, Any]:
     """Measure all sizes and contacts."""
     scene = load_scene(SCENE_FILE)
-    shape = make_shape(dict(cylinder_of(scene)))
+    shape = make_shape(dict(require_cylinder(scene)))
     by_size, by_contact = [], []
     print(HEAD)
     for spacing in SPACINGS_M:

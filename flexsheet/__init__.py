@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.base import Header, Message
     from flexsheet.messages.clock import SystemClock, VirtualClock
     from flexsheet.messages.scene import Scene
-    from flexsheet.messages.topics import TOPICS, topic_named
+    from flexsheet.messages.topics import TOPICS, find_topic
     from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 _MODULES = {
@@ -53,7 +53,7 @@ _MODULES = {
     "read_topic": "flexsheet.launch.running.tools",
     "recover": "flexsheet.messages.bag",
     "run_experiment": "flexsheet.launch.experiments.run",
-    "topic_named": "flexsheet.messages.topics",
+    "find_topic": "flexsheet.messages.topics",
 }
 
 _FORMER_NAMES = {
@@ -83,13 +83,13 @@ __all__ = [
     "Scene",
     "SystemClock",
     "VirtualClock",
+    "find_topic",
     "load_graph",
     "load_scene",
     "periodic",
     "read_topic",
     "recover",
     "run_experiment",
-    "topic_named",
 ]
 
 

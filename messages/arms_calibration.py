@@ -1,4 +1,4 @@
-"""The arms' calibration file: what `flexsheet calibrate arms` writes; where the bases stand."""
+"""Define the calibration file of the arms' bases, which `flexsheet calibrate arms` writes."""
 
 from __future__ import annotations
 
@@ -14,63 +14,73 @@ from flexsheet.messages.scene import NonNegative, Part, Pose
 ARMS_CALIBRATION_VERSION = 1
 
 
-class ArmPlace(Part):
-    """How one place of the arm fits."""
+class ArmPoseFit(Part):
+    """Residual of one pose of the arm."""
 
     name: str
     used: bool
-    reason: str = Field(description="why it was left out; empty when used")
-    shift_m: NonNegative = Field(description="from where the joints say to where it was seen")
+    reason: str = Field(description="why the pose was left out; empty if used")
+    shift_m: NonNegative = Field(
+        description="distance of the measured board from that by the joints"
+    )
     turn_rad: NonNegative
-    rms_px: NonNegative = Field(description="of the corners, drawn where the joints say")
+    rms_px: NonNegative = Field(description="reprojection error of the corners by the joints")
 
 
 class ArmBase(Part):
-    """Where one arm's base stands, and how well that is known; deviations are standard ones."""
+    """Pose of one arm's base, and its uncertainty as standard deviations."""
 
     world_from_base: Pose
     flange_from_board: Pose
     position_std_m: NonNegative = Field(
-        description="of where this arm is sent to at the world's origin, all three axes together"
+        description="position error of this arm at the world's origin, all three axes together"
     )
-    rotation_std_rad: NonNegative = Field(description="of the base, all three axes together")
+    rotation_std_rad: NonNegative = Field(
+        description="orientation error of the base, all three axes together"
+    )
     covariance: Covariance = Field(
-        description="(6, 6) of the base's error: a turn about its origin, in the world's axes "
-        "(rad), then a shift (m)"
+        description="covariance (6, 6) of the base's error: rotation about its origin, in the "
+        "world's axes (rad), then translation (m)"
     )
     jackknife_ratio: NonNegative = Field(
-        description="what refits without one place scatter, over what the fit states; above 1 the "
-        "covariance was raised by its square"
+        description="scatter of fits without one pose, over that by the covariance; above 1 the "
+        "covariance was multiplied by its square"
     )
     largest_change_m: NonNegative = Field(
-        description="of the base's position, when any one place is left out"
+        description="largest change of the base's position when one pose is left out"
     )
     largest_change_rad: NonNegative
-    corner_sigma_px: NonNegative = Field(description="of one coordinate of a corner")
-    arm_sigma_m: NonNegative = Field(description="of one component of the flange's own error")
+    corner_sigma_px: NonNegative = Field(
+        description="standard deviation of one coordinate of a corner"
+    )
+    arm_sigma_m: NonNegative = Field(
+        description="error of the flange's position by the joints, per axis"
+    )
     arm_sigma_rad: NonNegative
-    places: tuple[ArmPlace, ...]
+    places: tuple[ArmPoseFit, ...]
 
 
 class ArmsCalibration(Part):
-    """The measured bases; an arm that was not measured is null."""
+    """Calibration of the arms' bases; an arm that was not measured is null."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
     code_version: str
-    scene: str = Field(description="whose camera's place in the world was taken as given")
-    device: str = Field(description="the stereo camera")
+    scene: str = Field(description="scene whose camera pose in the world is the reference")
+    device: str = Field(description="device of the stereo camera")
     board: Board
     left: ArmBase | None = None
     right: ArmBase | None = None
 
 
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    title = f"Where the arms of scene {calibration.scene} stand, {calibration.date}."
+    """Write the calibration file; FileWriteError if the disk refuses it."""
+    title = f"Bases of the arms of scene {calibration.scene}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_arms_calibration(path: Path) -> ArmsCalibration:
+    """Read the calibration file; CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate arms"
     return read_calibration(
         ArmsCalibration, path, version=ARMS_CALIBRATION_VERSION, command=command

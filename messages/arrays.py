@@ -1,8 +1,8 @@
-"""Array fields whose element type and shape are part of the message's type.
+"""Define array fields whose element type and shape are part of the message's type.
 
-A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``; the usual ones
-have names here (``Vector3``, ``Transform``, ...).  Validation never copies an array that already
-fits: what a subscriber sees is the memory that came from the socket.
+A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``.  The common types
+have names (``Vector3``, ``Transform``, ...).  Validation does not copy a valid array, so a
+subscriber reads the memory that came from the socket.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 Dimension = int | str
-"""A fixed length, or the name of a free one; equal names within one array must be equal lengths."""
+"""A fixed length, or the name of a variable one; equal names in one array mean equal lengths."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArraySpec:
-    """What an array field accepts.
+    """Element type and shape of an array field.
 
     dtype: numpy type string with byte order, little-endian ("<f8", "|u1").
-    shape: a length per axis; a name stands for any length.
-    finite: refuse NaN and infinity (floating types only).
+    shape: length of each axis; a name means any length.
+    finite: reject NaN and infinity (floating types only).
     """
 
     dtype: str
@@ -36,51 +36,51 @@ class ArraySpec:
     finite: bool = True
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return `value` as an array of this type; ValueError says what does not fit.
+        """Return `value` as an array of this type; ValueError for another type or shape.
 
-        Arrays must have the exact dtype (a silent float64 -> float32 would lose digits); nested
-        lists, as they come from a scene file, are converted.
+        Arrays must have the exact dtype, because a silent float64 -> float32 would lose digits.
+        Nested lists, as in a scene file, are converted.
         """
-        wanted = _dtype(self.dtype)
+        expected = _dtype(self.dtype)
         if isinstance(value, np.ndarray):
             array = value
-            if array.dtype is not wanted and array.dtype != wanted:
-                raise ValueError(f"array of {array.dtype}, wanted {wanted}")
+            if array.dtype is not expected and array.dtype != expected:
+                raise ValueError(f"array of {array.dtype}, expected {expected}")
         elif isinstance(value, (list, tuple)):
-            array = _from_lists(value, wanted)
+            array = _convert_lists(value, expected)
         else:
-            raise ValueError(f"{type(value).__name__} is not an array of {wanted}")
-        if not _fits(array.shape, self.shape):
-            raise ValueError(f"array of shape {array.shape}, wanted {self.describe_shape()}")
+            raise ValueError(f"{type(value).__name__} is not an array of {expected}")
+        if not _has_shape(array.shape, self.shape):
+            raise ValueError(f"array of shape {array.shape}, expected {self.describe_shape()}")
         if not array.flags.c_contiguous:
             array = np.ascontiguousarray(array)
-        if self.finite and wanted.kind == "f" and not _all_finite(array):
+        if self.finite and expected.kind == "f" and not _all_finite(array):
             raise ValueError("array has NaN or infinite elements")
         return array
 
     def describe_shape(self) -> str:
-        """The shape as a reader would write it: "(3,)", "(height, width)"."""
+        """Return the shape as text: "(3,)", "(height, width)"."""
         inner = ", ".join(str(length) for length in self.shape)
         return f"({inner},)" if len(self.shape) == 1 else f"({inner})"
 
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        wanted, shape, unlike = np.dtype(self.dtype), self.shape, self.validate
-        check_finite = self.finite and wanted.kind == "f"
-        array_type, fits, all_finite = np.ndarray, _fits, _all_finite
+        expected, shape, validate_fully = np.dtype(self.dtype), self.shape, self.validate
+        check_finite = self.finite and expected.kind == "f"
+        array_type, has_shape, all_finite = np.ndarray, _has_shape, _all_finite
 
         def validate(value: object) -> NDArray[Any]:
-            """The common case without detours: an array that fits."""
+            """Accept a valid array at once; otherwise run the full validation."""
             if (
                 type(value) is array_type
-                and value.dtype is wanted
-                and fits(value.shape, shape)
+                and value.dtype is expected
+                and has_shape(value.shape, shape)
                 and value.flags.c_contiguous
                 and (not check_finite or all_finite(value))
             ):
                 return value
-            return unlike(value)
+            return validate_fully(value)
 
         return core_schema.no_info_plain_validator_function(
             validate,
@@ -106,33 +106,32 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 @lru_cache(maxsize=4096)
-def _fits(shape: tuple[int, ...], wanted: tuple[Dimension, ...]) -> bool:
-    """Return whether an array's shape is one of those that are wanted."""
-    if len(shape) != len(wanted):
+def _has_shape(shape: tuple[int, ...], expected: tuple[Dimension, ...]) -> bool:
+    """Return whether an array's shape matches the expected dimensions."""
+    if len(shape) != len(expected):
         return False
     lengths: dict[str, int] = {}
     return all(
         length == (lengths.setdefault(one, length) if isinstance(one, str) else one)
-        for length, one in zip(shape, wanted, strict=True)
+        for length, one in zip(shape, expected, strict=True)
     )
 
 
-def _from_lists(value: list[Any] | tuple[Any, ...], wanted: np.dtype[Any]) -> NDArray[Any]:
+def _convert_lists(value: list[Any] | tuple[Any, ...], expected: np.dtype[Any]) -> NDArray[Any]:
     try:
-        array = np.asarray(value, dtype=wanted)
-        if wanted.kind in "iu" and not np.array_equal(np.asarray(value), array):
+        array = np.asarray(value, dtype=expected)
+        if expected.kind in "iu" and not np.array_equal(np.asarray(value), array):
             raise ValueError("an element is not a whole number")
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"not an array of {wanted}: {error}") from error
+        raise ValueError(f"not an array of {expected}: {error}") from error
     return array
 
 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
     """Return whether no element is NaN or infinite.
 
-    A sum is NaN or infinite if an element is; of a few elements it is sooner had than numpy's
-    answer, above all by a process that has slept.  It may overflow for finite ones, hence the
-    second look.
+    A sum is NaN or infinite if an element is.  For few elements it is faster than numpy's test.
+    It may overflow for finite elements, which numpy then decides.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):
         return True

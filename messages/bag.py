@@ -1,18 +1,18 @@
-"""Bags: MCAP files that hold the wire's bytes as they are, with their schemas and their time.
+"""Read and write bags: MCAP files of the messages' bytes on the wire, with schemas and times.
 
-What MCAP leaves to the application is decided here:
+This module defines what MCAP leaves to the application:
 
 - Profile "flexsheet"; one schema per message type (JSON Schema); one channel per topic, encoding
   "flexsheet/2", with the type's fingerprint in the channel's metadata.
 - `log_time` is when the recorder received the message, `publish_time` is the header's source
   stamp; both in ns of a monotonic clock, not since 1970.
-- A message's data are its frames: uint32 number of frames, four zero bytes, a uint64 length per
-  frame, then the frames, each padded with zeros to a multiple of eight, so that arrays are aligned
-  when they are read in place.  All little-endian.
+- The data of a message are its frames: uint32 number of frames, four zero bytes, and a uint64
+  length per frame.  Then the frames follow, each padded with zeros to a multiple of eight, which
+  aligns arrays for reading in place.  All numbers are little-endian.
 
-A writer hands its data to the disk each second by itself.  A reader walks over the records and
-never needs the index at the end, so a file cut by a crash is no special case: it just ends earlier,
-and `BagReader.complete` is false.
+A writer flushes its data to the disk every second.  A reader scans the records and does not need
+the index at the end.  A file that a crash has truncated ends earlier, and `BagReader.complete` is
+false.
 """
 
 from __future__ import annotations
@@ -41,33 +41,33 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from flexsheet.messages.base import Header, Message, schema_fingerprint
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_error
-from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, migration_for
-from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
+from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, find_migration
+from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, find_topic
 from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
 
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
-SUMMARY_RECORD_BYTES_MAX = 64 << 20
-CHUNK_BYTES_MAX = 256 << 20
-"""Largest uncompressed chunk; a writer closes a chunk with the message that exceeds 1 MiB."""
+MAX_SUMMARY_RECORD_BYTES = 64 << 20
+MAX_CHUNK_BYTES = 256 << 20
+"""Maximum uncompressed chunk; a writer closes a chunk with the message that exceeds 1 MiB."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
 
 
 class BagError(FlexsheetError):
-    """A bag that cannot be written or read; the sentence names the file and says what is wrong."""
+    """A bag that cannot be written or read; the text names the file and the cause."""
 
     code = "bag"
     remedy = (
-        "`flexsheet bag info BAG` reports how much can be read. `flexsheet bag recover` makes a "
-        "whole bag of it."
+        "`flexsheet bag info BAG` reports how much is readable. `flexsheet bag recover` writes the "
+        "readable part to a complete bag."
     )
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:
-    """The data of one recorded message; the layout is in the module's text."""
+    """Encode the frames of one recorded message; the layout is in the module's docstring."""
     lengths = [len(frame) for frame in frames]
     parts: list[Any] = [struct.pack(f"<II{len(lengths)}Q", len(lengths), 0, *lengths)]
     for frame, length in zip(frames, lengths, strict=True):
@@ -76,7 +76,7 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 
 
 def split_frames(data: bytes) -> list[memoryview]:
-    """The frames of `join_frames`, as views; raises WireError where `data` is something else."""
+    """Decode the result of `join_frames` as views; raises WireError for other data."""
     view = memoryview(data)
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
@@ -87,18 +87,19 @@ def split_frames(data: bytes) -> list[memoryview]:
         frames.append(view[offset : offset + length])
         offset += length + -length % 8
     if offset != len(view):
-        raise WireError("malformed", f"recorded frames need {offset} bytes, there are {len(view)}")
+        raise WireError("malformed", f"recorded frames: expected {offset} bytes, found {len(view)}")
     return frames
 
 
 class BagWriter:
-    """Writes one bag; a context manager.  Methods may be called from one thread.
+    """Writer of one bag, a context manager; its methods must be called from one thread.
 
-    metadata: named records of text, for what identifies the recording (clock, hosts, git state).
-    compress: zstd per chunk of about 1 MiB; without, pictures cost less time and more disk.
+    metadata: named tables of text that identify the recording (clock, hosts, git state).
+    compress: compress chunks of about 1 MiB by zstd; without it, images take less time and more
+        disk space.
 
-    Each second a thread of its own hands what was written to the disk (fsync), so that a killed
-    process loses at most the last second, and a power cut little more.
+    A separate thread flushes the file to the disk every second (fsync).  A killed process therefore
+    loses at most the last second, and a power failure slightly more.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class BagWriter:
         try:
             self._file: IO[bytes] = self.path.open("xb")
         except FileExistsError:
-            raise BagError(f"{self.path}: exists already; a bag is never written over") from None
+            raise BagError(f"{self.path}: exists already; bags are not overwritten") from None
         except OSError as error:
             raise BagError(str(write_error(self.path, error))) from error
         self._writer: Any = Writer(  # mcap's types are incomplete
@@ -131,7 +132,7 @@ class BagWriter:
                 self._writer.start(profile=PROFILE, library="flexsheet")
                 self._file.flush()
         except BagError:
-            # What is buffered cannot be written either; the error that is raised says why.
+            # The buffered data cannot be written either; the raised error gives the cause.
             with suppress(OSError):
                 self._file.close()
             self.path.unlink(missing_ok=True)
@@ -142,13 +143,13 @@ class BagWriter:
         self._flusher.start()
 
     def write(self, topic: Topic, message: Message, header: Header, log_time_ns: int) -> None:
-        """Record a message with the bytes that it has on the wire."""
+        """Encode and record a message."""
         self.write_frames(topic, encode(message, header), header, log_time_ns)
 
     def write_frames(
         self, topic: Topic, frames: Sequence[Any], header: Header, log_time_ns: int
     ) -> None:
-        """Record a message whose frames are at hand."""
+        """Record an encoded message."""
         data = join_frames(frames)
         with self._writing():
             self._writer.add_message(
@@ -161,20 +162,20 @@ class BagWriter:
             self.messages += 1
 
     def add_attachment(self, name: str, data: bytes, media_type: str) -> None:
-        """Put a whole file into the bag: launch file, scene, calibration, git state."""
+        """Add a file to the bag: launch file, scene, calibration, git state."""
         with self._writing():
             self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Put a named table of text into the bag."""
+        """Add a named table of text to the bag."""
         with self._writing():
             self._writer.add_metadata(name, dict(values))
 
     def flush(self) -> None:
-        """Hand all that was written to the disk, and wait for it."""
+        """Flush the file to the disk, and wait until it is stored."""
         with self._writing():
             self._writer.flush()
-        # Outside the lock: a slow disk must not keep the next message waiting.
+        # Outside the lock: a slow disk must not delay the next message.
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -182,7 +183,7 @@ class BagWriter:
             raise BagError(str(write_error(self.path, error))) from error
 
     def close(self) -> None:
-        """Write the index and close; raises BagError if the disk did not take everything."""
+        """Write the index and close the file; raises BagError if any data could not be written."""
         if self._file.closed:
             return
         self._closing.set()
@@ -216,11 +217,11 @@ class BagWriter:
             try:
                 self.flush()
             except BagError:
-                return  # kept in _failure: the next call says it again
+                return  # stored in _failure; the next call raises it again
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """The lock held, the file open; what the disk refuses becomes a BagError."""
+        """Hold the lock of the open file, and convert disk errors to BagError."""
         with self._lock:
             if self._file.closed:
                 raise BagError(f"{self.path}: the bag is closed")
@@ -252,7 +253,7 @@ class BagWriter:
 
 @dataclass(slots=True)
 class Chunk:
-    """A chunk's place, its span of log time, and the log times of its messages per channel."""
+    """Position of a chunk, its range of log time, and the log times of its messages per channel."""
 
     offset: int
     length: int
@@ -262,8 +263,8 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
-    """How the messages of one channel are read: the type as recorded, and how to migrate it."""
+class ChannelDecoder:
+    """Recorded type of one channel's messages, and their migration to the current type."""
 
     topic: Topic
     recorded_type: str
@@ -273,9 +274,9 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """What a bag holds of one topic.
+    """Summary of one topic in a bag.
 
-    readable: the type's fields are what they are in this code, or can be made so (`migrations`).
+    readable: whether the recorded type is the current one, or can be migrated to it.
     """
 
     name: str
@@ -287,7 +288,7 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentInfo:
-    """A file that was put into the bag, and where in the bag it is."""
+    """File that is attached to a bag, and its position there."""
 
     name: str
     media_type: str
@@ -298,9 +299,9 @@ class AttachmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class BagInfo:
-    """The summary of a bag; times are on the recorder's clock.
+    """Summary of a bag; times are on the recorder's clock.
 
-    problem: why the bag is not complete, in a sentence.
+    problem: why the bag is not complete.
     """
 
     path: Path
@@ -316,10 +317,10 @@ class BagInfo:
 
 
 class BagReader:
-    """Reads a bag, whole or cut; iterating gives (topic name, message, header, log_time_ns).
+    """Reader of a complete or truncated bag; iterates over (topic, message, header, log_time_ns).
 
-    topics: names; default all.  start_ns, end_ns: of log time, the end excluded.
-    Messages come in the order of log time.
+    topics: names; None: all.  start_ns, end_ns: range of log time without its end.  Messages are in
+    the order of log time.
     """
 
     def __init__(
@@ -344,24 +345,23 @@ class BagReader:
         self.attachments: list[AttachmentInfo] = []
         try:
             with self.path.open("rb") as file:
-                self._walk(file)
-                self._fill_in_what_the_index_lacks(file)
+                self._scan(file)
+                self._index_remaining_chunks(file)
         except OSError as error:
             raise BagError(f"{self.path}: cannot be read: {error.strerror or error}") from error
         self._check_topics()
 
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
-        """Decoded messages, as of today: see `messages.migrations` for types that have changed.
+        """Yield decoded messages of the current types; `messages.migrations` converts older ones.
 
-        Raises BagError for a topic whose type has changed in a way that nobody knows how to follow.
+        Raises BagError for a topic whose recorded type has no migration.
         """
-        readable = {
-            channel.topic: self._reading_of(channel) for channel in self._selected().values()
+        decoders = {
+            channel.topic: self._make_decoder(channel) for channel in self._selected().values()
         }
         for number, (name, frames, log_time_ns) in enumerate(self.frames()):
-            reading = readable[name]
             try:
-                message, header = _open(frames, reading)
+                message, header = _decode(frames, decoders[name])
             except WireError as error:
                 raise BagError(
                     f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
@@ -371,16 +371,16 @@ class BagReader:
     def open_record(
         self, channel: mcap_records.Channel, record: mcap_records.Message
     ) -> tuple[Message, Header]:
-        """Decode one record of `records` or `read_chunk`, as iterating does; BagError."""
+        """Decode one record of `records` or `read_chunk`; raises BagError."""
         try:
-            return _open(split_frames(record.data), self._reading_of(channel))
+            return _decode(split_frames(record.data), self._make_decoder(channel))
         except WireError as error:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" at {record.log_time} ns: {error}'
             ) from error
 
     def frames(self) -> Iterator[tuple[str, list[memoryview], int]]:
-        """(topic name, frames, log_time_ns), as recorded, whatever the types are today."""
+        """Yield (topic name, frames, log_time_ns) as recorded, without any migration."""
         for channel, record in self.records():
             try:
                 frames = split_frames(record.data)
@@ -389,7 +389,7 @@ class BagReader:
             yield channel.topic, frames, record.log_time
 
     def records(self) -> Iterator[tuple[mcap_records.Channel, mcap_records.Message]]:
-        """MCAP's own records, in the order of log time."""
+        """Yield the MCAP channel and message of each record, in the order of log time."""
         selected = self._selected()
         start = self._start_ns if self._start_ns is not None else -1
         end = self._end_ns if self._end_ns is not None else 1 << 64
@@ -418,21 +418,23 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """The recorded topics and their types' names."""
-        return {channel.topic: _type_of(channel) for channel in self.channels.values()}
+        """The recorded topics and the names of their types."""
+        return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
-        """The newest attachment of that name; raises BagError if there is none."""
-        for held in reversed(self.attachments):
-            if held.name == name:
+        """Return the newest attachment of that name; raises BagError if there is none."""
+        for one in reversed(self.attachments):
+            if one.name == name:
                 with self.path.open("rb") as file:
-                    body = _read_at(file, held.offset, held.length)
+                    body = _read_at(file, one.offset, one.length)
                 return _parse_attachment(body).data
-        names = ", ".join(held.name for held in self.attachments) or "none"
-        raise BagError(f'{self.path}: no attachment "{name}"; there are: {names}')
+        names = ", ".join(one.name for one in self.attachments) or "none"
+        raise BagError(
+            f'{self.path}: does not contain the attachment "{name}"; attachments: {names}'
+        )
 
     def info(self) -> BagInfo:
-        """The summary of the whole bag, whatever this reader selects."""
+        """Return the summary of the whole bag, independent of the selection."""
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
             for channel_id, stamps in chunk.times_ns.items():
@@ -444,10 +446,10 @@ class BagReader:
             topics.append(
                 TopicInfo(
                     name=channel.topic,
-                    type=_type_of(channel),
+                    type=_find_type_name(channel),
                     count=len(stamps),
                     rate_hz=(len(stamps) - 1) / span_s if span_s > 0.0 else 0.0,
-                    readable=self._migration_of(channel) is not None,
+                    readable=self._find_migration(channel) is not None,
                 )
             )
         stamps = [stamp for channel_stamps in times.values() for stamp in channel_stamps]
@@ -465,34 +467,35 @@ class BagReader:
             metadata=self.metadata,
         )
 
-    def _walk(self, file: IO[bytes]) -> None:
-        """Find every whole record; where one is cut or makes no sense, the bag ends."""
+    def _scan(self, file: IO[bytes]) -> None:
+        """Index the records up to the first truncated or invalid one."""
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
-            what = "is empty" if not magic else "is no MCAP file"
+            what = "is empty" if not magic else "is not an MCAP file"
             raise BagError(f"{self.path}: {what}; bags are written by `flexsheet bag record`")
         offset = len(MCAP0_MAGIC)
         first = True
         while True:
             head = _read_at(file, offset, _RECORD_HEAD.size)
             if len(head) < _RECORD_HEAD.size:
-                self.problem = f"cut after {offset} of {size} bytes; it was not closed"
+                self.problem = f"truncated after {offset} of {size} bytes; it was not closed"
                 break
             opcode, length = _RECORD_HEAD.unpack(head)
             offset += _RECORD_HEAD.size
             if offset + length > size or opcode == 0:
                 self.problem = (
-                    f"cut after {offset - _RECORD_HEAD.size} of {size} bytes; it was not closed"
+                    f"truncated after {offset - _RECORD_HEAD.size} of {size} bytes; "
+                    "it was not closed"
                 )
                 break
             if first and opcode != Opcode.HEADER:
-                raise BagError(f"{self.path}: its first record is no header; not a bag")
+                raise BagError(f"{self.path}: not a bag; its first record is not a header")
             try:
-                self._note_record(file, opcode, offset, length)
+                self._index_record(file, opcode, offset, length)
             except BagError:
                 raise
-            # What the parsers raise on foreign bytes is not specified: struct.error, ValueError...
+            # The parsers raise unspecified errors on invalid bytes: struct.error, ValueError, ...
             except Exception as error:
                 if first:
                     raise BagError(f"{self.path}: its header is damaged: {error}") from error
@@ -501,21 +504,21 @@ class BagReader:
             offset += length
             if opcode == Opcode.FOOTER:
                 if _read_at(file, offset, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                    self.problem = f"cut in its last bytes, at {offset} of {size}"
+                    self.problem = f"truncated in its last bytes, at {offset} of {size}"
                 self.complete = not self.problem
                 break
         if first:
-            raise BagError(f"{self.path}: {self.problem}; it holds nothing")
+            raise BagError(f"{self.path}: {self.problem}; it contains no record")
 
-    def _note_record(self, file: IO[bytes], opcode: int, offset: int, length: int) -> None:
+    def _index_record(self, file: IO[bytes], opcode: int, offset: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
             head = _CHUNK_HEAD.unpack(_read_at(file, offset, _CHUNK_HEAD.size))
             self.chunks.append(Chunk(offset, length, head[0], head[1]))
             return
         if opcode == Opcode.ATTACHMENT:
-            held = _parse_attachment(_read_at(file, offset, length))
+            found = _parse_attachment(_read_at(file, offset, length))
             self.attachments.append(
-                AttachmentInfo(held.name, held.media_type, len(held.data), offset, length)
+                AttachmentInfo(found.name, found.media_type, len(found.data), offset, length)
             )
             return
         if opcode not in (
@@ -526,7 +529,7 @@ class BagReader:
             Opcode.MESSAGE_INDEX,
         ):
             return
-        if length > SUMMARY_RECORD_BYTES_MAX:
+        if length > MAX_SUMMARY_RECORD_BYTES:
             raise ValueError(f"a record of {length} bytes")
         stream = ReadDataStream(BytesIO(_read_at(file, offset, length)))
         if opcode == Opcode.HEADER:
@@ -548,15 +551,15 @@ class BagReader:
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
 
     def _add_channel(self, channel: mcap_records.Channel) -> None:
-        """Store a channel under the name that its topic has today."""
+        """Store a channel under the current name of its topic."""
         channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
         self.channels[channel.id] = channel
 
-    def _fill_in_what_the_index_lacks(self, file: IO[bytes]) -> None:
-        """Read the chunks of a cut bag whose channels or message times are known no other way.
+    def _index_remaining_chunks(self, file: IO[bytes]) -> None:
+        """Index the chunks of a truncated bag whose channels or message times are unknown.
 
-        The message indexes behind the last chunk may be cut off in part.  A chunk that is damaged
-        is left for whoever wants its messages to stumble over.
+        The message indexes after the last chunk may be truncated.  A damaged chunk is kept, and
+        raises an error when its messages are read.
         """
         for chunk in self.chunks:
             last = chunk is self.chunks[-1]
@@ -578,13 +581,13 @@ class BagReader:
             chunk.times_ns = times
 
     def read_chunk(self, file: IO[bytes], chunk: Chunk) -> list[mcap_records.McapRecord]:
-        """The chunk's records; raises BagError if its bytes are not what was written."""
+        """Return the chunk's records; raises BagError if the chunk is damaged."""
         body = _read_at(file, chunk.offset, chunk.length)
         try:
             parsed = mcap_records.Chunk.read(ReadDataStream(BytesIO(body)))
-            parsed.data, parsed.compression = _unpacked(parsed), ""
+            parsed.data, parsed.compression = _decompress(parsed), ""
             return breakup_chunk(parsed, validate_crc=True)
-        # Decompression and parsing of damaged bytes raise what they like.
+        # Decompression and parsing raise unspecified errors on damaged bytes.
         except Exception as error:
             raise BagError(
                 f"{self.path}: damaged chunk at byte {chunk.offset}: {type(error).__name__}: "
@@ -595,7 +598,7 @@ class BagReader:
         recorded = {channel.topic for channel in self.channels.values()}
         for name in (self._topics or frozenset()) - recorded:
             try:
-                topic_named(name)
+                find_topic(name)
             except UnknownTopicError as error:
                 raise BagError(f"{self.path}: {error}") from None
 
@@ -606,7 +609,7 @@ class BagReader:
             if self._topics is None or channel.topic in self._topics
         }
 
-    def _migration_of(self, channel: mcap_records.Channel) -> Migration | None:
+    def _find_migration(self, channel: mcap_records.Channel) -> Migration | None:
         topic, schema = TOPICS.get(channel.topic), self.schemas.get(channel.schema_id)
         if topic is None or schema is None:
             return None
@@ -615,24 +618,24 @@ class BagReader:
             bytes.fromhex(fingerprint)
         except (ValueError, KeyError, RecursionError):
             return None  # damaged
-        return migration_for(topic.message, fingerprint, recorded)
+        return find_migration(topic.message, fingerprint, recorded)
 
-    def _reading_of(self, channel: mcap_records.Channel) -> Reading:
-        """Return how a channel's messages are read; BagError where no migration is known."""
+    def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
+        """Return the decoder of a channel; BagError if its type has no migration."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" does not exist any more; '
-                "`BagReader.frames` still gives its bytes"
+                "`BagReader.frames` returns its bytes"
             )
-        migration = self._migration_of(channel)
+        migration = self._find_migration(channel)
         if migration is None:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" was recorded when '
-                f"{channel.metadata.get('type', 'its type')} had other fields, and nothing in "
-                "messages/migrations.py says how to follow; read it with the code of that time, or "
-                "leave the topic out (`BagReader.frames` gives its bytes)"
+                f"{channel.metadata.get('type', 'its type')} had other fields, and "
+                "messages/migrations.py does not contain a migration; read it with the code of "
+                "that time, or leave the topic out (`BagReader.frames` returns its bytes)"
             )
-        return Reading(
+        return ChannelDecoder(
             TOPICS[channel.topic],
             channel.metadata.get("type", TOPICS[channel.topic].message.__name__),
             bytes.fromhex(channel.metadata["fingerprint"]),
@@ -640,29 +643,29 @@ class BagReader:
         )
 
 
-def _type_of(channel: mcap_records.Channel) -> str:
-    """Return the name that a channel's message type has today."""
+def _find_type_name(channel: mcap_records.Channel) -> str:
+    """Return the current name of a channel's message type."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 
 
-def _open(frames: list[memoryview], reading: Reading) -> tuple[Message, Header]:
-    """Decode a message as of today; WireError."""
+def _decode(frames: list[memoryview], decoder: ChannelDecoder) -> tuple[Message, Header]:
+    """Decode a message and migrate it to the current type; raises WireError."""
     envelope = read_envelope(
-        frames, reading.topic, fingerprint=reading.fingerprint, type_name=reading.recorded_type
+        frames, decoder.topic, fingerprint=decoder.fingerprint, type_name=decoder.recorded_type
     )
-    envelope.fields = reading.migrate(envelope.fields)
+    envelope.fields = decoder.migrate(envelope.fields)
     return envelope.open(), envelope.header
 
 
 def info(path: Path | str) -> BagInfo:
-    """The summary of a bag."""
+    """Return the summary of a bag."""
     return BagReader(path).info()
 
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """What `recover` saved, and what it could not: chunks, and messages of channels unknown."""
+    """Result of `recover`: recovered messages, damaged chunks, and messages of unknown channels."""
 
     messages: int
     attachments: int
@@ -678,10 +681,10 @@ def recover(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RecoverReport:
-    """Write a whole bag from what can be read of a cut or damaged one; the original stays.
+    """Write the readable part of a truncated or damaged bag to a new bag.
 
-    `progress` is told how many chunks are done, and of how many.  Raises BagError where nothing can
-    be read, or the new file cannot be written or exists.
+    progress: called with the number of chunks done, and of all.  Raises BagError if nothing is
+    readable, or if the new file exists or cannot be written.
     """
     reader = BagReader(path_in)
     path_out = Path(path_out)
@@ -692,8 +695,8 @@ def recover(
             writer.start(profile=PROFILE, library="flexsheet")
             for name, values in reader.metadata.items():
                 writer.add_metadata(name, values)
-            for held in reader.attachments:
-                whole = _parse_attachment(_read_at(file, held.offset, held.length))
+            for attached in reader.attachments:
+                whole = _parse_attachment(_read_at(file, attached.offset, attached.length))
                 writer.add_attachment(
                     whole.create_time, whole.log_time, whole.name, whole.media_type, whole.data
                 )
@@ -735,7 +738,7 @@ def recover(
                     messages += 1
             writer.finish()
     except FileExistsError:
-        raise BagError(f"{path_out}: exists already; a bag is never written over") from None
+        raise BagError(f"{path_out}: exists already; bags are not overwritten") from None
     except OSError as error:
         with suppress(OSError):
             path_out.unlink(missing_ok=True)
@@ -757,31 +760,33 @@ def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
     return file.read(length)
 
 
-def _unpacked(chunk: mcap_records.Chunk) -> bytes:
-    """A chunk's records; ValueError where they are more than the chunk claims, or than is allowed.
+def _decompress(chunk: mcap_records.Chunk) -> bytes:
+    """Decompress a chunk's records; ValueError for another size than stated, or a too large one.
 
-    A few bytes of a packed chunk can stand for any number: no more is unpacked than is claimed.
+    A few compressed bytes can expand to any number, so at most the stated size is decompressed.
     """
-    claimed = chunk.uncompressed_size
-    if claimed > CHUNK_BYTES_MAX:
-        raise ValueError(f"claims {claimed} bytes, at most {CHUNK_BYTES_MAX} are allowed")
+    stated = chunk.uncompressed_size
+    if stated > MAX_CHUNK_BYTES:
+        raise ValueError(
+            f"uncompressed size of {stated} bytes; at most {MAX_CHUNK_BYTES} are allowed"
+        )
     match chunk.compression:
         case "":
             data = chunk.data
         case "zstd":
             with zstandard.ZstdDecompressor().stream_reader(chunk.data) as packed:
-                data = packed.read(claimed + 1)
+                data = packed.read(stated + 1)
         case other:
-            raise ValueError(f"is packed by {other[:40]!r}; bags are by zstd, or not at all")
-    if len(data) != claimed:
-        raise ValueError(f"claims {claimed} bytes unpacked, which it is not")
+            raise ValueError(f"unknown compression {other[:40]!r}; expected zstd or none")
+    if len(data) != stated:
+        raise ValueError(f"uncompressed size is not {stated} bytes, as stated")
     return data
 
 
 def _parse_attachment(body: bytes) -> mcap_records.Attachment:
-    """Raises ValueError where the bytes are not what was written."""
+    """Decode an attachment; raises ValueError if its check sum is wrong."""
     if zlib.crc32(memoryview(body)[:-4]) != int.from_bytes(body[-4:], "little"):
-        raise ValueError("an attachment whose check sum is wrong")
+        raise ValueError("the check sum of an attachment is wrong")
     attachment: mcap_records.Attachment = mcap_records.Attachment.read(
         ReadDataStream(BytesIO(body))
     )

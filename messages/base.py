@@ -1,4 +1,4 @@
-"""What every message is, and the header that travels with it."""
+"""Define the base class of messages, and their header."""
 
 from __future__ import annotations
 
@@ -13,47 +13,45 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True, slots=True)
 class StampMark:
-    """Marks a field as an instant on the clock of the header's stamps."""
+    """Annotation of a field that is a time on the clock of the header's stamps."""
 
 
 Stamp = Annotated[int, StampMark()]
-"""An instant in ns on the clock that the header names; 0: none.
+"""Time in ns on the clock of the header; 0: none.
 
-A reader whose clock differs gets such fields moved onto its own; a duration is a plain `int`.
+A subscriber with another clock receives these fields converted to its own.  A duration is an `int`.
 """
 
 
 class Message(BaseModel):
-    """A typed, immutable message.
+    """Base class of typed, immutable messages.
 
-    Subclasses declare fields; `flexsheet.messages.arrays` has the array types.
-
-    Numbers are SI and radians; a field whose unit or frame a reader could doubt carries it in its
-    name (`age_s`, `world_from_sheet`).
+    Subclasses declare fields; `flexsheet.messages.arrays` defines array types.  Numbers are in SI
+    units and radians.  Units and frames are in the names (`age_s`, `world_from_sheet`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
 class MessagePart(BaseModel):
-    """A named group of a message's fields."""
+    """Base class of the named groups of fields in a message."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The envelope of one message.
+    """Header of one message.
 
-    sequence: counts up by one per message of one writer, from 1; gaps are losses.
-    source_ns: when the thing that the message speaks of happened (for all that derives from a
-        picture: the middle of its exposure), on the clock `clock_id`.
-    publish_ns: when the message was handed to the socket, same clock.
-    clock_id: names the clock of the two stamps; stamps of different clocks must not be subtracted.
-    writer: the node that published.
-    epoch: when the writer was started, ns on the same clock: a restart is no loss, and what was
-        said before it is not taken again.
-    plan: hash of the writer's plan; empty in bags from before there was one in the header.
+    sequence: number of the message from its writer, from 1; a gap is a loss.
+    source_ns: time of the measurement on the clock `clock_id`; the middle of the exposure for
+        everything that derives from an image.
+    publish_ns: time when the message was passed to the socket, same clock.
+    clock_id: clock of both stamps; stamps of different clocks must not be subtracted.
+    writer: name of the node that published.
+    epoch: time when the writer started, ns on the same clock.  It distinguishes a restart from a
+        loss, and rejects older messages.
+    plan: hash of the writer's plan; empty in bags of the first wire protocol.
     """
 
     sequence: int
@@ -67,7 +65,7 @@ class Header:
 
 @cache
 def stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
-    """Names of the message's fields that are instants: those of type `Stamp`."""
+    """Return the names of the message's fields of type `Stamp`."""
     return tuple(
         name
         for name, field in message_type.model_fields.items()
@@ -77,22 +75,22 @@ def stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
 
 @cache
 def schema_fingerprint(message_type: type[Message]) -> bytes:
-    """First 8 bytes of the SHA-256 of the type's JSON Schema, its prose left out.
+    """Return the first 8 bytes of the SHA-256 of the type's JSON Schema without descriptions.
 
-    Equal if and only if names, types, ranges, dtypes and shapes of the fields are.
+    It changes with the names, types, ranges, dtypes and shapes of the fields.
     """
-    schema = json.dumps(_without_prose(message_type.model_json_schema()), sort_keys=True)
+    schema = json.dumps(_remove_descriptions(message_type.model_json_schema()), sort_keys=True)
     return hashlib.sha256(schema.encode()).digest()[:8]
 
 
-def _without_prose(schema: object) -> object:
-    """A JSON Schema without titles and descriptions; a field that is named so stays."""
+def _remove_descriptions(schema: object) -> object:
+    """Return a JSON Schema without titles and descriptions; fields of these names remain."""
     if isinstance(schema, dict):
         return {
-            key: _without_prose(value)
+            key: _remove_descriptions(value)
             for key, value in schema.items()
             if not (key in ("title", "description") and isinstance(value, str))
         }
     if isinstance(schema, list):
-        return [_without_prose(value) for value in schema]
+        return [_remove_descriptions(value) for value in schema]
     return schema

@@ -1,13 +1,13 @@
-"""Publishers and subscribers: one ZeroMQ socket each, driven by the asyncio loop.
+"""Publish and subscribe by one ZeroMQ socket each in the asyncio loop.
 
-A publisher binds, subscribers connect, in any order; either side may be restarted.  A subscriber
-reads its plain (not asyncio) sockets in a callback of the loop and calls the handler right there:
-of the designs in `benchmarks/messaging.py` this has the least latency, and there is no pending
-`recv` whose cancellation could lose a message.
+A publisher binds and subscribers connect, in any order; either side may be restarted.  A subscriber
+reads its plain (not asyncio) sockets in a callback of the loop and calls the handler there.  This
+has the smallest latency of the designs in `benchmarks/messaging.py`.  No pending `recv` exists
+whose cancellation could lose a message.
 
-A subscriber has one socket per host that it reads, so that it knows from which host each message
-comes.  It accepts from a host only messages of the writers that run there.  Beyond loopback nothing
-is bound or connected without keys (`flexsheet.messages.security`).
+A subscriber has one socket per host, which identifies the host of each message.  It accepts from a
+host only messages of the writers that run there.  Beyond loopback, sockets are bound and connected
+with keys only (`flexsheet.messages.security`).
 
 ZeroMQ's file descriptor is edge-triggered: it signals that a state changed, not that a message is
 ready, and any call on the socket can clear the signal.  So each callback reads until the socket is
@@ -36,14 +36,14 @@ from zmq.utils.monitor import parse_monitor_message
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
+from flexsheet.messages.security import KeyChange, KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]
 MessageFilter = Callable[[Any, Header], str | None]
-"""Returns why a valid message is not accepted, or None if it is."""
+"""Function that returns why a valid message is rejected, or None to accept it."""
 
 QUEUE_S = 0.5
 MAX_QUEUE_LENGTH = 1000
@@ -70,11 +70,11 @@ _log = logging.getLogger("flexsheet.bus")
 
 
 HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
-"""Publishers send heartbeats by tcp only; ipc reports by itself that a process has ended.
+"""Publishers send heartbeats by tcp only, since ipc reports the end of a process.
 
 Subscribers send none: libzmq 4.3.5 aborts the process when a heartbeat is due after the publisher
-has disconnected while its messages still fill the queue.  A reader that is busy for long answers
-none, and would be disconnected; so publishers send none by ipc.
+has disconnected while its messages still fill the queue.  A subscriber that is busy for seconds
+answers none and would be disconnected; so publishers send none by ipc.
 """
 
 TCP_KEEPALIVE_OPTIONS = {
@@ -92,8 +92,8 @@ libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "refuses our key; is it the one in its launch file?",
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not speak with our keys; does it run without any?",
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "rejects the key of this host; check its launch file",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not accept keys; its launch file may have none",
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "did not prove that it has its key",
 }
 RECONNECTED = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
@@ -116,21 +116,21 @@ class Counts(Protocol):
 
 
 def queue_length(topic: Topic) -> int:
-    """Return how many messages each end of a connection queues for a busy reader.
+    """Return the length of the queue at each end of a connection.
 
-    A full queue drops the newest message.  So on `latest` topics the queue must outlast the slowest
-    handler: half a second at the topic's highest rate.  On others memory limits it.
+    A full queue drops the newest message.  On `latest` topics the queue therefore lasts for half a
+    second at the topic's highest rate.  On other topics memory limits it.
     """
     if topic.delivery is Delivery.LATEST and topic.rate_hz is not None:
-        wanted = round(QUEUE_S * topic.rate_hz[1])
+        length = round(QUEUE_S * topic.rate_hz[1])
     else:
-        wanted = min(MAX_QUEUE_LENGTH, MAX_QUEUE_BYTES // topic.max_bytes)
-    return max(MIN_QUEUE_LENGTH, wanted)
+        length = min(MAX_QUEUE_LENGTH, MAX_QUEUE_BYTES // topic.max_bytes)
+    return max(MIN_QUEUE_LENGTH, length)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An endpoint that a subscriber connects to, and the writer expected there; None: any.
+    """Endpoint to which a subscriber connects, and the writer expected there; None: any.
 
     host: the host whose key must answer at a tcp endpoint, if there are keys.
     """
@@ -141,14 +141,14 @@ class Source:
 
 
 class Publisher:
-    """Sends the messages of one topic to all subscribers.
+    """Publisher of one topic.
 
     A latched topic and keys need a running loop.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
-    keys: only hosts of this ring may connect by tcp; without it tcp is bound on loopback alone.
-    on_refused: called with a sentence for each connection that was refused or closed; without a
-        running loop, on a thread of its own.
+    keys: only hosts of this ring may connect by tcp; None: tcp is bound to loopback only.
+    on_refused: called with a text for each connection that was refused or closed; without a
+        running loop, on a separate thread.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Publisher:
         self._on_refused = on_refused
         self._domain: bytes | None = None
         if self._keys is not None:
-            self._domain = Gatekeeper.admit(self._keys, on_refused)
+            self._domain = ZapAuthenticator.register(self._keys, on_refused)
         try:
             self._open(bind)
         except BaseException:
@@ -176,8 +176,8 @@ class Publisher:
             raise
 
     def _open(self, bind: Sequence[str]) -> None:
-        # Only an XPUB socket can be read.  Reading it lets ZeroMQ free what ended connections used,
-        # although nothing is sent.
+        # Only an XPUB socket can be read.  Reading it lets ZeroMQ free the memory of ended
+        # connections even if nothing is sent.
         is_read = self._latched or self._keys is not None
         self._loop = asyncio.get_running_loop() if is_read else None
         self._socket = _open_socket(zmq.XPUB if is_read else zmq.PUB, self.topic)
@@ -187,13 +187,13 @@ class Publisher:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
             if self._by_tcp:
                 ConnectionGuard.watch(self._socket, self._on_closed_by_guard)
-            # What is bound before keys are set is open to this host, which ipc alone reaches.
+            # Endpoints that are bound before the keys are set need no key, so ipc comes first.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
                 if endpoint.startswith("tcp:"):
                     for option, value in HEARTBEATS.items():
                         self._socket.setsockopt(option, value)
                     if self._keys is not None and self._domain is not None:
-                        self._keys.serve(self._socket, self._domain)
+                        self._keys.set_server_keys(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
             self._socket.disable_monitor()
@@ -205,7 +205,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Open the socket again if this host's key or that of a host of the ring has changed."""
+        """Reopen the socket if the key of this host or of one in the ring has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
@@ -233,7 +233,7 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions; send the last message again if there is a new one."""
+        """Read a batch of subscriptions; resend the last message if one of them is new."""
         if self._socket.closed or self._loop is None:
             return
         found = drained = False
@@ -245,7 +245,7 @@ class Publisher:
                 break
         if found and self._last is not None:
             self._send(self._last)
-            # `_send` may have taken the event of another subscription away from the loop.
+            # `_send` may have cleared the event of another subscription.
             drained = False
         if not drained and not self._loop.is_closed():
             self._loop.call_soon(self._serve_late_subscribers)
@@ -256,12 +256,12 @@ class Publisher:
         if self._loop is None:
             self._on_refused(text)
             return
-        # Nobody reads the report of a loop that has ended.
+        # After the end of the loop, no handler for the report is left.
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_refused, text)
 
     def forget(self) -> None:
-        """Discard the message for late subscribers; the next one sent replaces it."""
+        """Discard the stored message for late subscribers, until the next `send`."""
         self._last = None
 
     def close(self) -> None:
@@ -269,7 +269,7 @@ class Publisher:
         if self._socket.closed:
             return
         for endpoint in self.endpoints:
-            # ZeroMQ leaves the file.  Before the socket closes it cannot be a successor's file.
+            # ZeroMQ does not remove the file, which no other publisher can own before the close.
             if endpoint.startswith(IPC):
                 Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
         self._close_socket(unbind=False)
@@ -286,24 +286,24 @@ class Publisher:
 
     def _unregister_keys(self) -> None:
         if self._domain is not None:
-            Gatekeeper.dismiss(self._domain)
+            ZapAuthenticator.unregister(self._domain)
             self._domain = None
 
 
 class Subscriber:
-    """Receives one topic and calls `on_message(message, header)` on the loop's thread.
+    """Subscriber of one topic, which calls `on_message(message, header)` on the loop's thread.
 
     connect: the endpoints of all writers; a writer may start later or restart.  A `Source` also
         names the writer expected there, and the host whose key must answer.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: called with a sentence for losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
-        topics, which may lose messages), for the first rejection of each cause, and for an
+    on_problem: called with a text for losses (the 1st, 2nd, 4th, 8th, ...; not on `latest` topics,
+        which may lose messages), and for the first rejection of each cause.  Also called for an
         exception in `on_message`, after which the subscriber continues.
     on_handshake_failed: called with the problem of each failed handshake; None: `on_problem`.
-    unopened: call `on_message(frames, header)` with every message, whatever the topic's
+    raw: call `on_message(frames, header)` with every message, whatever the topic's
         delivery; the fields are not validated.
-    keys: this host's key and those of the others; without it tcp connects to loopback only.
-    plan: accept only messages of this plan; None: of any.
+    keys: keys of this host and the others; None: tcp connects to loopback only.
+    plan: accept only messages of this plan; None: of any plan.
     message_filter: called with each valid message before `on_message`.
     """
 
@@ -316,7 +316,7 @@ class Subscriber:
         *,
         on_problem: Problem = _log.error,
         on_handshake_failed: Problem | None = None,
-        unopened: bool = False,
+        raw: bool = False,
         keys: KeyRing | None = None,
         plan: str | None = None,
         message_filter: MessageFilter | None = None,
@@ -325,7 +325,7 @@ class Subscriber:
         self.on_handshake_failed = on_handshake_failed or on_problem
         self._on_message, self._message_filter, self._plan = on_message, message_filter, plan
         self._latched = topic.delivery is Delivery.LATCHED
-        latest_only = topic.delivery is Delivery.LATEST and not unopened
+        latest_only = topic.delivery is Delivery.LATEST and not raw
         self._writers_seen: dict[str, _Writer] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
@@ -335,14 +335,14 @@ class Subscriber:
             source = one if isinstance(one, Source) else Source(one)
             by_host.setdefault(source.host, []).append(source)
         self._connections = [
-            _HostConnection(self, host, sources, keys, latest_only=latest_only, unopened=unopened)
+            _HostConnection(self, host, sources, keys, latest_only=latest_only, raw=raw)
             for host, sources in (by_host or {None: []}).items()
         ]
 
     def start(self) -> None:
         """Connect and start to deliver; needs a running loop."""
         if self._started:
-            raise BusError(f'topic "{self.topic.name}": this subscriber has been started already')
+            raise BusError(f'topic "{self.topic.name}": the subscriber is started already')
         try:
             for connection in self._connections:
                 connection.open()
@@ -352,12 +352,12 @@ class Subscriber:
         self._started = True
 
     def close(self) -> None:
-        """Stop at once; the handler may call this."""
+        """Disconnect; may be called from the handler."""
         for connection in self._connections:
             connection.close()
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Connect again to hosts whose key has changed, and to all if this host's key has."""
+        """Reconnect to hosts whose key has changed, or to all if this host's key has changed."""
         for connection in self._connections:
             if (
                 connection.secured
@@ -378,20 +378,20 @@ class Subscriber:
             if writers is not None and header.writer not in writers:
                 raise WireError(
                     "writer",
-                    f"{header.writer!r:.60} does not write it from there; "
-                    f"{', '.join(sorted(writers))} may",
+                    f"unexpected writer {header.writer!r:.60}; expected "
+                    f"{', '.join(sorted(writers))} from this endpoint",
                 )
             if self._plan is not None and header.plan != self._plan:
                 raise WireError(
                     "plan",
-                    f"{header.writer} belongs to plan {header.plan!r:.40}, here it is "
+                    f"{header.writer} runs plan {header.plan!r:.40}, this node runs "
                     f"{self._plan}; start all hosts with the same launch file, scene and settings",
                 )
             known = self._writers_seen.get(header.writer)
             if known is None:
                 self._writers_seen[header.writer] = _Writer(header)
                 return envelope
-            lost = known.follow(header)
+            lost = known.update(header)
         except WireError as error:
             self.reject(error)
             return None
@@ -400,7 +400,7 @@ class Subscriber:
         elif lost < 0:
             if not (self._latched and lost == -1):
                 self.reject(
-                    WireError("replayed", f"message {header.sequence} of {header.writer} again")
+                    WireError("replayed", f"message {header.sequence} of {header.writer} repeated")
                 )
             return None
         return envelope
@@ -410,9 +410,9 @@ class Subscriber:
         header = envelope.header
         try:
             message = envelope.open()
-            why = None if self._message_filter is None else self._message_filter(message, header)
-            if why is not None:
-                raise WireError("forbidden", why)
+            reason = None if self._message_filter is None else self._message_filter(message, header)
+            if reason is not None:
+                raise WireError("forbidden", reason)
         except WireError as error:
             self.reject(error)
             return
@@ -442,15 +442,15 @@ class Subscriber:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
                 f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
-                f"{self.counts.gaps} in all; a reader or the network is too slow"
+                f"{self.counts.gaps} in total; a subscriber or the network is too slow"
             )
 
 
 class _Writer:
-    """Newest start and sequence number of a writer; older messages are rejected as replayed.
+    """Newest epoch and sequence number of a writer, to reject older messages as replayed.
 
-    A restart on the same clock has a later epoch.  A restart after a reboot has a new clock; the
-    former clocks are then rejected.
+    A restart on the same clock has a later epoch.  A restart after a reboot has a new clock, and
+    its former clocks are rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
@@ -459,16 +459,16 @@ class _Writer:
         self.clock_id, self.epoch, self.sequence = header.clock_id, header.epoch, header.sequence
         self.past_clocks: deque[str] = deque(maxlen=MAX_PAST_CLOCKS)
 
-    def follow(self, header: Header) -> int:
+    def update(self, header: Header) -> int:
         """Return the number of messages lost before this one.
 
-        Below 0 the message is not new; -1 is a repetition of the newest.  Raises WireError for a
+        A negative number means an old message; -1: the newest one again.  Raises WireError for a
         message from before the writer's newest start.
         """
         if header.clock_id != self.clock_id:
             if header.clock_id in self.past_clocks:
                 raise WireError(
-                    "replayed", f"a message of {header.writer} from before its host's last start"
+                    "replayed", f"the message of {header.writer} is older than its host's start"
                 )
             self.past_clocks.append(self.clock_id)
             self.clock_id = header.clock_id
@@ -478,7 +478,7 @@ class _Writer:
                 self.sequence = header.sequence
             return lost
         elif header.epoch < self.epoch:
-            raise WireError("replayed", f"a message of {header.writer} from before its last start")
+            raise WireError("replayed", f"the message of {header.writer} is older than its start")
         self.epoch, self.sequence = header.epoch, header.sequence
         return 0
 
@@ -494,10 +494,10 @@ class _HostConnection:
         keys: KeyRing | None,
         *,
         latest_only: bool,
-        unopened: bool,
+        raw: bool,
     ) -> None:
         self._subscriber, self.host, self._sources, self._keys = subscriber, host, sources, keys
-        self._latest_only, self._unopened = latest_only, unopened
+        self._latest_only, self._raw = latest_only, raw
         rate_hz = subscriber.topic.rate_hz
         self._fresh_ns = 0 if rate_hz is None else int(0.5e9 / rate_hz[1])
         known = [one.writer for one in sources if one.writer is not None]
@@ -523,10 +523,10 @@ class _HostConnection:
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
         try:
-            if self._unopened:
-                # A recorder has low priority and may not run for seconds on a busy computer.  A
-                # full queue would leave the publisher's heartbeats unread, so that it disconnects,
-                # and libzmq would abort as `HEARTBEATS` describes.
+            if self._raw:
+                # A recorder has low priority and may pause for seconds on a busy computer.  With a
+                # full queue the publisher's heartbeats would be unread, the publisher would
+                # disconnect, and libzmq would abort as `HEARTBEATS` describes.
                 self._socket.setsockopt(zmq.RCVHWM, 0)
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             if self.secured:
@@ -536,7 +536,7 @@ class _HostConnection:
             for source in self._sources:
                 _check_endpoint(topic, source.endpoint)
                 if self._keys is not None and self.host is not None:
-                    self._keys.seek(self._socket, self.host)
+                    self._keys.set_client_keys(self._socket, self.host)
                 else:
                     _refuse_beyond_loopback(topic, source.endpoint)
                 try:
@@ -568,9 +568,9 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Connect again later where ZeroMQ has ended a connection for good; a loop callback.
+        """Schedule a new connection after ZeroMQ has ended one permanently; a loop callback.
 
-        ZeroMQ does so after a refused key and after data that was changed on the way.
+        ZeroMQ does so after a rejected key and after corrupted data.
         """
         while self._monitor is not None:
             try:
@@ -632,7 +632,7 @@ class _HostConnection:
                 # With stamps of another clock an older message may be delivered before a newer.
                 self._deliver(envelope)
                 continue
-            # Removed first, so that the order is that of arrival.
+            # The removal makes the order that of arrival.
             self._subscriber.counts.dropped += newest.pop(header.writer, None) is not None
             newest[header.writer] = envelope
         for envelope in newest.values():
@@ -645,7 +645,7 @@ class _HostConnection:
             if frames is None:
                 return True
             envelope = self._subscriber.accept(frames, self._writers)
-            if envelope is not None and self._unopened:
+            if envelope is not None and self._raw:
                 self._subscriber.call(frames, envelope.header)
             elif envelope is not None:
                 self._deliver(envelope)
@@ -689,15 +689,14 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }
     if kind == zmq.SUB:
-        # A larger frame makes ZeroMQ end the connection for good without a report.  So frames that
-        # are only too large for the topic are received, rejected and counted.  This limit bounds
-        # the memory.
+        # A larger frame makes ZeroMQ end the connection permanently without a report.  So frames
+        # that only exceed the topic's limit are received, rejected and counted.
         options[zmq.MAXMSGSIZE] = topic.max_bytes + MAX_EXCESS_BYTES
         options |= TCP_KEEPALIVE_OPTIONS
     else:
-        # A publisher is sent subscriptions and handshakes; `ConnectionGuard` bounds their sum.  So
-        # the queue needs no limit.  Where one is full when its sender hangs up, libzmq 4.3.5 aborts
-        # the process with the next heartbeat.
+        # A publisher receives subscriptions and handshakes; `ConnectionGuard` bounds their sum, so
+        # the queue needs no limit.  If a queue is full when its sender disconnects, libzmq 4.3.5
+        # aborts the process at the next heartbeat.
         options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
         options[zmq.RCVHWM] = 0
     for option, value in options.items():
@@ -721,13 +720,13 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
             if error.errno != errno.EADDRINUSE:
                 raise BusError(
                     f'topic "{topic.name}": {endpoint} cannot be bound: {error.strerror}; '
-                    "is its folder or address on this host?"
+                    "check that its folder or address exists on this host"
                 ) from error
             # ZeroMQ's thread releases the endpoint of a closed writer a little later.
             if time.monotonic() > deadline_s:
                 raise BusError(
                     f'topic "{topic.name}": {endpoint} is in use by another process; '
-                    "is the same launch file running already?"
+                    "the same launch file may be running already"
                 ) from error
             time.sleep(0.01)
     bound: str = opened.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -736,13 +735,13 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
     """Raise BusError for endpoints that ZeroMQ accepts silently or reports unclearly."""
-    transport, _, place = endpoint.partition("://")
-    port = place.rpartition(":")[2]
+    transport, _, address = endpoint.partition("://")
+    port = address.rpartition(":")[2]
     if transport == "tcp" and port != "*" and not (port.isdecimal() and 0 < int(port) < 1 << 16):
-        raise BusError(f'topic "{topic.name}": {endpoint}: a port is a number from 1 to 65535')
-    if transport == "ipc" and len(os.fsencode(place)) > IPC_PATH_BYTES:
+        raise BusError(f'topic "{topic.name}": {endpoint}: the port must be in 1..65535')
+    if transport == "ipc" and len(os.fsencode(address)) > IPC_PATH_BYTES:
         raise BusError(
-            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(place))} bytes, '
+            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(address))} bytes, '
             f"the system allows {IPC_PATH_BYTES}; choose a shorter folder for sockets"
         )
     if transport not in ("tcp", "ipc"):
@@ -753,23 +752,23 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
     """Raise BusError for a tcp endpoint beyond loopback; called where there are no keys."""
-    transport, _, place = endpoint.partition("://")
+    transport, _, address = endpoint.partition("://")
     if transport != "tcp":
         return
-    address = place.rpartition(":")[0].strip("[]")
     try:
-        inside = ipaddress.ip_address(address).is_loopback
+        host = address.rpartition(":")[0].strip("[]")
+        inside = ipaddress.ip_address(host).is_loopback
     except ValueError:
         inside = False
     if not inside:
         raise BusError(
             f'topic "{topic.name}": {endpoint} is beyond loopback and there are no keys; '
-            "make them: flexsheet keys new"
+            "create them: flexsheet keys new"
         )
 
 
 def _ipc_is_served(endpoint: str) -> bool:
-    """Return whether a process listens at the path; binding would take the path from it."""
+    """Return whether a process listens at the path; binding would replace its socket."""
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):
         return False
@@ -777,7 +776,7 @@ def _ipc_is_served(endpoint: str) -> bool:
         try:
             probe.connect(path)
         except ConnectionRefusedError:
-            # Either a killed writer left the file, or a writer that closes now will remove it.
+            # The file is left by a killed publisher, or a closing publisher will remove it.
             time.sleep(IPC_CLOSING_S)
             return False
         except OSError:

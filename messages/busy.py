@@ -1,15 +1,15 @@
-"""Says whether a computer is too busy for its nodes, and by what, from its launcher's message."""
+"""Decide from a launcher's message whether a computer is too busy for its nodes, and why."""
 
 from __future__ import annotations
 
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
-"""Processes that want to run per core; for computers that cannot measure their nodes' waiting."""
+"""Maximum load per core, for computers that cannot measure how long their nodes wait."""
 
 BUSY_REMEDY = (
-    "end other programs, give the graph more cores, or start less of it; "
-    "as root the simulated arms take precedence (docs/launch-files.md, nice)"
+    "end other programs, give the graph more cores, or start fewer nodes; "
+    "started as root, the simulated arms have priority (docs/launch-files.md, nice)"
 )
 
 
@@ -19,18 +19,18 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Say in one sentence what makes a computer busy; empty where it is not."""
+    """Return one sentence on why a computer is busy; empty if it is not."""
     if not is_busy(host):
         return ""
     if host.cpu is None:
-        why = f"{host.load_ratio:.1f} processes per core want to run"
+        why = f"{host.load_ratio:.1f} runnable processes per core"
     else:
         why = describe_pressure(host.cpu)
     return f"the computer {host.host} is busy: {why}"
 
 
 def describe_pressure(cpu: CpuPressure) -> str:
-    """Say who waits for a processor for how long, and who takes the processors."""
+    """Return which node waits for a processor, for how long, and which programs use the cores."""
     waits = f"{cpu.node} waits for a processor {cpu.wait_ratio:.0%} of the time"
     if not cpu.programs:
         return waits

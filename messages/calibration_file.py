@@ -1,4 +1,4 @@
-"""How calibrations are kept: as YAML that people can read, with every number in full precision."""
+"""Read and write calibrations as readable YAML, with every number in full precision."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(FlexsheetError, ValueError):
-    """A calibration file that cannot be used; the message names file, key and remedy."""
+    """An invalid calibration file; the text names file, key and remedy."""
 
     code = "calibration-file"
-    remedy = "Calibrate again, or name another calibration file."
+    remedy = "Calibrate again, or give another calibration file."
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """A calibration of something else than the scene's: another camera, another sheet."""
+    """A calibration of another camera or sheet than the scene's."""
 
     code = "calibration-mismatch"
-    remedy = "Name the calibration of the scene's own device, or the scene of the calibration."
+    remedy = "Give the calibration of the scene's device, or the scene of the calibration."
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
-    """Write the file, replacing an older one only when the new one is complete.
+    """Write the file; an existing file is replaced only by a complete one.
 
-    title: the first line of its head.  comment: one line more, as the command that made it.
+    title: first comment line.  comment: second comment line, such as the command; may be empty.
     """
     yaml = YAML()
     yaml.default_flow_style = None
-    yaml.width = 4096  # a row of a matrix a line
+    yaml.width = 4096  # one line per row of a matrix
     text = io.StringIO()
     text.write(f"# {title}\n")
     if comment:
@@ -53,7 +53,7 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
 
 
 def _parse(path: Path) -> Any:
-    """The values of a file; YAMLError for one that no command of ours has written."""
+    """Return the values of a file; YAMLError for one that no calibration command has written."""
     with path.open("rb") as file:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
@@ -61,9 +61,9 @@ def _parse(path: Path) -> Any:
     text = data.decode()
     depth = 0
     for event in YAML(typ="safe").parse(text):
-        # A few aliases can stand for any number of values.
+        # A few aliases can expand to any number of values.
         if isinstance(event, AliasEvent):
-            raise YAMLError("an alias (*), which no calibration has")
+            raise YAMLError("an alias (*), which calibrations do not contain")
         depth += isinstance(event, CollectionStartEvent)
         depth -= isinstance(event, CollectionEndEvent)
         if depth > MAX_CALIBRATION_DEPTH:
@@ -74,29 +74,29 @@ def _parse(path: Path) -> Any:
 def read_calibration(
     kind: type[Calibration], path: Path, *, version: int, command: str
 ) -> Calibration:
-    """Read a calibration of one kind, as its command wrote it.
+    """Read a calibration of one kind.
 
-    Raises CalibrationFileError for a file that is absent, foreign, of another version or
-    incomplete.
+    command: the command that writes it, for errors.  Raises CalibrationFileError for a file that is
+    absent, foreign, of another version or incomplete.
     """
     try:
         content = _parse(path)
     except OSError as error:
         raise CalibrationFileError(
-            f"{path}: cannot be read: {error.strerror}; name a file that `{command}` wrote"
+            f"{path}: cannot be read: {error.strerror}; give a file that `{command}` wrote"
         ) from error
-    # Numbers and dates that are none make the parser raise what it likes.
+    # Invalid numbers and dates make the parser raise undocumented errors.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
         raise CalibrationFileError(
             f"{path}: not YAML that `{command}` wrote: {str(error)[:200]}"
         ) from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(
-            f'{path}: no key "version": not a calibration; `{command}` writes one'
+            f'{path}: does not contain the key "version": not a calibration; run `{command}`'
         )
     if content["version"] != version:
         raise CalibrationFileError(
-            f"{path}: version: {content['version']!r}, this program reads {version}; "
+            f"{path}: version: expected {version}, found {content['version']!r}; "
             f"calibrate again with `{command}`"
         )
     try:
@@ -106,4 +106,6 @@ def read_calibration(
             f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
             for problem in error.errors()[:5]
         )
-        raise CalibrationFileError(f"{path}: not what `{command}` writes: {problems}") from error
+        raise CalibrationFileError(
+            f"{path}: not a calibration of `{command}`: {problems}"
+        ) from error

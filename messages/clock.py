@@ -1,4 +1,4 @@
-"""Clocks that nodes are given: the machine's own, and one that a test or a replay moves by hand."""
+"""Define the clocks of nodes: the system's clock, and a virtual one for tests and replays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """A monotonic clock.  `id` names it; stamps of equal `id` may be subtracted."""
+    """Interface of a monotonic clock; stamps of clocks with equal `id` may be subtracted."""
 
     @property
     def id(self) -> str: ...
@@ -17,13 +17,13 @@ class Clock(Protocol):
     def now_ns(self) -> int: ...
 
 
-def boot_id() -> str:
-    """The kernel's random identity of this boot; CLOCK_MONOTONIC restarts with it."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+def read_boot_id() -> str:
+    """Return the kernel's random identifier of this boot; CLOCK_MONOTONIC starts with the boot."""
+    return Path("/proc/sys/kernel/random/read_boot_id").read_text().strip()
 
 
-def namespace_offset() -> str:
-    """By what a time namespace moves CLOCK_MONOTONIC, as "+36000.0"; empty outside of one."""
+def read_namespace_offset() -> str:
+    """Return the time namespace's offset of CLOCK_MONOTONIC, as "+36000.0"; empty without one."""
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()
     except FileNotFoundError:
@@ -35,10 +35,10 @@ def namespace_offset() -> str:
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC of this host: shared by all its processes, never set back."""
+    """CLOCK_MONOTONIC of this host, which all its processes share."""
 
     def __init__(self) -> None:
-        self._id = f"{host_name()}-{boot_id()[:8]}{namespace_offset()}"
+        self._id = f"{host_name()}-{read_boot_id()[:8]}{read_namespace_offset()}"
 
     @property
     def id(self) -> str:
@@ -49,7 +49,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that stands still until it is moved, for replay and for tests."""
+    """Clock for replays and tests that advances only by `move_to`."""
 
     def __init__(self, start_ns: int = 0, *, clock_id: str = "virtual") -> None:
         self._now_ns = start_ns
@@ -63,5 +63,5 @@ class VirtualClock:
         return self._now_ns
 
     def move_to(self, now_ns: int) -> None:
-        """Set the time; it never goes back (an earlier time leaves it where it is)."""
+        """Set the time; an earlier time is ignored."""
         self._now_ns = max(self._now_ns, now_ns)

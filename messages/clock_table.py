@@ -1,7 +1,6 @@
-"""Stamps of other hosts' clocks, put into our own as they arrive.
+"""Convert stamps of other hosts' clocks to the local clock when a message arrives.
 
-Downstream of here every stamp is of the own clock: ages, predictions and what is passed on need not
-know from where a message came.
+After the conversion, ages and predictions do not depend on the host that sent the message.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from flexsheet.messages.types import ClockOffset, Clocks
 M = TypeVar("M", bound=Message)
 
 MAX_STAMP_AHEAD_NS = 20_000_000
-"""By how much clocks that are trusted may at most seem to be ahead of our own."""
+"""Maximum time by which a measured clock may be ahead of the local one."""
 
 
 class ClockTable:
-    """What a host knows of the other hosts' clocks: the newest `Clocks` of its clock node."""
+    """Offsets of the other hosts' clocks, from the newest `Clocks` message of the clock node."""
 
     def __init__(self, clock_id: str) -> None:
         self._own = clock_id
@@ -28,12 +27,12 @@ class ClockTable:
         self.offsets: dict[str, ClockOffset] = {}
 
     def update(self, clocks: Clocks) -> None:
-        """Take what the clock node says; what it no longer speaks of is not known any more."""
+        """Replace all offsets by those of a message."""
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
-    def trouble(self, clock_id: str, now_ns: int) -> str:
-        """Why stamps of a clock cannot be trusted; empty when they can."""
+    def find_problem(self, clock_id: str, now_ns: int) -> str:
+        """Return why stamps of a clock are not accurate enough; empty if they are."""
         if clock_id == self._own:
             return ""
         offset = self.offsets.get(clock_id)
@@ -44,14 +43,15 @@ class ClockTable:
         if uncertainty_s <= self._limit_s:
             return ""
         return (
-            f"clock {clock_id} is known to {1e3 * uncertainty_s:.3g} ms only, "
+            f"clock {clock_id} has an uncertainty of {1e3 * uncertainty_s:.3g} ms, "
             f"{1e3 * self._limit_s:.3g} ms are allowed"
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """What to add to a stamp near `at_ns`, both of that clock, to make it ours; None: unknown.
+        """Return what converts a stamp near `at_ns` to the local clock by addition; None: unknown.
 
-        at_ns lies where the message was published: what is older by its stamps stays so by as much.
+        at_ns: publication time of the message on that clock.  One shift for all stamps of a message
+        preserves their differences.
         """
         offset = self.offsets.get(clock_id)
         if offset is None:
@@ -60,10 +60,10 @@ class ClockTable:
         drift = offset.drift_ratio
         return -offset.offset_ns - round(since_ns * drift / (1.0 + drift))
 
-    def localised(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
-        """The message and its header with stamps of our clock, and why not to trust them.
+    def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
+        """Return message and header with stamps of the local clock, and `find_problem` of theirs.
 
-        Of a clock that is not measured yet, a message counts as if it had arrived in no time.
+        For a clock without a measured offset, the message counts as published on arrival.
         """
         clock_id = header.clock_id
         if clock_id == self._own:
@@ -72,19 +72,19 @@ class ClockTable:
         if shift_ns is None:
             shift_ns = now_ns - header.publish_ns
         return (
-            shifted(message, shift_ns),
+            shift_stamps(message, shift_ns),
             replace(
                 header,
                 source_ns=max(0, header.source_ns + shift_ns),
                 publish_ns=max(0, header.publish_ns + shift_ns),
                 clock_id=self._own,
             ),
-            self.trouble(clock_id, now_ns),
+            self.find_problem(clock_id, now_ns),
         )
 
 
-def shifted(message: M, shift_ns: int) -> M:
-    """Move the message's instants (fields of type `Stamp`) by a shift; 0 means none and stays."""
+def shift_stamps(message: M, shift_ns: int) -> M:
+    """Return the message with its `Stamp` fields shifted; a stamp of 0 means none and remains."""
     moved = {
         name: max(1, value + shift_ns)
         for name in stamp_fields(type(message))

@@ -37,7 +37,7 @@ MAX_CONNECTIONS_PER_ADDRESS = 64
 """Connections of a publisher per address: nodes of a computer, its recorder and its tools."""
 
 EXCLUSION_S = 1.0
-"""How long an address that sent too much is refused; connections that it already has stay open."""
+"""Time for which new connections of an address that sent too much are refused."""
 
 RECEIVE_BUFFER_BYTES = 16_384
 """Receive buffer of a connection; its content is still read after the connection is closed."""
@@ -51,7 +51,7 @@ OnRefused = Callable[[str, str], None]
 
 @dataclass(frozen=True, slots=True)
 class _Publisher:
-    """A publisher's monitor and what is called for each connection that is closed."""
+    """Monitor socket of a publisher, and its callback for closed connections."""
 
     monitor: zmq.Socket[bytes]
     on_refused: OnRefused
@@ -59,7 +59,7 @@ class _Publisher:
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """An accepted connection: its two ends identify it although numbers of files are reused."""
+    """Accepted connection; its two addresses identify it although file descriptors are reused."""
 
     publisher: _Publisher
     local: tuple[object, ...]
@@ -71,7 +71,7 @@ class _Connection:
         return str(self.remote[0])
 
     def open(self, fd: int) -> socket.socket | None:
-        """Return a duplicate of file `fd` if it still is this connection."""
+        """Return a duplicate of the descriptor `fd`; None if it is another connection now."""
         try:
             opened = socket.socket(fileno=os.dup(fd))
         except OSError:
@@ -83,7 +83,7 @@ class _Connection:
 
 
 class ConnectionGuard:
-    """The thread that watches the accepted connections of all publishers of this process."""
+    """Thread that monitors the accepted connections of all publishers of this process."""
 
     _present: ClassVar[ConnectionGuard | None] = None
     _lock: ClassVar[threading.Lock] = threading.Lock()
@@ -97,7 +97,7 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Watch what a socket accepts from now on, until its monitor is disabled."""
+        """Monitor the future connections of a socket until its monitor is disabled."""
         publisher.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         events = int(zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)
         monitor = publisher.get_monitor_socket(events, f"inproc://accepted-{next(cls._numbers)}")
@@ -122,20 +122,20 @@ class ConnectionGuard:
                     return
 
     def _read_monitor(self, fd: int, publisher: _Publisher) -> bool:
-        """Take up new connections; False if no publisher is left to be watched."""
+        """Register new connections; return False if no publisher is left."""
         while True:
             try:
                 news = parse_monitor_message(publisher.monitor.recv_multipart(zmq.NOBLOCK))
             except zmq.Again:
                 return True
             if news["event"] == zmq.EVENT_MONITOR_STOPPED:
-                return self._forget(fd, publisher)
+                return self._remove_publisher(fd, publisher)
             endpoint = news["endpoint"].decode()
             if endpoint.startswith("tcp:"):
                 self._accept(int(news["value"]), int(endpoint.rpartition(":")[2]), publisher)
 
     def _accept(self, fd: int, port: int, publisher: _Publisher) -> None:
-        """Watch a connection, or close it if its address has too many or sent too much."""
+        """Monitor a connection, or close it if its address has too many or sent too much."""
         with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
             local, remote = _ends(opened)
             if not remote or local[1] != port:
@@ -159,7 +159,7 @@ class ConnectionGuard:
         self._check(fd)
 
     def _count(self, new: _Connection) -> int:
-        """Count the other connections of an address; forget those that have ended."""
+        """Count the other connections of an address; remove those that have ended."""
         number = 0
         for fd, known in list(self._connections.items()):
             if known.publisher is new.publisher and known.address == new.address:
@@ -194,8 +194,8 @@ class ConnectionGuard:
             address, f"it sent {received} bytes, more than a handshake and one subscription"
         )
 
-    def _forget(self, fd: int, publisher: _Publisher) -> bool:
-        """Stop watching a publisher; False if it was the last one."""
+    def _remove_publisher(self, fd: int, publisher: _Publisher) -> bool:
+        """Stop monitoring a publisher; return False if it was the last one."""
         self._epoll.unregister(fd)
         for connected_fd, connection in list(self._connections.items()):
             if connection.publisher is publisher:
@@ -214,7 +214,7 @@ class ConnectionGuard:
 
 
 def _ends(opened: socket.socket) -> tuple[tuple[object, ...], tuple[object, ...]]:
-    """The local and the remote address of a connection; empty where it is none."""
+    """Return the local and the remote address of a connection; empty if it is not connected."""
     try:
         local, remote = opened.getsockname(), opened.getpeername()
     except OSError:

@@ -1,4 +1,4 @@
-"""Base class of the errors that users meet."""
+"""Define the base class of errors that are shown to users."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import ClassVar
 
 
 class FlexsheetError(Exception):
-    """Base of all errors that a user can put right.
+    """Base class of errors that a user can correct.
 
-    Each subclass sets its own `code`, which `flexsheet explain` accepts, and its `remedy`.
-    exit_code: status with which a command ends that such an error stops.
+    code: name of the error for `flexsheet explain`.  remedy: what the user should do.
+    exit_code: exit status of a command that ends with this error.
     """
 
     code: ClassVar[str]

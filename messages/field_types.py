@@ -1,4 +1,4 @@
-"""Describe the types of message fields and parameters in words, for pages and commands."""
+"""Describe the types of message fields and parameters for documentation and commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.messages.arrays import ArraySpec
 
 
 def field_type(field: FieldInfo) -> str:
-    """Return a field's type in words; models are links to their sections."""
+    """Return a field's type as text; models are links to their sections."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):
             return _array(extra)

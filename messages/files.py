@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Write files atomically."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""Numbers of errors that are the disk's, wherever they come up."""
+"""Numbers of errors that the disk or its file system causes."""
 
 
 class FileWriteError(FlexsheetError, OSError):
-    """A file that cannot be written; the sentence names path, cause, needed and free space."""
+    """A file that cannot be written; the text names path, cause, needed and free space."""
 
     code = "file-write"
-    remedy = "Free space on the disk, create the folder, or name another file."
+    remedy = "Free space on the disk, create the folder, or give another file."
 
     def __str__(self) -> str:
         return str(self.strerror)
 
 
 def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> None:
-    """Write a file at once: where it cannot be written, the former one stays, or none.
+    """Write a file atomically; after a failure, an existing file is unchanged.
 
-    mode: permissions; None: as the process creates files.  Raises FileWriteError.
+    mode: permissions; None: the default of the process.  Raises FileWriteError.
     """
     data = content.encode() if isinstance(content, str) else content
     part = path.with_name(f"{path.name}.part")
@@ -46,25 +46,25 @@ def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> 
 
 
 def write_error(path: Path, error: OSError, *, needed_bytes: int | None = None) -> FileWriteError:
-    """The error of a file that could not be written, in one sentence."""
+    """Return the error for a file that could not be written."""
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        needed = "" if needed_bytes is None else f"{_shown(needed_bytes)} are needed, "
+        needed = "" if needed_bytes is None else f"{_format_size(needed_bytes)} are needed, "
         with suppress(OSError):
-            needed += f"{_shown(free_bytes(path.parent))} are free; "
-        text += f"; {needed}make room, or name a file on another disk"
+            needed += f"{_format_size(free_bytes(path.parent))} are free; "
+        text += f"; {needed}free space, or give a file on another disk"
     elif error.errno == errno.ENOENT:
-        text += "; make its folder first"
+        text += "; create its folder first"
     else:
-        text += "; name another file"
+        text += "; give another file"
     return FileWriteError(error.errno, text)
 
 
 def free_bytes(folder: Path) -> int:
-    """What is left for this user on the disk of a folder; OSError where it is gone."""
+    """Return the free bytes for this user on a folder's disk; OSError if there is no folder."""
     state = os.statvfs(folder)
     return state.f_bavail * state.f_frsize
 
 
-def _shown(size_bytes: int) -> str:
+def _format_size(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.2f} MB" if size_bytes >= 100_000 else f"{size_bytes} bytes"

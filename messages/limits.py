@@ -1,8 +1,8 @@
-"""Limits of numbers that people write into files: scenes, launch files, parameters, calibrations.
+"""Define limits for numbers in scenes, launch files, parameters and calibrations.
 
-A field's name ends in its unit, and the unit has a limit; a few names have one of their own.  The
-limits are wide: they refuse what no apparatus of this kind can have, and what the arithmetic of the
-nodes is not made for.
+A field's name ends in its unit, and each unit has a limit.  A few names have a limit of their own.
+The limits are wide: they exclude numbers that no such apparatus has, and that would break the
+nodes' arithmetic.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 MAX_LENGTH_M = 10.0
-"""Everything stands in one room."""
+"""Size of a room."""
 
 MAX_ANGLE_RAD = 7.0
-"""A full rotation, and rounding."""
+"""A full rotation plus a margin for rounding."""
 
 MAX_DURATION_S = 86_400.0
 MAX_RATE_HZ = 10_000.0
@@ -32,16 +32,16 @@ MAX_STRESS_PA = 1.2e12
 
 MAX_FORCE_N = 10_000.0
 MAX_SPEED_M_PER_S = 10.0
-"""The fastest strokes of a hand."""
+"""Speed of the fastest strokes of a hand."""
 
 MAX_TOOL_SPEED_M_PER_S = 2.2
-"""The RV-1A's own limit, all joints together (its specification)."""
+"""Maximum speed of the RV-1A with all joints together (its specification)."""
 
 MAX_STRETCH_RATIO = 10.0
-"""Natural rubber breaks below it."""
+"""Larger than the stretch at which natural rubber breaks."""
 
 MAX_NUMBER = 1e9
-"""Largest magnitude of a number without a unit."""
+"""Maximum magnitude of a number without a unit."""
 
 MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50
@@ -84,20 +84,20 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""Largest magnitudes by the suffix of a name; longer suffixes first."""
+"""Maximum magnitudes by the suffix of a name; longer suffixes first."""
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""Smallest values of fields above zero; a fraction of the resolution of any device."""
+"""Minimum values of positive fields; a fraction of the resolution of any device."""
 
 MIN_POSITIVE = 1e-9
-"""Smallest value of fields above zero without such a unit."""
+"""Minimum value of positive fields without such a unit."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""Largest error of an element of R Rᵀ for a rotation matrix R: 0.05 mm at half a metre."""
+"""Maximum error of an element of R Rᵀ for a rotation matrix R: 0.05 mm at half a metre."""
 
 
 class LimitedModel(BaseModel):
-    """A model of numbers within the limits of their units, and of rigid 4x4 arrays."""
+    """Base model that checks numbers against the limits of their units, and 4x4 transforms."""
 
     @field_validator("*", mode="after")
     @classmethod
@@ -116,20 +116,24 @@ class LimitedModel(BaseModel):
                     _check_number(one, name)
         elif isinstance(value, int | float):
             _check_number(value, name)
-            if 0.0 < value < min_of(name) and _refuses_zero(cls, name):
-                raise ValueError(f"give at least {min_of(name):g}{_unit_text(name)}, not {value:g}")
+            if 0.0 < value < find_min_positive(name) and _refuses_zero(cls, name):
+                raise ValueError(
+                    f"give at least {find_min_positive(name):g}{_unit_text(name)}, not {value:g}"
+                )
         return value
 
 
 def _check_number(value: float, name: str) -> None:
-    if not abs(value) <= max_of(name):
-        raise ValueError(f"give at most {max_of(name):g}{_unit_text(name)}, and a finite number")
+    if not abs(value) <= find_max_magnitude(name):
+        raise ValueError(
+            f"give at most {find_max_magnitude(name):g}{_unit_text(name)}, and a finite number"
+        )
 
 
 def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
-    """Raise ValueError for a 4x4 matrix that is no rigid transform."""
+    """Raise ValueError unless a 4x4 matrix is a rigid transform."""
     if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
-        raise ValueError("the last row of a rigid transform is [0, 0, 0, 1]")
+        raise ValueError("the last row of a rigid transform must be [0, 0, 0, 1]")
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
         raise ValueError("the upper left 3x3 must be a rotation: rows of length 1 at right angles")
@@ -138,16 +142,16 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 
 @cache
-def max_of(name: str) -> float:
-    """The largest magnitude of a field's numbers."""
+def find_max_magnitude(name: str) -> float:
+    """Return the maximum magnitude of a field's numbers."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
     return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
 
 
 @cache
-def min_of(name: str) -> float:
-    """The smallest value of a field that must be above zero."""
+def find_min_positive(name: str) -> float:
+    """Return the minimum value of a positive field."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
 
@@ -164,7 +168,7 @@ def _refuses_zero(model: type[BaseModel], name: str) -> bool:
 
 
 def _constraints(field: FieldInfo, annotation: Any) -> Iterator[Any]:
-    """The constraints of a field, and of the members of an optional one."""
+    """Yield the constraints of a field, and of the members of an optional one."""
     yield from field.metadata
     for member in get_args(annotation):
         if get_origin(member) is Annotated:

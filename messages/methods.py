@@ -1,8 +1,8 @@
 """Define the method families of the nodes, and the choice of methods in a scene.
 
-A method family is a set of interchangeable ways to do one thing (`nodes/methods.py`); here are the
-names that nodes know theirs by.  `flexsheet tune SCENE` writes a scene's `methods`; a node's
-parameter that says `auto` follows them, and what the node's parameters say else goes before.
+A method family is a set of interchangeable methods for one task (`nodes/methods.py`); this module
+defines their names.  `flexsheet tune SCENE` writes a scene's `methods`.  A node's parameter with
+the value `auto` uses them; another value overrides them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SoftBodyMethod = Literal["linear", "nonlinear_table"]
 
 
 class SoftBodyChoice(BaseModel):
-    """How the soft body is answered for, and on how fine a mesh."""
+    """Method of the soft body and spacing of its mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -34,7 +34,7 @@ class SoftBodyChoice(BaseModel):
 
 
 class Methods(BaseModel):
-    """A scene's choice for each family; of one that is left out, the node's own default holds."""
+    """A scene's choice for each method family; None: the node's default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,8 +47,8 @@ class Methods(BaseModel):
     soft_body: SoftBodyChoice | None = None
 
 
-def chosen(asked: T | Literal["auto"], by_scene: T | None, default: T) -> T:
-    """What a node takes: what its parameter says, else the scene's choice, else its default."""
-    if asked != "auto":
-        return asked
+def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:
+    """Return the value of a node's parameter; for `auto` the scene's choice, else the default."""
+    if parameter != "auto":
+        return parameter
     return default if by_scene is None else by_scene

@@ -1,13 +1,13 @@
-"""Reads bags that were written before a message changed.
+"""Migrate messages from bags that were recorded before a message type changed.
 
-Every bag holds the JSON Schema of its messages.  Where a type has since only gained (fields with
-defaults, further values of a literal, further members of a union), the recorded fields are valid
-as they are, and `fits` finds that out by comparing the two schemas.
+Every bag contains the JSON Schemas of its messages.  Recorded fields remain valid if a type only
+gained fields with defaults, values of a literal, or members of a union; `is_compatible` compares
+the two schemas.
 
 A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`, a removed
-field one in `REMOVED_FIELDS`.  These hold for every recorded version of the type.  Any other change
-needs a line in `MIGRATIONS`: the type, the fingerprint it had (`flexsheet bag info --json` names
-it), and a function from the recorded fields to those of the type that came after.
+field one in `REMOVED_FIELDS`.  They apply to every recorded version of the type.  Any other change
+needs a line in `MIGRATIONS`: the type, its former fingerprint (`flexsheet bag info --json`), and a
+function from the recorded fields to those of the next version.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Schema = Mapping[str, Any]
 
 
 RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
-"""Recorded topic names and those of today."""
+"""Former and current names of topics."""
 
 RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
-"""Recorded names of message types and those of today."""
+"""Former and current names of message types."""
 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
@@ -43,7 +43,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""By model, messages and their parts alike: recorded field names and those of today."""
+"""Former and current field names, by message or message part."""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -58,7 +58,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
     ("Methods", "sheet_force"): {"cubic": "scaled"},
 }
-"""By model and today's field name: recorded literal values and those of today."""
+"""Former and current literal values, by model and current field name."""
 
 SHEET_REASONS = {
     "": "ok",
@@ -73,10 +73,10 @@ SHEET_REASONS = {
     "sheet turned too far about its normal; lift the finger": "beyond_spin",
     "hollow place: the flat sheet rests on its rim": "concave_contact",
 }
-"""Recorded texts of `SheetTarget.reason` and today's literals."""
+"""Former texts of `SheetTarget.reason` and current literals."""
 
 
-def _sheet_reason(recorded: str) -> str:
+def _convert_sheet_reason(recorded: str) -> str:
     if recorded in SHEET_REASONS:
         return SHEET_REASONS[recorded]
     if recorded.startswith("fingertip: "):
@@ -87,18 +87,18 @@ def _sheet_reason(recorded: str) -> str:
 
 
 TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
-    ("SheetTarget", "reason"): _sheet_reason,
+    ("SheetTarget", "reason"): _convert_sheet_reason,
 }
-"""By model and today's field name: makes the literal of a field that was recorded as text."""
+"""Functions from a former text to the current literal, by model and current field name."""
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {"Methods": frozenset({"kinematics"})}
-"""By model: recorded fields that are dropped, since nothing reads them any more."""
+"""Removed fields, by model."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 
 
 def _add_stroke_duration(fields: Fields) -> Fields:
-    """Add a stroke's moving time, which recorded messages hold in the path's label only."""
+    """Add a stroke's moving time, which older messages contain in the path's label only."""
     found = _STROKE_LABEL.fullmatch(fields["path_label"])
     return {**fields, "path_stroke_s": None if found is None else float(found[1])}
 
@@ -112,27 +112,26 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
                        "items", "prefixItems"})  # fmt: skip
 
 
-def migration_for(
+def find_migration(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
-    """Return the function from recorded fields to those of today's type; None without one.
+    """Return the function from recorded fields to those of the current type; None if there is none.
 
-    fingerprint: hexadecimal, of the type as it was recorded.
-    recorded_schema: the bag's own.
+    fingerprint: of the recorded type, hexadecimal.  recorded_schema: JSON Schema from the bag.
     """
     if fingerprint == schema_fingerprint(message_type).hex():
         return _unchanged
     if (message_type.__name__, fingerprint) in MIGRATIONS:
         return MIGRATIONS[message_type.__name__, fingerprint]
-    today = message_type.model_json_schema()
+    current = message_type.model_json_schema()
     renamed_schema = _rename_in_schema(message_type, recorded_schema)
-    if not fits(_literal_schema(message_type.__name__, renamed_schema, today), today):
+    if not is_compatible(_literal_schema(message_type.__name__, renamed_schema, current), current):
         return None
     return lambda fields: _rename_in_fields(message_type, fields)
 
 
 def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
-    """Return the recorded schema with the names of today."""
+    """Return the recorded schema with current names."""
     parts = recorded.get("$defs", {})
     if not isinstance(parts, Mapping):
         return recorded
@@ -140,13 +139,13 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
     return {**_rename_part(message_type.__name__, recorded), "$defs": renamed}
 
 
-def _literal_schema(model: str, recorded: Schema, today: Schema) -> Schema:
-    """Return a recorded schema whose text fields are the literals that they are read as."""
+def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
+    """Return a recorded schema with the literals to which its text fields are converted."""
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
     literals = {
-        name: today["properties"][name]
+        name: current["properties"][name]
         for owner, name in TEXTS_TO_LITERALS
         if owner == model and _is_text(properties.get(name))
     }
@@ -174,7 +173,7 @@ def _rename_part(model: str, schema: Any) -> Any:
 
 
 def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
-    """Return a field's schema with the literal values of today, in it and in its options."""
+    """Return a field's schema with current literal values, in it and in its options."""
     if not values or not isinstance(schema, Mapping):
         return schema
     renamed = dict(schema)
@@ -188,7 +187,7 @@ def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
 
 
 def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
-    """Return the recorded fields of a model, and of the models within it, with today's names."""
+    """Return the recorded fields of a model and of its nested models with current names."""
     names = RENAMED_FIELDS.get(model.__name__, {})
     renamed: Fields = {}
     for name, value in fields.items():
@@ -210,7 +209,7 @@ def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
 
 
 def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
-    """Return the recorded fields of a part, or of each part of a list, with today's names."""
+    """Return the recorded fields of a part, or of each part of a list, with current names."""
     if model is not None and isinstance(value, dict):
         return _rename_in_fields(model, value)
     if model is not None and isinstance(value, list):
@@ -225,12 +224,14 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return models[0] if len(models) == 1 else None
 
 
-def fits(recorded: Schema, today: Schema) -> bool:
-    """Return whether everything that the recorded schema allows is valid by today's."""
+def is_compatible(recorded: Schema, current: Schema) -> bool:
+    """Return whether all values that the recorded schema allows are valid by the current one."""
     try:
-        return _Comparison(recorded.get("$defs", {}), today.get("$defs", {})).fits(recorded, today)
+        return _Comparison(recorded.get("$defs", {}), current.get("$defs", {})).is_compatible(
+            recorded, current
+        )
     except (KeyError, TypeError, AttributeError, RecursionError):
-        return False  # damaged: no JSON Schema at all, or one without an end
+        return False  # damaged: not a JSON Schema, or an endless one
 
 
 def _unchanged(fields: Fields) -> Fields:
@@ -238,19 +239,19 @@ def _unchanged(fields: Fields) -> Fields:
 
 
 class _Comparison:
-    """Of two schemas with their parts; each pair is looked at once, however often it is named."""
+    """Comparison of two schemas with their parts; each pair of parts is compared once."""
 
     def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
         self._old_parts, self._new_parts = old_parts, new_parts
         self._known: dict[tuple[int, int], bool] = {}
 
-    def fits(self, old: Any, new: Any) -> bool:
-        old, new = _resolved(old, self._old_parts), _resolved(new, self._new_parts)
+    def is_compatible(self, old: Any, new: Any) -> bool:
+        old, new = _resolve(old, self._old_parts), _resolve(new, self._new_parts)
         if not (isinstance(old, Mapping) and isinstance(new, Mapping)):
             return bool(old == new)
         pair = id(old), id(new)
         if pair not in self._known:
-            # What is met again within itself has no end, and is no message's.
+            # A schema that contains itself is endless, and no message has such a schema.
             self._known[pair] = False
             self._known[pair] = self._fit(old, new)
         return self._known[pair]
@@ -258,42 +259,47 @@ class _Comparison:
     def _fit(self, old: Schema, new: Schema) -> bool:
         was, now = _options(old), _options(new)
         if was or now:
-            return all(any(self.fits(one, other) for other in now or [new]) for one in was or [old])
+            return all(
+                any(self.is_compatible(one, other) for other in now or [new])
+                for one in was or [old]
+            )
         old_fields, new_fields = old.get("properties", {}), new.get("properties", {})
         old_items, new_items = old.get("prefixItems", []), new.get("prefixItems", [])
         return (
-            _rest(old) == _rest(new)
-            and _values(old) <= _values(new)
+            _other_keywords(old) == _other_keywords(new)
+            and _allowed_values(old) <= _allowed_values(new)
             and set(new.get("required", ())) <= old_fields.keys()
             and old_fields.keys() <= new_fields.keys()
-            and all(self.fits(field, new_fields[name]) for name, field in old_fields.items())
-            and self.fits(old.get("items"), new.get("items"))
+            and all(
+                self.is_compatible(field, new_fields[name]) for name, field in old_fields.items()
+            )
+            and self.is_compatible(old.get("items"), new.get("items"))
             and len(old_items) == len(new_items)
-            and all(map(self.fits, old_items, new_items))
+            and all(map(self.is_compatible, old_items, new_items))
         )
 
 
-def _resolved(schema: Any, parts: Schema) -> Any:
-    """What a chain of references leads to; TypeError for one that leads to itself."""
+def _resolve(schema: Any, parts: Schema) -> Any:
+    """Follow a chain of references; TypeError for a cycle."""
     for _ in range(len(parts) + 1):
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema
         schema = parts[str(schema["$ref"]).rpartition("/")[2]]
-    raise TypeError("a reference that leads to itself")
+    raise TypeError("cyclic reference")
 
 
 def _options(schema: Schema) -> list[Any]:
     return [*schema.get("anyOf", ()), *schema.get("oneOf", ())]
 
 
-def _values(schema: Schema) -> set[Any]:
-    """The literal values that are allowed; {None} where a schema restricts nothing."""
+def _allowed_values(schema: Schema) -> set[Any]:
+    """Return the allowed literal values; {None} if the schema does not restrict them."""
     if "const" in schema:
         return {schema["const"]}
     return set(schema["enum"]) if "enum" in schema else {None}
 
 
-def _rest(schema: Schema) -> dict[str, Any]:
+def _other_keywords(schema: Schema) -> dict[str, Any]:
     return {
         key: value for key, value in schema.items() if key not in _IGNORED and key not in _COMPARED
     }

@@ -1,4 +1,4 @@
-"""Notes of nodes that need an action, and what to do."""
+"""Define the remedies for notes of nodes, which `flexsheet explain` prints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row 
 
 
 class NodeNote(Enum):
-    """Notes, reasons and warnings of nodes that need an action, by their constant phrase."""
+    """Notes, reasons and warnings of nodes that need an action, by the constant text in them."""
 
     COMPUTER_BUSY = (
         "is busy:",
@@ -34,35 +34,33 @@ class NodeNote(Enum):
     )
     NO_PATH = (
         "no path:",
-        "Move the arms nearer to the sheet by hand, or the sheet to another position "
-        "(docs/arms.md).",
+        "Move the arms nearer to the sheet by hand, or move the sheet (docs/arms.md).",
     )
     NOT_RECORDING = (
         "NOT RECORDING:",
-        "Free space on the disk, or record to another one. With space, the next bag starts "
-        "by itself.",
+        "Free space on the disk, or record to another one. Then the next bag starts automatically.",
     )
     NODE_HUNG = (
         "hung: no heartbeat",
-        "The node is restarted. The end of `logs/NODE.log` of the run shows where it stood. "
-        "`liveness_s` of the launch file sets how long it may be silent.",
+        "The node is restarted. The end of `logs/NODE.log` of the run shows its stack. "
+        "`liveness_s` of the launch file sets the time-out.",
     )
     KEY_REFUSED = (
-        "refuses our key",
-        "The launch file there has no key or another key for this host. Copy the newest launch "
-        "file to all hosts; `flexsheet doctor hosts` lists which differ.",
+        "rejects the key of this host",
+        "The launch file of that host has no key or another key for this host. Copy the newest "
+        "launch file to all hosts; `flexsheet doctor hosts` lists the differences.",
     )
     NO_KEYS_THERE = (
-        "does not speak with our keys",
+        "does not accept keys",
         "Start that host with a launch file that has keys, the same on all hosts.",
     )
     KEY_NOT_PROVED = (
         "did not prove that it has its key",
-        "The secret key there does not belong to the public key in the launch file, or another "
+        "The secret key of that host does not match its public key in the launch file, or another "
         "program uses its address: `flexsheet doctor hosts`.",
     )
     READER_TOO_SLOW = (
-        "a reader or the network is too slow",
+        "a subscriber or the network is too slow",
         "`flexsheet topic echo status` shows which port drops messages. Give that node more "
         "processor time, or the link more bandwidth.",
     )
@@ -72,8 +70,8 @@ class NodeNote(Enum):
     )
     CLOCK_NOT_MEASURED = (
         "is not measured",
-        "Wait some seconds after a start. If it remains, the clock node or the network of that "
-        "host is down (docs/clocks.md).",
+        "Wait some seconds after a start. If the note remains, the clock node or the network of "
+        "that host is down (docs/clocks.md).",
     )
     CLOCK_UNCERTAIN = (
         "ms are allowed",
@@ -85,7 +83,7 @@ class NodeNote(Enum):
     )
     LAST_SHEET_PLANE = (
         "keeping the last valid sheet plane",
-        "The arms are silent, or the sheet faces away. The renderer recovers by itself.",
+        "The arms are silent, or the sheet faces away. The renderer recovers automatically.",
     )
 
     def __init__(self, phrase: str, remedy: str) -> None:
@@ -94,14 +92,14 @@ class NodeNote(Enum):
 
     @property
     def code(self) -> str:
-        """Return the name as `flexsheet explain` accepts it."""
+        """Return the name for `flexsheet explain`."""
         return self.name.lower().replace("_", "-")
 
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "no_marker": "Move the finger into the view, replace a lost marker, or expose longer.",
-    "marker_in_one_view": "One camera is occluded or sees less far: move the finger or the camera.",
-    "two_markers": "Cover reflections, and show one marked finger only.",
+    "marker_in_one_view": "One camera does not see the marker: move the finger or the camera.",
+    "two_markers": "Cover reflections, and use one marked finger only.",
     "merged": "Remove the bright spot that touches the marker's image.",
     "blurred": "The finger is too fast for the exposure: expose shorter, with more light.",
     "saturated": "The marker is overexposed: expose shorter.",
@@ -110,4 +108,4 @@ FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "too_fast": "A jump faster than a finger is usually a reflection: cover it.",
     "unconfirmed": "Wait: a new marker is accepted after a few images.",
 }
-"""Remedies by `reason` of the topic `fingertip`, for all reasons but "ok"."""
+"""Remedies by `reason` of the topic `fingertip`, except "ok"."""

@@ -1,9 +1,8 @@
-"""The scene: what is shown, with which devices, over which range, and how well.
+"""Define the scene: object, devices, working range and tolerances.
 
-A scene file (`launch/scenes/*.yaml`) holds exactly these fields (but a mesh is named by its file,
-see `launch/objects/meshes.py`).  Lengths are metres, angles radians, stresses pascals.  The world
-frame has its origin at the centre of the imaginary screen, x to the right, y up, z towards the
-user.
+A scene file (`launch/scenes/*.yaml`) contains these fields; a mesh is given by its file (see
+`launch/objects/meshes.py`).  Units are metres, radians and pascals.  The world frame has its origin
+at the centre of the imaginary screen, x to the right, y up, z towards the user.
 """
 
 from __future__ import annotations
@@ -25,17 +24,19 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Part(MessagePart, LimitedModel):
-    """A named group of values in a scene or a calibration, each within the limits of its unit."""
+    """Base class of the parts of scenes and calibrations, with limits for each unit."""
 
 
 class Pose(Part):
-    """Where a frame sits in another; roll, pitch, yaw turn about fixed x, y, z axes, in order."""
+    """Pose of a frame in another; roll, pitch, yaw are rotations about fixed x, y, z, in order."""
 
     position_m: Vector3
     rpy_rad: Vector3
 
 
 class Material(Part):
+    """Linear elastic constants of the soft object."""
+
     young_modulus_pa: Positive
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)]
 
@@ -43,7 +44,7 @@ class Material(Part):
 class Cylinder(Part):
     """Solid circular cylinder, axis along the object frame's x, centred on its origin.
 
-    Its side is touched, not its ends.
+    The user touches its side, not its ends.
     """
 
     shape: Literal["cylinder"] = "cylinder"
@@ -66,7 +67,7 @@ class Ellipsoid(Part):
 
 
 class Plane(Part):
-    """The half-space below z = 0 of the object frame, touched on a rectangle about the origin."""
+    """Half-space below z = 0 of the object frame, with a touchable rectangle about the origin."""
 
     shape: Literal["plane"] = "plane"
     width_m: Positive = Field(description="along x")
@@ -74,36 +75,36 @@ class Plane(Part):
 
 
 class RoundedBox(Part):
-    """Solid box about the object frame's origin, its edges and corners rounded by a ball."""
+    """Solid box about the object frame's origin with rounded edges and corners."""
 
     shape: Literal["rounded_box"] = "rounded_box"
     size_m: tuple[Positive, Positive, Positive] = Field(
-        description="along x, y, z, rounding included"
+        description="along x, y, z, including the rounded edges"
     )
     edge_radius_m: Positive
 
     @model_validator(mode="after")
-    def _rounding_fits(self) -> Self:
+    def _check_rounding(self) -> Self:
         if 2.0 * self.edge_radius_m > min(self.size_m):
             raise ValueError(
-                f"edge_radius_m: {self.edge_radius_m} is more than half of the least size_m, "
-                f"{min(self.size_m)}; round the edges less"
+                f"edge_radius_m: {self.edge_radius_m} is more than half of the smallest size_m, "
+                f"{min(self.size_m)}; reduce it"
             )
         return self
 
 
 class Mesh(Part):
-    """The smooth solid that a closed triangle mesh stands for.
+    """Smooth solid that approximates a closed triangle mesh.
 
-    It travels with the scene, so that every node on every host has the same.  A scene file names
-    the mesh's file instead, as `shape: mesh_file`; see `launch/objects/meshes.py`.
+    The scene message contains the mesh, so every node on every host has the same one.  A scene file
+    gives the mesh's file as `shape: mesh_file`; see `launch/objects/meshes.py`.
     """
 
     shape: Literal["mesh"] = "mesh"
     vertices_m: Vertices
-    triangles: Triangles = Field(description="indices, counter-clockwise seen from outside")
-    smoothing_m: Positive = Field(description="what is finer is smoothed away; edges are rounded")
-    origin: str = Field(description="for people: where it comes from, what was repaired")
+    triangles: Triangles = Field(description="vertex indices, counter-clockwise from outside")
+    smoothing_m: Positive = Field(description="length below which details and edges are smoothed")
+    origin: str = Field(description="source file and repairs, for information")
 
 
 Geometry = Annotated[
@@ -112,32 +113,34 @@ Geometry = Annotated[
 
 
 class StripSupport(Part):
-    """Held is the skin that faces away from the user."""
+    """Fixed skin on the side that faces away from the user."""
 
     kind: Literal["strip"] = "strip"
     angle_rad: Positive = Field(
-        description="full angle that the held skin's normals span about the line from the user"
+        description="full angle of the fixed skin's normals about the line from the user"
     )
 
 
 class BaseSupport(Part):
-    """Held is the lowest skin, as of an object that stands on something."""
+    """Fixed skin at the lowest part, as of an object on a table."""
 
     kind: Literal["base"] = "base"
-    height_m: Positive = Field(description="of the held skin, above the lowest point")
+    height_m: Positive = Field(description="height of the fixed skin above the lowest point")
     down_world: tuple[Finite, Finite, Finite] = Field(
-        default=(0.0, 0.0, -1.0), description="where low is; of any length but zero"
+        default=(0.0, 0.0, -1.0), description="direction downwards, of any length except zero"
     )
 
     @model_validator(mode="after")
-    def _has_direction(self) -> Self:
+    def _check_direction(self) -> Self:
         if not any(self.down_world):
-            raise ValueError("down_world: (0, 0, 0) is no direction; [0, -1, 0] is below")
+            raise ValueError(
+                "down_world: (0, 0, 0) is not a direction; give for example [0, -1, 0]"
+            )
         return self
 
 
 class SpherePatchSupport(Part):
-    """Held is the skin within a sphere, as by a clamp."""
+    """Fixed skin within a sphere, as by a clamp."""
 
     kind: Literal["sphere_patch"] = "sphere_patch"
     centre_m: Vector3 = Field(description="object frame")
@@ -145,16 +148,16 @@ class SpherePatchSupport(Part):
 
 
 class BoxPatchSupport(Part):
-    """Held is the skin within a box, its sides along the object frame's axes."""
+    """Fixed skin within a box along the object frame's axes."""
 
     kind: Literal["box_patch"] = "box_patch"
     min_m: Vector3 = Field(description="object frame")
     max_m: Vector3
 
     @model_validator(mode="after")
-    def _holds_something(self) -> Self:
+    def _check_order(self) -> Self:
         if not (self.min_m < self.max_m).all():
-            raise ValueError(f"min_m: {self.min_m} is not below max_m: {self.max_m} on every axis")
+            raise ValueError(f"min_m: {self.min_m} must be below max_m: {self.max_m} on every axis")
         return self
 
 
@@ -163,73 +166,73 @@ Support = Annotated[
 ]
 
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Appearance(Part):
-    """How the object is painted; a texture moves with the skin and so shows how that is strained.
+    """Colour and texture of the object; the texture moves with the skin and shows its strain.
 
-    `texture: image` needs an image; a scene file names its file instead, as `image_file`, see
-    `launch/objects/textures.py`.
+    `texture: image` needs an image; a scene file gives its file as `image_file` (see
+    `launch/objects/textures.py`).
     """
 
-    colour: tuple[Share, Share, Share] = Field(
-        default=(0.95, 0.72, 0.60), description="red, green, blue in full light"
+    colour: tuple[Fraction, Fraction, Fraction] = Field(
+        default=(0.95, 0.72, 0.60), description="red, green, blue at full illumination"
     )
     texture: Literal["none", "speckle", "grid", "image"] = "none"
     texture_pitch_m: Positive = Field(
-        default=0.008, description="between the grid's lines, or the speckle's spots, about"
+        default=0.008, description="approximate distance of the grid's lines or the speckles"
     )
     image: ColorImage | None = Field(
         default=None,
-        description="top row first; laid over the object from its front, the object frame's +z, "
-        "fitted to its width and height",
+        description="top row first; projected along the object frame's z and scaled to the "
+        "object's width and height",
     )
 
     @model_validator(mode="after")
-    def _has_image(self) -> Self:
+    def _check_image(self) -> Self:
         if self.texture == "image" and (self.image is None or not self.image.size):
-            raise ValueError("texture: image has no image; give image_file, or another texture")
+            raise ValueError("texture: image needs an image; give image_file, or another texture")
         return self
 
 
 class VirtualObject(Part):
-    """The soft object that is seen and touched.
+    """Soft virtual object.
 
-    `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
+    `support_angle_rad: x` in a scene file means `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
     material: Material
     world_from_object: Pose
-    support: Support = Field(description="the part of the skin that does not move")
+    support: Support = Field(description="fixed part of the skin")
     appearance: Appearance = Appearance()
 
     @model_validator(mode="before")
     @classmethod
-    def _strip_by_its_angle(cls, values: Any) -> Any:
+    def _convert_support_angle(cls, values: Any) -> Any:
         if not isinstance(values, Mapping) or "support_angle_rad" not in values:
             return values
         if "support" in values:
             raise ValueError(
-                "support and support_angle_rad are both given; the latter is short for "
-                "support: {kind: strip, angle_rad: ...}, keep one of them"
+                "support and support_angle_rad are both given; the latter means "
+                "support: {kind: strip, angle_rad: ...}; remove one of them"
             )
         rest = {key: value for key, value in values.items() if key != "support_angle_rad"}
         return rest | {"support": {"kind": "strip", "angle_rad": values["support_angle_rad"]}}
 
     @property
     def support_angle_rad(self) -> float:
-        """Angle of the held strip, for who can handle no other support; UnfitGeometryError."""
+        """Angle of the fixed strip; raises UnfitGeometryError for another support."""
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
-                f'object.support.kind: "{self.support.kind}" cannot be handled here; use "strip"'
+                f'object.support.kind: expected "strip", found "{self.support.kind}"'
             )
         return self.support.angle_rad
 
 
 class SheetSpec(Part):
-    """The rubber sheet, clamped at its left and right edges (x), free at top and bottom (y)."""
+    """Rubber sheet, clamped at its left and right edges (x), free at top and bottom (y)."""
 
     width_m: Positive = Field(description="slack distance between the clamped edges")
     height_m: Positive = Field(description="length of a clamped edge")
@@ -242,33 +245,37 @@ class SheetSpec(Part):
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
     max_edge_force_n: Positive
     usable_half_height_m: Positive = Field(
-        description="how far from the sheet's middle line the finger may come"
+        description="maximum distance of the finger from the sheet's horizontal centre line"
     )
 
 
 class ArmSpec(Part):
-    """One RV-1A: where it stands and how it holds its edge of the sheet.
+    """One RV-1A: pose of its base, and of its edge of the sheet on the flange.
 
     Sheet frame: x from the left edge to the right, y along the edges, z towards the user.
     """
 
     world_from_base: Pose
     flange_from_edge: Pose = Field(
-        description="the middle of the clamped edge, axes as the sheet's, seen from the flange"
+        description="pose of the clamped edge's centre in the flange's frame, axes like the sheet's"
     )
 
 
 class Arms(Part):
+    """Both arms and their common limits."""
+
     left: ArmSpec
     right: ArmSpec
     max_tool_speed_m_per_s: Positive
-    min_distance_m: Positive = Field(description="least distance between the two flanges")
-    workspace_min_m: Vector3 = Field(description="corner of the box the flanges stay in, world")
+    min_distance_m: Positive = Field(description="minimum distance between the two flanges")
+    workspace_min_m: Vector3 = Field(
+        description="lower corner of the box that limits the flanges, world"
+    )
     workspace_max_m: Vector3
 
 
 class Lens(Part):
-    """Pinhole with Brown's distortion (k1, k2, p1, p2, k3), OpenCV's convention, in pixels."""
+    """Pinhole camera with Brown's distortion (k1, k2, p1, p2, k3), OpenCV's convention, px."""
 
     fx_px: Positive
     fy_px: Positive
@@ -278,7 +285,7 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """A rig of two cameras; camera frames have x right, y down, z along the view (OpenCV)."""
+    """Stereo rig; camera frames have x right, y down, z along the optical axis (OpenCV)."""
 
     device: str
     width_px: Annotated[int, Field(gt=0)]
@@ -286,13 +293,14 @@ class StereoCamera(Part):
     rate_hz: Positive
     exposure_s: Positive
     gain: Finite | None = Field(
-        default=None, description="in the device's own units; null: as the device has it"
+        default=None, description="gain in units of the device; null: the device's setting"
     )
     read_noise_levels: Positive = Field(
-        default=1.5, description="standard deviation of a dark pixel, of 255 levels"
+        default=1.5, description="standard deviation of a dark pixel, in levels of 255"
     )
     photons_per_level: Positive = Field(
-        default=40.0, description="a level L has the shot noise sqrt(L / photons_per_level)"
+        default=40.0,
+        description="photons per level; level L has the shot noise sqrt(L / photons_per_level)",
     )
     left: Lens
     right: Lens
@@ -301,7 +309,7 @@ class StereoCamera(Part):
 
 
 class Projector(Part):
-    """A projector as a camera run backwards: same lens model, z along the light."""
+    """Projector with the lens model of a camera; z is along the light."""
 
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
@@ -310,21 +318,25 @@ class Projector(Part):
 
 
 class Eyes(Part):
-    """The point of view V; the eyes stand half the interocular distance to either side along x."""
+    """Viewpoint V; each eye is half the interocular distance away along x."""
 
     centre_world_m: Vector3
     interocular_m: NonNegative
 
 
 class Finger(Part):
+    """Limits of the user's finger."""
+
     radius_m: Positive
     max_speed_m_per_s: Positive
-    volume_min_m: Vector3 = Field(description="corner of the box a fingertip can be in, world")
+    volume_min_m: Vector3 = Field(
+        description="lower corner of the box of possible fingertips, world"
+    )
     volume_max_m: Vector3
 
 
 class WorkingRange(Part):
-    """What the user may do; limits and charts are taken over it."""
+    """Range of the user's actions over which limits and charts are computed."""
 
     push_depth_m: Positive
     tilt_rad: Positive
@@ -332,9 +344,9 @@ class WorkingRange(Part):
 
 
 class Tolerances(Part):
-    """How good is good enough; each method family is tuned against one of these."""
+    """Maximum errors; each method family is tuned against one of them."""
 
-    image_m: Positive = Field(description="displacement of the picture as the eye sees it")
+    image_m: Positive = Field(description="displacement of the image from the eye's viewpoint")
     fingertip_m: Positive
     skin_m: Positive = Field(description="skin displacement outside 1.5 finger radii")
     force_ratio: Positive
@@ -343,7 +355,7 @@ class Tolerances(Part):
 
 
 class Scene(Message):
-    """Everything that the nodes must agree on."""
+    """Scene: everything that all nodes must know in common."""
 
     name: str
     object: VirtualObject
@@ -356,22 +368,22 @@ class Scene(Message):
     working_range: WorkingRange
     tolerances: Tolerances
     methods: Methods = Field(
-        default_factory=Methods, description="methods of nodes whose parameter has the value `auto`"
+        default_factory=Methods, description="methods for parameters with the value `auto`"
     )
 
 
 class UnfitGeometryError(FlexsheetError, ValueError):
-    """A scene whose object has a shape that the asker cannot handle."""
+    """An object of a shape that is not supported."""
 
     code = "unfit-geometry"
-    remedy = "Choose an object of a shape that this command supports."
+    remedy = "Choose an object of a supported shape."
 
 
-def cylinder_of(scene: Scene) -> Cylinder:
-    """The scene's geometry, for who can handle no other than a cylinder; UnfitGeometryError."""
+def require_cylinder(scene: Scene) -> Cylinder:
+    """Return the scene's cylinder; raises UnfitGeometryError for another shape."""
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):
         raise UnfitGeometryError(
-            f'object.geometry.shape: "{geometry.shape}" cannot be handled here; use "cylinder"'
+            f'object.geometry.shape: expected "cylinder", found "{geometry.shape}"'
         )
     return geometry

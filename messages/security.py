@@ -1,11 +1,11 @@
-"""Keys between hosts: who may connect, whom one connects to, and files that hold secrets.
+"""Authenticate hosts by CURVE keys.
 
-Every host has one CURVE key pair.  Its secret half stays in a file that only its owner may read;
-the public halves of all hosts stand in the launch file.  Whoever binds lets in only the keys of
-hosts of the plan (asked by ZeroMQ through ZAP, on the loop: no thread); whoever connects names the
-key that must answer.  So each end of a connection knows which host the other one is.
+Every host has one CURVE key pair.  The secret key is in a file that only its owner may read; the
+public keys of all hosts are in the launch file.  A bound socket accepts only the keys of hosts of
+the plan; ZeroMQ requests that decision by ZAP, in the event loop.  A connecting socket requires the
+key of one host.  Each end of a connection therefore knows the host of the other end.
 
-Keys are written in Z85, 40 characters, as ZeroMQ does.
+Keys are written in Z85, 40 characters.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 ZAP_VERSION = b"1.0"
 CURVE_KEY_BYTES = 32
 
-Refused = Callable[[str], None]
-"""Told in a sentence of a connection that was refused."""
+RefusalHandler = Callable[[str], None]
+"""Function that is called with a text for each refused connection."""
 
 
 class SecurityError(FlexsheetError, RuntimeError):
-    """Keys that cannot be used; the sentence names file or host, and the remedy."""
+    """An invalid or missing key; the text names file or host, and the remedy."""
 
     code = "keys"
     remedy = (
@@ -47,15 +47,15 @@ class SecurityError(FlexsheetError, RuntimeError):
 
 
 def new_key_pair() -> tuple[str, str]:
-    """Make a (public, secret) key pair; no public key looks like an option of a command line."""
+    """Return a new (public, secret) key pair; the public key does not begin with a hyphen."""
     while True:
         public, secret = zmq.curve_keypair()
         if not public.startswith(b"-"):
             return public.decode(), secret.decode()
 
 
-def public_of(secret: str) -> str:
-    """The public key that belongs to a secret one."""
+def derive_public_key(secret: str) -> str:
+    """Return the public key of a secret key."""
     public: bytes = zmq.curve_public(secret.encode())
     return public.decode()
 
@@ -69,7 +69,10 @@ def is_key(text: str) -> bool:
 
 
 def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
-    """Write a secret key so that only its owner can ever read it; SecurityError if it is there."""
+    """Write a secret key that only its owner can read; SecurityError for an existing file.
+
+    replace: whether an existing file is replaced.
+    """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)
@@ -80,12 +83,12 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
         if replace:
             part.rename(path)
         else:
-            # A link, unlike a rename, takes no other file's place.
+            # A link, unlike a rename, does not replace an existing file.
             os.link(part, path)
     except FileExistsError as error:
         raise SecurityError(
-            f"{path}: there is a key already; --replace makes a new one, which every host must be "
-            "told of"
+            f"{path}: exists already; --replace creates a new key, which must be entered in the "
+            "launch file on every host"
         ) from error
     except OSError as error:
         raise SecurityError(str(write_error(path, error))) from error
@@ -94,41 +97,41 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
 
 
 def read_secret(path: Path) -> str:
-    """The secret key in a file of our own that nobody else may read; SecurityError."""
+    """Read a secret key; SecurityError unless its file is private to this user and valid."""
     try:
         with path.open() as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
                 raise SecurityError(
-                    f"{path}: belongs to somebody else; make one: flexsheet keys new"
+                    f"{path}: belongs to another user; create a key: flexsheet keys new"
                 )
             if status.st_mode & 0o077:
                 raise SecurityError(
-                    f"{path}: others may read it (mode {stat.S_IMODE(status.st_mode):04o}); make a "
-                    f"new key, or, if nobody has seen it: chmod 600 {path}"
+                    f"{path}: other users may read it (mode {stat.S_IMODE(status.st_mode):04o}); "
+                    f"create a new key, or, if nobody has read it: chmod 600 {path}"
                 )
             text = file.read(KEY_LENGTH + 2).strip()
     except FileNotFoundError as error:
         raise SecurityError(
-            f"{path}: there is no key; make one: flexsheet keys new {path.stem}"
+            f"{path}: does not exist; create a key: flexsheet keys new {path.stem}"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise SecurityError(f"{path}: cannot be read: {error}") from error
     if not is_key(text):
-        raise SecurityError(f"{path}: holds no key of {KEY_LENGTH} characters")
+        raise SecurityError(f"{path}: does not contain a key of {KEY_LENGTH} characters")
     return text
 
 
 @dataclass(frozen=True, slots=True)
 class KeyChange:
-    """What a reload has changed: our own key, and the hosts whose keys are other ones or gone."""
+    """Changes by a reload: of this host's own key, and of the keys of other hosts."""
 
     own: bool
     hosts: frozenset[str]
 
 
 class KeyRing:
-    """One host's key pair and the public keys of all hosts.
+    """Key pair of one host, and the public keys of all hosts.
 
     file: JSON of {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
     """
@@ -138,39 +141,39 @@ class KeyRing:
         self._stamps: tuple[Any, ...] = ()
         self.host, self.public_key, self.secret_key = "", "", ""
         self.public: dict[str, str] = {}
-        self._host_of: dict[str, str] = {}
+        self._host_by_key: dict[str, str] = {}
         self.reload()
 
-    def key_of(self, host: str) -> str:
-        """The public key of a host; SecurityError for one that has none."""
+    def get_public_key(self, host: str) -> str:
+        """Return the public key of a host; SecurityError if it has none."""
         key = self.public.get(host)
         if key is None:
             raise SecurityError(f'host "{host}" has no key in the launch file')
         return key
 
-    def host_of(self, key: str) -> str | None:
-        """The host that has this public key; None for a stranger."""
-        return self._host_of.get(key)
+    def find_host(self, key: str) -> str | None:
+        """Return the host of a public key; None for an unknown key."""
+        return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
-        """Read the files again if they have changed; what that changes, or None for nothing.
+        """Read the files again if they have changed; return the changes, or None without any.
 
-        Raises SecurityError for files that cannot be used; the keys then stay as they were.
+        Raises SecurityError for invalid files; the keys are then unchanged.
         """
         try:
             ring = json.loads(self._file.read_text())
             host, secret_file, public = ring["host"], Path(ring["secret_file"]), ring["public"]
             stamps = (_stamp(self._file), _stamp(secret_file))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SecurityError(f"{self._file}: holds no keys: {error}") from error
+            raise SecurityError(f"{self._file}: does not contain valid keys: {error}") from error
         if stamps == self._stamps:
             return None
         secret = read_secret(secret_file)
-        own = public_of(secret)
+        own = derive_public_key(secret)
         if public.get(host) != own:
             raise SecurityError(
-                f'{secret_file}: is not the key that the launch file has for host "{host}"; there: '
-                f"{public.get(host)}, here: {own}; put it there: flexsheet keys install"
+                f'{secret_file}: does not match the key of host "{host}" in the launch file: '
+                f"expected {public.get(host)}, found {own}; enter it there: flexsheet keys install"
             )
         before = self.public
         change = KeyChange(
@@ -179,42 +182,42 @@ class KeyRing:
         )
         self.host, self.secret_key, self.public_key = host, secret, own
         self.public = dict(public)
-        self._host_of = {key: name for name, key in self.public.items()}
+        self._host_by_key = {key: name for name, key in self.public.items()}
         self._stamps = stamps
         return change
 
-    def serve(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
-        """Let what is bound from now on take in only hosts of this ring."""
+    def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
+        """Restrict endpoints that the socket binds from now on to hosts of this ring."""
         opened.setsockopt(zmq.CURVE_SERVER, 1)
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
         opened.setsockopt(zmq.ZAP_DOMAIN, domain)
-        # Without this, a gatekeeper that is not there would let everybody in.
+        # Without this option, a missing authenticator would admit every peer.
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
-    def seek(self, opened: zmq.Socket[bytes], host: str) -> None:
-        """Let what is connected from now on speak to that host alone."""
-        opened.setsockopt(zmq.CURVE_SERVERKEY, self.key_of(host).encode())
+    def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
+        """Restrict endpoints to which the socket connects from now on to one host."""
+        opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
 
 
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
-    """Write what a `KeyRing` reads, at once."""
+    """Write the file of a `KeyRing` atomically."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
     write_file(file, text)
 
 
-class Gatekeeper:
-    """Answers ZeroMQ's question whether a key may come in; one per process, while it is needed.
+class ZapAuthenticator:
+    """Handler of ZeroMQ's authentication requests (ZAP); one per process while it is needed.
 
-    Each bound socket has a domain of its own, and with it its ring and who is told of refusals.
+    Each bound socket has its own domain, with a key ring and a handler of refusals.
     """
 
-    _present: ClassVar[Gatekeeper | None] = None
+    _present: ClassVar[ZapAuthenticator | None] = None
     _numbers = count(1)
 
     def __init__(self) -> None:
-        self._doors: dict[bytes, tuple[KeyRing, Refused]] = {}
+        self._domains: dict[bytes, tuple[KeyRing, RefusalHandler]] = {}
         self._loop = asyncio.get_running_loop()
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -223,33 +226,33 @@ class Gatekeeper:
         self._loop.call_soon(self._answer)
 
     @classmethod
-    def admit(cls, keys: KeyRing, on_refused: Refused) -> bytes:
-        """Open a door; its domain, for `KeyRing.serve` and `dismiss`."""
+    def register(cls, keys: KeyRing, on_refused: RefusalHandler) -> bytes:
+        """Register a socket; return its domain for `KeyRing.set_server_keys` and `unregister`."""
         if cls._present is None:
-            cls._present = Gatekeeper()
+            cls._present = ZapAuthenticator()
         domain = f"flexsheet-{next(cls._numbers)}".encode()
-        cls._present._doors[domain] = (keys, on_refused)
+        cls._present._domains[domain] = (keys, on_refused)
         return domain
 
     @classmethod
-    def dismiss(cls, domain: bytes) -> None:
-        """Close a door; with the last one the gatekeeper goes."""
+    def unregister(cls, domain: bytes) -> None:
+        """Remove a domain; close the handler after the last one."""
         if cls._present is None:
             return
-        cls._present._doors.pop(domain, None)
-        if not cls._present._doors:
+        cls._present._domains.pop(domain, None)
+        if not cls._present._domains:
             cls._present._close()
             cls._present = None
 
     def _close(self) -> None:
         if not self._loop.is_closed():
             self._loop.remove_reader(self._socket.fileno())
-        # At once: a closed socket keeps its name until ZeroMQ's own thread has seen to it.
+        # `close` alone would release the name later, in ZeroMQ's thread.
         self._socket.unbind(ZAP_ENDPOINT)
         self._socket.close(linger=0)
 
     def _answer(self) -> None:
-        """The loop's callback: until nothing is left to be answered."""
+        """Answer all pending requests; a loop callback."""
         while not self._socket.closed:
             try:
                 request = self._socket.recv_multipart(zmq.NOBLOCK)
@@ -258,21 +261,23 @@ class Gatekeeper:
             self._socket.send_multipart(self.reply(request))
 
     def reply(self, request: list[bytes]) -> list[bytes]:
-        """The frames of an answer: 200 and the host's name, or 400."""
+        """Return the frames of the answer to a request: 200 and the host's name, or 400."""
         version, number, domain, address, _, mechanism, *credentials = request
-        keys, on_refused = self._doors.get(domain, (None, lambda _: None))
-        host, why = None, "a mechanism without keys"
+        keys, on_refused = self._domains.get(domain, (None, lambda _: None))
+        host, reason = None, "it uses no key"
         if keys is not None and version == ZAP_VERSION and mechanism == b"CURVE":
             key = z85.encode(credentials[0]).decode()
-            host, why = keys.host_of(key), f"the key {key}, which no host of the plan has"
+            host, reason = keys.find_host(key), f"no host of the plan has its key {key}"
         if host is None:
-            on_refused(f"a connection from {address.decode(errors='replace')} was refused: {why}")
+            on_refused(
+                f"a connection from {address.decode(errors='replace')} was refused: {reason}"
+            )
             return [ZAP_VERSION, number, b"400", b"not a host of the plan", b"", b""]
         return [ZAP_VERSION, number, b"200", b"OK", host.encode(), b""]
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Another one for each state of a file; None where there is none."""
+    """Return mtime (ns), inode and size of a file, to detect changes; None without a file."""
     try:
         status = path.stat()
     except FileNotFoundError:

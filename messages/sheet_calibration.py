@@ -1,4 +1,4 @@
-"""The sheet's calibration file: what `flexsheet calibrate sheet` writes and the planner reads."""
+"""Define the sheet's calibration file, from `flexsheet calibrate sheet` for the planner."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ Axis = Annotated[NDArray[np.float64], ArraySpec("<f8", ("entries",))]
 Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths", "xs", "ys"))]
 
 NOMINAL_RATIO = 0.02
-"""Nominal sizes of calibration and scene may differ by this much."""
+"""Maximum relative difference of the nominal sizes of calibration and scene."""
 
 
 class Fitted(Part):
-    """A fitted number and its standard deviation (normal errors)."""
+    """Fitted number with its standard deviation (normal errors)."""
 
     value: NonNegative
     standard_deviation: NonNegative
 
 
 class LeftOutRow(Part):
-    """A row that contradicted the others, by its line in the file (from 1)."""
+    """Outlier row, by its line in the file (from 1)."""
 
     line: Annotated[int, Field(ge=1)]
-    residual_ratio: float = Field(description="measured force over the fitted law's, less one")
+    residual_ratio: float = Field(description="measured over fitted force, minus one")
 
 
 class SheetTable(Part):
-    """Measured over fitted force; linear between stretches and places, cubic between depths."""
+    """Measured over fitted force; linear in stretch and position, cubic in depth."""
 
     stretch_ratios: Axis = Field(description="edge distance over the nominal width")
     depths_m: Axis
@@ -51,19 +51,23 @@ class SheetTable(Part):
 
 
 class SheetCalibration(Part):
-    """A measured sheet."""
+    """Calibration of a sheet."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
     code_version: str
-    source: str = Field(description="the rows' file, or the twin's scene")
-    nominal_width_m: Positive = Field(description="the scene's slack width; stretch is over this")
+    source: str = Field(description="file of the measurements, or scene of the simulator")
+    nominal_width_m: Positive = Field(
+        description="slack width of the scene's sheet, to which stretch ratios refer"
+    )
     height_m: Positive
     thickness_m: Positive
     finger_radius_m: Positive
     modulus_thickness_n_per_m: Fitted
     slack_width_m: Fitted
-    cubic_ratio: Fitted = Field(description="of the slack sheet's cubic term, over ideal rubber's")
+    cubic_ratio: Fitted = Field(
+        description="cubic term of the slack sheet's force, over that of ideal rubber"
+    )
     mooney_share: Fitted | None = Field(default=None, description="C2/(C1+C2); null: not fitted")
     rows: Annotated[int, Field(ge=1)]
     left_out: tuple[LeftOutRow, ...]
@@ -76,25 +80,27 @@ class SheetCalibration(Part):
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
-    """Raises CalibrationMismatchError unless the calibration is of a sheet of the scene's sizes."""
+    """Raise CalibrationMismatchError unless the calibrated sheet has the sizes of the scene's."""
     sizes = (
         ("width_m", calibration.nominal_width_m, sheet.width_m),
         ("height_m", calibration.height_m, sheet.height_m),
     )
-    for key, measured, wanted in sizes:
-        if abs(measured - wanted) > NOMINAL_RATIO * wanted:
+    for key, measured, expected in sizes:
+        if abs(measured - expected) > NOMINAL_RATIO * expected:
             raise CalibrationMismatchError(
                 f"calibration is of a sheet with {key} {measured:g}, the scene's sheet.{key} is "
-                f"{wanted:g}: name the right file, or calibrate this sheet"
+                f"{expected:g}: give the file of this sheet, or calibrate it"
             )
 
 
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
+    """Write the calibration file; FileWriteError if the disk refuses it."""
     title = f"Calibration of a sheet, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_sheet_calibration(path: Path) -> SheetCalibration:
+    """Read the calibration file; CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate sheet"
     return read_calibration(
         SheetCalibration, path, version=SHEET_CALIBRATION_VERSION, command=command

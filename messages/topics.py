@@ -1,7 +1,7 @@
-"""The one table of topics.
+"""Define the table of topics.
 
-Ports, recorder, health checks, command line and docs are derived from it, by name.  To add a topic
-is to add a line.
+Ports, recorder, health checks, command line and documentation use this table.  A new topic needs
+one new row.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
-    """What a slow or late subscriber gets.
+    """Delivery of messages to a slow or late subscriber.
 
-    latest: the newest only; older ones are dropped and counted.
-    every: all, in order, through a bounded queue; an overflow is counted and is an error.
-    latched: as `every`, and a late subscriber first gets the last one sent.
+    latest: only the newest message; older ones are dropped and counted.
+    every: all messages in order through a bounded queue; an overflow is counted as an error.
+    latched: like `every`, and a late subscriber first receives the last message sent.
     """
 
     LATEST = "latest"
@@ -33,11 +33,11 @@ class Delivery(StrEnum):
 class Topic:
     """One row of the table.
 
-    rate_hz: what is expected, for health checks; None for topics sent on change.
-    logged: recorded unless the launch file says otherwise.
-    many_writers: any number of nodes may publish it; else exactly one.
-    max_bytes: larger messages are refused at both ends.
-    open_to_tools: where many may write, so may command-line tools.
+    rate_hz: expected range, for health checks; None: the topic is published on change.
+    logged: whether it is recorded by default.
+    many_writers: whether any number of nodes may publish it; otherwise exactly one.
+    max_bytes: maximum size of a message, checked at both ends.
+    open_to_tools: whether command-line tools may publish a topic with many writers.
     """
 
     name: str
@@ -54,47 +54,54 @@ class Topic:
 _LATEST, _EVERY, _LATCHED = Delivery.LATEST, Delivery.EVERY, Delivery.LATCHED
 
 _ROWS = (
-    Topic("scene", scene.Scene, _LATCHED, None, True, "what is shown, where, how well",
+    Topic("scene", scene.Scene, _LATCHED, None, True,
+          "objects, devices, working range and tolerances",
           max_bytes=16 << 20),
-    Topic("stereo", types.StereoPair, _LATEST, (30, 130), False, "pictures of the finger",
+    Topic("stereo", types.StereoPair, _LATEST, (30, 130), False, "images of the finger",
           max_bytes=16 << 20),
-    Topic("fingertip", types.Fingertip, _LATEST, (30, 130), True, "where the fingertip is"),
-    Topic("sheet_target", types.SheetTarget, _LATEST, (30, 150), True, "where the sheet shall be"),
-    Topic("arm_left", types.ArmState, _LATEST, (40, 150), True, "the left arm"),
-    Topic("arm_right", types.ArmState, _LATEST, (40, 150), True, "the right arm"),
-    Topic("skin", types.Skin, _LATCHED, None, True, "the soft body's skin at rest",
+    Topic("fingertip", types.Fingertip, _LATEST, (30, 130), True, "position of the fingertip"),
+    Topic("sheet_target", types.SheetTarget, _LATEST, (30, 150), True, "target pose of the sheet"),
+    Topic("arm_left", types.ArmState, _LATEST, (40, 150), True, "state of the left arm"),
+    Topic("arm_right", types.ArmState, _LATEST, (40, 150), True, "state of the right arm"),
+    Topic("skin", types.Skin, _LATCHED, None, True, "skin of the soft body at rest",
           max_bytes=16 << 20),
-    Topic("soft_body", types.SoftBody, _LATEST, (20, 1000), True, "the skin's answer to the finger",
+    Topic("soft_body", types.SoftBody, _LATEST, (20, 1000), True,
+          "response of the skin to the finger",
           max_bytes=16 << 20),
-    Topic("display", types.Display, _LATCHED, None, True, "what the renderer shall show",
+    Topic("display", types.Display, _LATCHED, None, True, "settings of the renderer",
           many_writers=True),
-    Topic("frame", types.Frame, _LATEST, (1, 130), True, "what the projector was given",
+    Topic("frame", types.Frame, _LATEST, (1, 130), True, "images for the projector",
           max_bytes=64 << 20),
-    Topic("eye", types.Eye, _LATEST, None, True, "where the user's eyes are", many_writers=True),
-    Topic("estop", types.EStop, _LATCHED, None, True, "stop, latched", many_writers=True),
+    Topic("eye", types.Eye, _LATEST, None, True, "position of the user's eyes", many_writers=True),
+    Topic("estop", types.EStop, _LATCHED, None, True, "emergency stop, latched", many_writers=True),
     Topic("recording", types.Recording, _LATCHED, None, True, "start and stop of a recording",
           many_writers=True),
-    Topic("bookmark", types.Bookmark, _EVERY, None, True, "positions in a bag to find again",
+    Topic("bookmark", types.Bookmark, _EVERY, None, True, "marked times in a bag",
           many_writers=True),
-    Topic("arming", types.Arming, _EVERY, None, True, "the arms may move", many_writers=True),
-    Topic("status", types.Status, _EVERY, (0.5, 3), True, "how each node is", many_writers=True),
-    Topic("clock_ping", types.ClockPing, _EVERY, (1, 100), True, "among the hosts' clock nodes",
+    Topic("arming", types.Arming, _EVERY, None, True,
+          "permission of motion for the arms", many_writers=True),
+    Topic("status", types.Status, _EVERY, (0.5, 3), True, "state of each node", many_writers=True),
+    Topic("clock_ping", types.ClockPing, _EVERY, (1, 100), True,
+          "exchange between the hosts' clock nodes",
           many_writers=True, open_to_tools=False),
-    Topic("clocks", types.Clocks, _LATCHED, None, True, "what each host knows of other clocks",
+    Topic("clocks", types.Clocks, _LATCHED, None, True, "measured offsets of other hosts' clocks",
           many_writers=True, open_to_tools=False),
-    Topic("host", types.HostStatus, _EVERY, (0.5, 2), True, "how each computer is",
+    Topic("host", types.HostStatus, _EVERY, (0.5, 2), True, "state of each computer",
           many_writers=True, open_to_tools=False),
-    Topic("twin/finger_path", types.FingerPath, _LATCHED, None, True, "what the twin's finger does",
+    Topic("twin/finger_path", types.FingerPath, _LATCHED, None, True,
+          "path of the simulated finger",
           many_writers=True, max_bytes=16 << 20),
-    Topic("twin/stereo", types.StereoPair, _LATEST, (30, 130), False, "the twin camera's pixels",
+    Topic("twin/stereo", types.StereoPair, _LATEST, (30, 130), False,
+          "images of the simulated camera",
           max_bytes=16 << 20),
-    Topic("twin/finger", types.TwinFinger, _EVERY, (30, 1000), True, "the true fingertip"),
-    Topic("twin/arms", types.TwinArms, _EVERY, (50, 1000), True, "the true arms"),
+    Topic("twin/finger", types.TwinFinger, _EVERY, (30, 1000), True,
+          "true position of the fingertip"),
+    Topic("twin/arms", types.TwinArms, _EVERY, (50, 1000), True, "true poses of the arms"),
     Topic("twin/arms_left", types.TwinArms, _EVERY, (50, 1000), True,
-          "the same, by the left arm's computer"),
+          "true poses of the arms, from the left arm's computer"),
     Topic("twin/arms_right", types.TwinArms, _EVERY, (50, 1000), True,
-          "the same, by the right arm's computer"),
-    Topic("twin/eye", types.TwinEye, _EVERY, None, True, "what the user's eye sees",
+          "true poses of the arms, from the right arm's computer"),
+    Topic("twin/eye", types.TwinEye, _EVERY, None, True, "image as the user's eye would see it",
           max_bytes=64 << 20),
 )  # fmt: skip
 
@@ -102,14 +109,14 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
 class UnknownTopicError(FlexsheetError, KeyError):
-    """A name that is not in the table; the message suggests one that is."""
+    """Unknown name of a topic; the text suggests a similar one."""
 
     code = "unknown-topic"
     remedy = "`flexsheet topic list` prints all names."
 
 
-def topic_named(name: str) -> Topic:
-    """The topic of that name; raises UnknownTopicError with the nearest name."""
+def find_topic(name: str) -> Topic:
+    """Return the topic of that name; raises UnknownTopicError with the most similar name."""
     try:
         return TOPICS[name]
     except KeyError:
@@ -118,5 +125,5 @@ def topic_named(name: str) -> Topic:
                 f'unknown topic "{name}"; it is now "{RENAMED_TOPICS[name]}"'
             ) from None
         near = get_close_matches(name, TOPICS, n=1)
-        hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(TOPICS)}"
+        hint = f'; did you mean "{near[0]}"?' if near else f"; topics: {', '.join(TOPICS)}"
         raise UnknownTopicError(f'unknown topic "{name}"{hint}') from None

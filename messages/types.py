@@ -1,7 +1,7 @@
-"""The message of every topic but the scene (`flexsheet.messages.scene`).
+"""Define the messages of all topics except the scene (`flexsheet.messages.scene`).
 
-Positions and directions are in the world frame unless the name says otherwise.  When a quantity is
-not known the message says so by a field; an array never holds NaN.
+Positions and directions are in the world frame unless the name contains another frame.  A field
+marks an unknown quantity; arrays never contain NaN.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 
 
 class StereoPair(Message):
-    """Two pictures taken together.  The header's source stamp is the middle of the exposure.
+    """Pair of images; the header's source stamp is the middle of the exposure.
 
-    Where the two cameras have no common trigger, it is the middle between both exposures.
+    For cameras without a common trigger, it is the middle between both exposures.
     """
 
     device: str
     exposure_s: NonNegative
     skew_s: Finite = Field(
-        default=0.0, description="exposure of the right picture minus that of the left, as measured"
+        default=0.0, description="measured time of the right exposure minus that of the left, s"
     )
-    dropped_frames: int = Field(ge=0, description="frames lost in the device since start")
+    dropped_frames: int = Field(ge=0, description="frames that the device has lost since its start")
     left_origin_px: tuple[int, int] = Field(
-        default=(0, 0), description="column and row of the sensor where the left picture begins"
+        default=(0, 0), description="column and row of the left image's first pixel on the sensor"
     )
     right_origin_px: tuple[int, int] = (0, 0)
     left: GrayImage
@@ -72,20 +72,19 @@ FingertipReason = Literal[
     "unconfirmed",
 ]
 """Why an image pair gave no fingertip: no marker; a marker in one view only; several candidates; a
-marker merged with another light; blurred; overexposed; outside the finger's volume; views that are
-not of one point; faster than a finger; too few detections to begin a track."""
+marker merged with another light; blurred; overexposed; outside the finger's volume; rays that do
+not intersect; faster than a finger; too few detections for a track."""
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
-"""State of the track: none; too new to be used; confirmed by this image pair; predicted for a while
-without a detection."""
+"""State of the track: none; tentative; confirmed by this image pair; predicted only."""
 
 
 class Fingertip(Message):
-    """Report the fingertip at the exposure, and its predicted path.
+    """Fingertip at the exposure, and its predicted path.
 
-    When `valid` is false, `reason` says why, and the tracked state is predicted from the last
-    valid one while `state` is "coasting".  `measured_world_m` is the triangulated point of this
-    image pair, without any filter.
+    If `valid` is false, `reason` gives the cause, and while `state` is "coasting" the tracked state
+    is predicted from the last valid one.  `measured_world_m` is the triangulated point of this
+    image pair, unfiltered.
     """
 
     valid: bool
@@ -95,7 +94,7 @@ class Fingertip(Message):
     velocity_world_m_per_s: Vector3
     covariance: Matrix6 = Field(description="covariance of (position, velocity), m and m/s")
     predicted_path_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
-        description="predicted fingertip at the exposure and every prediction_step_s after it"
+        description="predicted fingertip at the exposure and every prediction_step_s after it, m"
     )
     prediction_step_s: Positive
     measured_world_m: Vector3
@@ -120,29 +119,33 @@ SheetReason = Literal[
     "past_sheet_height",
     "concave_contact",
 ]
-"""Why the sheet does not follow the finger; "concave_contact": it follows with a distance."""
+"""Why the sheet does not follow the finger; with "concave_contact" it follows at a distance."""
 
 
 class SheetTarget(Message):
-    """Command the sheet's pose at `valid_at_ns`, and its motion there.
+    """Target pose and velocity of the sheet at `valid_at_ns`.
 
-    The sheet frame sits at the sheet's centre: x from the left edge to the right, z towards the
-    user.  A consumer that uses it at another time adds twist times the difference.
+    The sheet frame is at the sheet's centre: x from the left edge to the right, z towards the user.
+    For another time, a consumer extrapolates by the twist.
     """
 
     phase: Phase
-    reason: SheetReason = Field(description='why the sheet holds or waits; otherwise "ok"')
-    valid_at_ns: Stamp = Field(description="on the clock of the header's stamps")
+    reason: SheetReason = Field(description='why the sheet stops or waits; otherwise "ok"')
+    valid_at_ns: Stamp = Field(
+        description="time of the target, on the clock of the header's stamps"
+    )
     world_from_sheet: Transform
-    twist_world: Vector6 = Field(description="linear (m/s) of the centre, then angular (rad/s)")
+    twist_world: Vector6 = Field(
+        description="linear velocity (m/s) of the centre, then angular velocity (rad/s)"
+    )
     stretch_ratio: Positive = Field(description="distance of the edges over the slack width")
-    contact_world_m: Vector3 = Field(description="point of the undeformed object that is presented")
+    contact_world_m: Vector3 = Field(description="contact point on the undeformed object")
     normal_world: Vector3
     contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
-    push_depth_m: NonNegative = Field(description="of the finger in the undeformed object")
+    push_depth_m: NonNegative = Field(description="depth of the finger in the undeformed object")
     normal_offset_m: Finite = Field(
         default=0.0,
-        description="distance of the sheet behind the object's tangent plane, at which it has the "
+        description="distance of the sheet behind the object's tangent plane, where it gives the "
         "object's force; negative: in front of it",
     )
 
@@ -150,48 +153,52 @@ class SheetTarget(Message):
 ArmMode = Literal[
     "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
 ]
-"""Mode of an arm; in "starting" the arm has not answered since its bridge was started."""
+"""Mode of an arm; "starting": no answer since the start of its bridge."""
 
 
 class ArmState(Message):
-    """One arm as its bridge sees it; the source stamp is when the joints were measured."""
+    """State of one arm; the source stamp is the time of the joint measurement."""
 
     side: Side
     mode: ArmMode
     faults: tuple[str, ...]
     ready: bool = Field(
         default=False,
-        description="it may move: it has been armed, and no interlock has disarmed it since",
+        description="true: the arm is armed and may move",
     )
     estop_engaged: bool = Field(
         default=False,
-        description="the bridge holds an e-stop; nothing moves, not even to slacken the sheet",
+        description="true: an e-stop is latched, and the arm does not move at all",
     )
-    reason: str = Field(default="", description="why it does not follow; empty otherwise")
+    reason: str = Field(
+        default="", description="why the arm does not follow the target; empty if it does"
+    )
     path_blocked: bool = Field(
         default=False,
-        description="it rests because no path to the sheet's target is clear and within its "
-        "limits; reason says what blocks it",
+        description="true: the arm rests because every path to the target is blocked; reason gives "
+        "the cause",
     )
     auto_arming: bool = Field(
-        default=False, description="it arms itself, without a person's command"
+        default=False, description="true: the arm arms itself without a command of the operator"
     )
     joints_rad: Vector6
     joints_commanded_rad: Vector6
     world_from_flange: Transform
     world_from_flange_commanded: Transform
-    command_age_s: NonNegative | None = Field(description="of the sheet target in use; None: none")
-    target_source_ns: Stamp = Field(
-        description="exposure of the picture behind that target; 0: none"
+    command_age_s: NonNegative | None = Field(
+        description="age of the sheet target in use; None: no target"
     )
-    command_sent_ns: Stamp = Field(description="when the newest command was written; 0: never")
-    edge_distance_m: NonNegative | None = Field(description="between both edges; None: unknown")
+    target_source_ns: Stamp = Field(description="exposure of the image behind that target; 0: none")
+    command_sent_ns: Stamp = Field(description="time of the newest command; 0: never")
+    edge_distance_m: NonNegative | None = Field(
+        description="distance between both edges; None: unknown"
+    )
     edge_force_n: NonNegative | None
     cycle_s: NonNegative = Field(description="duration of the last exchange with the arm")
 
 
 class Skin(Message):
-    """The soft body's skin at rest, once per object; triangles wind outwards."""
+    """Skin of the soft body at rest, published once per object; normals point outwards."""
 
     mesh_id: str
     vertices_world_m: Points3
@@ -206,34 +213,36 @@ class SoftBody(Message):
 
     mesh_id: str
     method: str
-    in_range: bool = Field(description="false: the push is outside the method's range")
+    in_range: bool = Field(description="false: the push is outside the method's range of validity")
     push_depth_m: NonNegative
-    force_world_n: Vector3 = Field(description="of the object on the finger")
-    stiffness_n_per_m: NonNegative = Field(description="of the object where the finger is")
+    force_world_n: Vector3 = Field(description="force of the object on the finger")
+    stiffness_n_per_m: NonNegative = Field(description="stiffness of the object at the finger")
     force_curve: ForceCurve = Field(
         default_factory=lambda: np.zeros((0, 2)),
-        description="of the object where the finger is, whether it touches or not: rows of depth "
-        "(m) and force (N), both from 0 and never falling; empty: not known",
+        description="force of the object at the finger, with or without contact: rows of depth (m) "
+        "and force (N), both from 0 and never falling; empty: unknown",
     )
     prediction_horizon_s: NonNegative = Field(
-        default=0.0, description="from the exposure to the predicted finger of this response"
+        default=0.0, description="time from the exposure to the predicted finger of this response"
     )
     displacement_world_m: Points3
 
 
 class Eye(Message):
-    """Where the user's eyes are, from whatever tracks his head; the scene's `eyes` without it."""
+    """Position of the user's eyes from a head tracker; without one, the scene's `eyes` are used."""
 
-    valid: bool = Field(description="false: not seen; the rest is the last that was")
-    centre_world_m: Vector3 = Field(description="midway between both eyes")
+    valid: bool = Field(
+        description="false: the eyes are not detected; the other fields are the last valid ones"
+    )
+    centre_world_m: Vector3 = Field(description="midpoint between both eyes")
     right_world: Vector3 = Field(
         default_factory=lambda: np.array([1.0, 0.0, 0.0]),
-        description="from the left eye to the right one, of any length but zero",
+        description="direction from the left to the right eye, of any length except zero",
     )
 
 
 class Display(Message):
-    """What the renderer shall show; latched, from console or experiment."""
+    """Settings of the renderer, from console or experiment; latched."""
 
     correction: Correction
     stereo: StereoMode
@@ -241,78 +250,85 @@ class Display(Message):
     shading: Shading = "soft"
     pattern: Pattern = Field(
         default="object",
-        description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
-        "line or a change; coordinate_ramp_x, coordinate_ramp_y: the object, coloured by the "
-        "position at which the eye should see it",
+        description="grid, checker, white: 300 mm square on the imaginary screen, with a line or "
+        "field every 20 mm; coordinate_ramp_x, coordinate_ramp_y: the object, coloured by its "
+        "position on the imaginary screen",
     )
-    marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
+    marks: bool = Field(default=True, description="draw marks at the target and at the fingertip")
     pixels_every: int = Field(
         default=0, ge=0, description="attach pixels to each nth frame; 0: none"
     )
-    label: str = Field(default="", description="copied into each frame drawn with these settings")
+    label: str = Field(
+        default="", description="label of each frame that is drawn with these settings"
+    )
 
 
 class Frame(Message):
-    """What the projector was given; the source stamp is the exposure behind what it shows."""
+    """Frame for the projector; the source stamp is the exposure behind its content."""
 
     number: int
     correction: Correction
     stereo: StereoMode
     label: str
-    eyes_world_m: EyePair = Field(description="left, right")
+    eyes_world_m: EyePair = Field(description="left and right eye, m")
     world_from_sheet: Transform
     pushed_point_world_m: Vector3
-    predicted_to_ns: Stamp = Field(description="the instant that the picture was drawn for")
+    predicted_to_ns: Stamp = Field(description="time for which the frame was drawn")
     draw_s: NonNegative
     late_frames: int = Field(
-        ge=0, description="whose light was later than predicted by more than half a frame"
+        ge=0, description="frames that were displayed more than half a period later than predicted"
     )
     eye: Literal["both", "left", "right"] = Field(
-        default="both", description="whose picture it is: one eye's, where frames alternate"
+        default="both", description="eye of the frame; left or right if frames alternate"
     )
-    drawn_ns: Stamp = Field(default=0, description="when the graphics card was through with it")
-    swapped_ns: Stamp = Field(default=0, description="when the window showed it; 0: no window did")
+    drawn_ns: Stamp = Field(
+        default=0, description="time when the graphics card had finished the frame"
+    )
+    swapped_ns: Stamp = Field(
+        default=0, description="time when the window showed the frame; 0: no window"
+    )
     light_ns: Stamp = Field(
-        default=0, description="the middle of its light, as measured; without a window: assumed"
+        default=0, description="middle of the display time, measured; without a window: assumed"
     )
     shaped_for_ns: Stamp = Field(
-        default=0, description="the instant whose finger dents the object; 0: it is at rest"
+        default=0,
+        description="time of the finger that deforms the object; 0: the object is at rest",
     )
     fingertip_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
         default_factory=lambda: np.zeros((0, 3)),
-        description="where the finger was taken to be at `predicted_to_ns`; none: not known",
+        description="predicted finger at `predicted_to_ns`, m; no row: unknown",
     )
     occluded_fraction: NonNegative = Field(
-        default=0.0, description="fraction of the sheet's visible area without light, in folds"
+        default=0.0, description="fraction of the sheet's visible area that folds keep unlit"
     )
     pixels: tuple[ColorImage, ...] = Field(
-        description="projector images, top row first: none, one (mono or packed)"
+        description="projector images, top row first: none, or one (mono or packed stereo)"
     )
 
 
 class EStop(Message):
-    """Emergency stop by software.  Bridges latch it; `engaged` false clears it, at rest only."""
+    """Emergency stop by software, which bridges latch; `engaged` false resets it at rest."""
 
     engaged: bool
     reason: str
 
 
 class Recording(Message):
-    """Whether a recorder that waits for it is to record; each start opens a bag of its own."""
+    """Start or stop of a recording, for recorders with `start_paused`; a start opens a new bag."""
 
     running: bool
 
 
 class Bookmark(Message):
-    """Mark a time to find again in a bag; the source stamp is that time."""
+    """Marked time in a bag, which is the source stamp."""
 
     label: str = Field(max_length=200)
 
 
 class Arming(Message):
-    """A person's word that the arms may move (or, false, shall stop and let the sheet go).
+    """Operator's command to arm the arms, or (`ready` false) to stop them and relax the sheet.
 
-    After whatever has stopped them they stay where they are until somebody says so again.
+    After any stop the arms rest until the next command.
     """
 
     ready: bool
@@ -320,53 +336,61 @@ class Arming(Message):
 
 
 class PortStatus(MessagePart):
-    """One input or output of a node over the last second and since its start."""
+    """Statistics of one port of a node: rate over the last second, counts since its start."""
 
     topic: str
     rate_hz: NonNegative
-    age_s: NonNegative | None = Field(description="of the newest message, from its source stamp")
+    age_s: NonNegative | None = Field(description="age of the newest message by its source stamp")
     messages: int = Field(ge=0)
-    dropped: int = Field(ge=0, description="superseded or overflown before the node saw them")
-    gaps: int = Field(ge=0, description="lost on the way, by sequence numbers")
-    rejected: int = Field(ge=0, description="malformed or of another type")
+    dropped: int = Field(
+        ge=0, description="messages superseded, or lost by an overflow, before the node read them"
+    )
+    gaps: int = Field(ge=0, description="messages lost in transport, by sequence numbers")
+    rejected: int = Field(ge=0, description="messages that are malformed or of another type")
 
 
 class ClockEcho(MessagePart):
-    """The newest ping that came from another clock."""
+    """Newest ping from another clock."""
 
     clock_id: str
-    sent_ns: int = Field(ge=0, description="its publish stamp, on its own clock")
-    received_ns: int = Field(ge=0, description="on the clock of this message's header")
+    sent_ns: int = Field(ge=0, description="publish stamp of the ping, on its own clock")
+    received_ns: int = Field(
+        ge=0, description="time of its arrival, on the clock of this message's header"
+    )
 
 
 class ClockPing(Message):
-    """From each host's clock node to the others; with the header's publish stamp and the moment of
-    its arrival, an echo in it is a ping of four stamps."""
+    """Ping between the clock nodes of two hosts.
+
+    An echo, the header's publish stamp and the time of arrival are the four stamps of a round trip.
+    """
 
     echoes: tuple[ClockEcho, ...]
 
 
 class ClockOffset(MessagePart):
-    """What another clock shows, less the clock of the header, when that shows `at_ns`."""
+    """Time of another clock minus that of the header's clock, at `at_ns` of the latter."""
 
     clock_id: str
     at_ns: int = Field(ge=0)
     offset_ns: int
-    uncertainty_s: NonNegative = Field(description="it is surely within so much of that")
-    drift_ratio: Finite = Field(description="by how much it gains on the header's clock")
-    resets: int = Field(ge=0, description="how often it was found to have been stepped")
+    uncertainty_s: NonNegative = Field(description="maximum error of the offset")
+    drift_ratio: Finite = Field(description="rate of the other clock over the header's, minus one")
+    resets: int = Field(ge=0, description="number of detected steps of the clock")
 
 
 class Clocks(Message):
-    """What a host's clock node knows of the other clocks, for the nodes of its host."""
+    """Offsets of the other clocks, from a host's clock node for the nodes of that host."""
 
-    max_offset_uncertainty_s: Positive = Field(description="beyond it no arm moves")
-    max_drift_ratio: Positive = Field(description="by how much a clock may gain on another")
+    max_offset_uncertainty_s: Positive = Field(
+        description="limit of the uncertainty above which no arm moves"
+    )
+    max_drift_ratio: Positive = Field(description="maximum relative rate between two clocks")
     offsets: tuple[ClockOffset, ...]
 
 
 class Status(Message):
-    """How a node is; each node sends one a second."""
+    """State of a node, published once per second."""
 
     node: str
     state: Literal["starting", "running", "degraded", "stopping"]
@@ -378,80 +402,81 @@ class Status(Message):
     outputs: tuple[PortStatus, ...]
     errors: int = Field(ge=0)
     last_error: str
-    note: str = Field(description="what the node itself wants to say, one line")
+    note: str = Field(description="note of the node, one line")
     plan_hash: str
     clock_id: str = ""
     clock_offsets: tuple[ClockOffset, ...] = Field(
-        default=(), description="of the other clocks that it hears, as it knows them"
+        default=(), description="measured offsets of the other clocks"
     )
     execution_log: Annotated[NDArray[np.int64], ArraySpec("<i8", ("steps", 4))] = Field(
         default_factory=lambda: np.zeros((0, 4), np.int64),
-        description="handler calls since the last status (in the first seconds: since the "
-        "start), in order, for `bag verify`. Columns: input, counted from 0, or timer, -1, -2, "
-        "...; the message's sequence; its writer's epoch; time of the call, ns",
+        description="handler calls since the last status (in the first seconds: since the start) "
+        "in order, for `bag verify`. Columns: input from 0, or timer -1, -2, ...; sequence of the "
+        "message; epoch of its writer; time of the call, ns",
     )
 
 
 class NodeProcess(MessagePart):
-    """A node as its launcher knows it."""
+    """State of a node's process, from its launcher."""
 
     name: str
     state: Literal["starting", "ready", "exited"] = Field(
-        description="exited: it has ended, and is restarted unless it may not"
+        description="exited: the process has ended; it is restarted if that is allowed"
     )
     restarts: int = Field(ge=0)
-    hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
+    hangs: int = Field(ge=0, description="restarts because of a missing heartbeat")
 
 
 class HostKey(MessagePart):
-    """A host's public key, as another one knows it."""
+    """Public key of a host, as another host has it."""
 
     host: str
     key: str
 
 
 class ProgramCpu(MessagePart):
-    """The processor time of all processes of one name."""
+    """Processor time of all processes with one name."""
 
-    name: str = Field(description="of the node, for nodes of the graph; else the program's")
-    cores: NonNegative = Field(description="processor time over time passed")
+    name: str = Field(description="name of the node, or of another program")
+    cores: NonNegative = Field(description="processor time over elapsed time")
 
 
 class CpuPressure(MessagePart):
-    """How long the nodes of a computer were ready to run while no processor was free.
+    """Waiting time of a computer's nodes for a free processor, over the last seconds.
 
-    Over the last seconds, of the nodes that do not give way to all others (`nice` below 10).
+    It covers nodes with a `nice` value below 10.
     """
 
     busy: bool = Field(description="`wait_ratio` is above a quarter")
-    wait_ratio: NonNegative = Field(
-        description="of the node that waited longest: time ready to run but not running, over time"
-    )
-    node: str = Field(description="that node")
+    wait_ratio: NonNegative = Field(description="largest waiting time of a node over elapsed time")
+    node: str = Field(description="node with this waiting time")
     programs: tuple[ProgramCpu, ...] = Field(
-        default=(), description="while busy: those that take most, the largest first"
+        default=(),
+        description="programs with most processor time, the largest first; only while busy",
     )
 
 
 class HostStatus(Message):
-    """How a computer is, from its launcher, once a second."""
+    """State of a computer, published by its launcher once per second."""
 
     host: str
-    run: str = Field(description="the run's identity")
+    run: str = Field(description="identifier of the run")
     plan_hash: str
-    code: str = Field(description="commit of the code, with + where it was changed since")
+    code: str = Field(description="commit of the code; + marks local changes")
     python: str
     uptime_s: NonNegative
-    load_ratio: NonNegative = Field(description="of the last minute, over the number of cores")
-    disk_free_bytes: int = Field(ge=0, description="where bags go, or in the working folder")
+    load_ratio: NonNegative = Field(description="load of the last minute over the number of cores")
+    disk_free_bytes: int = Field(ge=0, description="free space for bags, or in the working folder")
     memory_free_bytes: int = Field(ge=0)
     nodes: tuple[NodeProcess, ...]
-    missing_devices: tuple[str, ...] = Field(description="what its nodes name and is not there")
-    software: str = Field(default="", description="versions of what the hosts must agree about")
-    keys: tuple[HostKey, ...] = Field(default=(), description="which hosts it lets in")
-    estop: str | None = Field(default=None, description="reason of the e-stop that it keeps")
+    missing_devices: tuple[str, ...] = Field(description="missing devices of its nodes")
+    software: str = Field(
+        default="", description="versions of software that must agree between hosts"
+    )
+    keys: tuple[HostKey, ...] = Field(default=(), description="keys of the hosts that it accepts")
+    estop: str | None = Field(default=None, description="reason of the latched e-stop; None: none")
     cpu: CpuPressure | None = Field(
-        default=None, description="None: its system does not measure it, or no node runs yet"
+        default=None, description="None: the system does not measure it, or no node runs yet"
     )
 
 
@@ -459,29 +484,31 @@ PathJoin = Literal["rounded_lines", "spline"]
 
 
 class FingerPath(Message):
-    """A path for the twin's finger, from now on: it eases from where it is to the first point."""
+    """Path for the simulated finger, which first moves smoothly to the first point."""
 
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
     positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
-    wander_m: NonNegative = Field(description="standard deviation of slow human error")
+    wander_m: NonNegative = Field(description="standard deviation of the slow human error")
     tremor_m: NonNegative = Field(description="amplitude of 8-12 Hz tremor")
     joined_by: PathJoin = Field(
         default="rounded_lines",
-        description="rounded_lines: the points are corners, rounded over +-40 ms; spline: they are "
-        "samples of a smooth motion that begins and ends at rest",
+        description="rounded_lines: points are corners, rounded over +-40 ms; spline: points "
+        "are samples of a smooth motion that begins and ends at rest",
     )
     stroke_s: Positive | None = Field(
-        default=None, description="moving time, if the path is a stroke of the experiment"
+        default=None, description="duration of motion, if the path is a stroke of the experiment"
     )
 
 
 class TwinFinger(Message):
-    """The true fingertip at the source stamp."""
+    """True fingertip at the source stamp."""
 
     path_label: str
     path_done: bool
-    path_time_s: Finite = Field(description="since the path began; negative while easing to it")
+    path_time_s: Finite = Field(
+        description="time since the start of the path; negative on the way to it"
+    )
     path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
@@ -497,10 +524,10 @@ class TwinArms(Message):
 
 
 class TwinEye(Message):
-    """What a measuring camera at V sees of the projected image, and what it ought to see."""
+    """Image of a measuring camera at V, and the expected image."""
 
     label: str
     correction: Correction
-    metres_per_px: Positive = Field(description="of the picture, on the imaginary screen")
+    metres_per_px: Positive = Field(description="size of a pixel on the imaginary screen")
     seen: ColorImage
     expected: ColorImage

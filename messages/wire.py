@@ -1,4 +1,4 @@
-"""How a message looks on a socket and in a bag: a header frame, then large arrays as raw frames.
+"""Encode and decode messages: a header frame, then large arrays as raw frames.
 
 The header frame is one msgpack array of eleven elements:
 
@@ -6,19 +6,18 @@ The header frame is one msgpack array of eleven elements:
     type         name of the message's class
     fingerprint  8 bytes of its JSON Schema's hash, see `flexsheet.messages.base.schema_fingerprint`
     sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
-    fields       a map; parts are maps, tuples are arrays, numpy arrays are extension types:
+    fields       a map; nested parts are maps, tuples arrays, numpy arrays extension types:
                  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
                  type 2  dtype and shape only; the elements are the next frame
 
-dtype and shape are: one byte that counts into `DTYPES`, one byte for the number of axes, two zero
-bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight, so that elements stay
-aligned.  Elements are little-endian and in C order.
+dtype and shape are: one byte with the index in `DTYPES`, one byte for the number of axes, two zero
+bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight for the alignment of the
+elements.  Elements are little-endian and in C order.
 
-Large arrays are neither copied by `encode` nor by `decode`: a sender must leave an array alone once
-it is in a message, and a receiver gets read-only views on the memory that came from the socket.
-Small ones are cheaper to copy than to send apart (`benchmarks/messaging.py` measures both).
-Equal messages with equal headers have equal bytes.  "flexsheet/1", which old bags hold, is the same
-without `plan`.
+`encode` and `decode` do not copy large arrays.  A sender must not change an array that is in a
+message, and a receiver gets read-only views of the memory from the socket.  Copying small arrays is
+faster than sending them separately (`benchmarks/messaging.py`).  Equal messages with equal headers
+have equal bytes.  The protocol "flexsheet/1" of old bags is the same without `plan`.
 """
 
 from __future__ import annotations
@@ -50,27 +49,26 @@ DTYPES = tuple(
 )
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
-HEADER_BYTES_MAX = 1 << 20
-"""Largest header frame; larger arrays have frames of their own.  Its smallest values, a byte each,
-take up to 64 times as much memory as objects."""
+MAX_HEADER_BYTES = 1 << 20
+"""Maximum size of the header frame, since decoded values need up to 64 times as much memory."""
 
-ELEMENTS_MAX = 4096
-"""Most elements of an array or a map in the header.  A decoder allocates the announced length
-before it reads the elements, and arrays can be nested."""
+MAX_ELEMENTS = 4096
+"""Maximum number of elements of an array or a map in the header.  A decoder allocates the stated
+length before it reads the elements, and arrays can be nested."""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
 _BUFFERS = (bytes, memoryview)
 _MAX_INTEGER = 2**63 - 1
-# The constructor of ExtType checks what is right by construction, for half the time of all.
+# The constructor of ExtType takes half the time of `encode` for checks that always succeed here.
 _extension = tuple.__new__
 
 
 class WireError(FlexsheetError, ValueError):
-    """Bytes that are not the message that was expected, or a message that has no bytes.
+    """An invalid or unexpected message, or one that cannot be encoded.
 
-    `cause` is a word for counting: "malformed", "type", "fingerprint", "frames", "size" or "field";
-    a subscriber refuses more: "writer", "plan", "replayed" or "forbidden".
+    cause: "malformed", "type", "fingerprint", "frames", "size" or "field"; from a subscriber also
+        "writer", "plan", "replayed" or "forbidden".
     """
 
     code = "wire"
@@ -82,7 +80,7 @@ class WireError(FlexsheetError, ValueError):
 
 
 class Codec:
-    """What encoding and decoding need to know of one message type."""
+    """Name, fingerprint and validator of one message type."""
 
     __slots__ = ("fingerprint", "name", "type", "validate")
 
@@ -93,7 +91,7 @@ class Codec:
         self.validate = message_type.__pydantic_validator__.validate_python
 
 
-codec_of = cache(Codec)
+get_codec = cache(Codec)
 
 
 def encode(
@@ -103,10 +101,9 @@ def encode(
     max_bytes: int | None = None,
     inline_bytes: int = INLINE_BYTES,
 ) -> list[Buffer]:
-    """The frames of a message; raises WireError where it is larger than `max_bytes`.
+    """Encode a message as frames; raises WireError if it is larger than `max_bytes`.
 
-    `inline_bytes`: arrays up to this size travel in the header frame.  Every reader understands
-    every value; bags and sockets use the one default.
+    inline_bytes: maximum size of arrays in the header frame; decoders accept any value.
     """
     frames: list[Buffer] = [b""]
 
@@ -120,9 +117,9 @@ def encode(
             return _extension(ExtType, (_FRAME, what))
         if isinstance(value, BaseModel):
             return value.__dict__
-        raise TypeError(f"{type(value).__name__} has no form on the wire")
+        raise TypeError(f"{type(value).__name__} cannot be encoded")
 
-    codec = codec_of(type(message))
+    codec = get_codec(type(message))
     try:
         frames[0] = Packer(default=pack).pack(
             (
@@ -141,15 +138,15 @@ def encode(
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError("field", f"{type(message).__name__} cannot be encoded: {error}") from error
-    if max_bytes is not None and size_of(frames) > max_bytes:
-        raise _too_large(frames, max_bytes, codec.name)
-    if len(frames[0]) > HEADER_BYTES_MAX:
-        raise _too_much_header(frames)
+    if max_bytes is not None and count_bytes(frames) > max_bytes:
+        raise _message_size_error(frames, max_bytes, codec.name)
+    if len(frames[0]) > MAX_HEADER_BYTES:
+        raise _header_size_error(frames)
     return frames
 
 
 class Envelope:
-    """A message whose header frame is read and checked, its fields not yet validated."""
+    """Message with a checked header, whose fields are not yet validated."""
 
     __slots__ = ("codec", "fields", "header")
 
@@ -157,7 +154,7 @@ class Envelope:
         self.codec, self.header, self.fields = codec, header, fields
 
     def open(self) -> Message:
-        """The validated message; raises WireError with the fields that are wrong."""
+        """Validate the message; raises WireError that names the first invalid field."""
         try:
             return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
         except ValidationError as error:
@@ -171,48 +168,54 @@ def read_envelope(
     fingerprint: bytes | None = None,
     type_name: str | None = None,
 ) -> Envelope:
-    """Check everything but the values of the fields; raises WireError.
+    """Check and decode a message except the values of its fields; raises WireError.
 
     frames: buffers (bytes, memoryview, zmq.Frame), header first.
-    expected: the topic, whose size limit then holds, or the type alone.
-    fingerprint, type_name: of the type as it was recorded; None: as it is today.
+    expected: the topic with its size limit, or only the type.
+    fingerprint, type_name: of a recorded type; None: of the current type.
     """
     if isinstance(expected, Topic):
-        codec = codec_of(expected.message)
+        codec = get_codec(expected.message)
         if sum(map(len, frames)) > expected.max_bytes:
-            raise _too_large(frames, expected.max_bytes, f'topic "{expected.name}"')
+            raise _message_size_error(frames, expected.max_bytes, f'topic "{expected.name}"')
     else:
-        codec = codec_of(expected)
-    wanted = codec.fingerprint if fingerprint is None else fingerprint
+        codec = get_codec(expected)
+    expected_fingerprint = codec.fingerprint if fingerprint is None else fingerprint
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
-        raise WireError("malformed", "not a message of flexsheet: no header of eleven elements")
-    protocol, name, carried, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
+        raise WireError(
+            "malformed", "not a flexsheet message: the header does not have eleven elements"
+        )
+    protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
-            "malformed", f"speaks {_shown(protocol)}, wanted {PROTOCOL}: not a flexsheet node?"
+            "malformed", f"expected protocol {PROTOCOL}, found {_format_value(protocol)}"
         )
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]
-    # An array may stand anywhere, and is neither equal nor unequal to anything.
+    # Any element may be an array, whose comparison would not be a bool.
     if type(name) is not str or name != (type_name or codec.name):
-        raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
-    if type(carried) is not bytes or carried != wanted:
+        raise WireError("type", f"expected type {codec.name}, found {_format_value(name)}")
+    if type(found) is not bytes or found != expected_fingerprint:
         raise WireError(
             "fingerprint",
-            f"{codec.name} of another version: fingerprint {_shown(carried)}, "
-            f"here {wanted.hex()}; both ends must run the same code",
+            f"{codec.name}: expected fingerprint {expected_fingerprint.hex()}, "
+            f"found {_format_value(found)}; run the same version on both hosts",
         )
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:
-            raise WireError("malformed", f"a stamp or number in the header is {_shown(number)}")
+            raise WireError(
+                "malformed", f"invalid stamp or number in the header: {_format_value(number)}"
+            )
     for text in (clock_id, writer, plan):
         if type(text) is not str or len(text) > NAME_LENGTH:
-            raise WireError("malformed", f"a name in the header is {_shown(text)}")
+            raise WireError("malformed", f"invalid name in the header: {_format_value(text)}")
     if not (clock_id and writer):
-        raise WireError("malformed", "neither clock nor writer may be without a name")
+        raise WireError("malformed", "the name of the clock or of the writer is empty")
     if type(fields) is not dict:
-        raise WireError("malformed", f"the fields of {codec.name} are {_shown(fields)}")
+        raise WireError(
+            "malformed", f"the fields of {codec.name} are not a map: {_format_value(fields)}"
+        )
     header = Header(sequence, source, publish, clock_id, writer, epoch, plan)
     return Envelope(codec, header, fields)
 
@@ -222,18 +225,18 @@ def decode(frames: Sequence[Any], expected: type[M]) -> tuple[M, Header]: ...
 @overload
 def decode(frames: Sequence[Any], expected: Topic) -> tuple[Message, Header]: ...
 def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Message, Header]:
-    """The validated message and its header; whatever is wrong raises WireError and nothing else."""
+    """Decode and validate a message and its header; raises WireError for any invalid bytes."""
     envelope = read_envelope(frames, expected)
     return envelope.open(), envelope.header
 
 
-def size_of(frames: Sequence[Any]) -> int:
-    """Bytes of all frames together."""
+def count_bytes(frames: Sequence[Any]) -> int:
+    """Return the size of all frames together."""
     return sum(map(len, frames))
 
 
 def _unpack(frames: Sequence[Any]) -> Any:
-    """The header frame's value, with its arrays; each further frame must be used exactly once."""
+    """Decode the header frame with its arrays; each further frame must be used exactly once."""
     used = 0
 
     def unpack(code: int, data: bytes) -> NDArray[Any]:
@@ -241,55 +244,59 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if code not in (_INLINE, _FRAME):
             raise WireError("malformed", f"unknown extension type {code} in the header")
         if len(data) < 8:
-            raise WireError("malformed", "an array without dtype and shape")
+            raise WireError("malformed", "an array has neither dtype nor shape")
         dtype, shape, offset, size = _read_dtype_and_shape(data[: (4 * data[1] + 11) & ~7])
         if code == _INLINE:
             if len(data) - offset != size:
-                raise _wrong_size(len(data) - offset, size, dtype, shape)
+                raise _array_size_error(len(data) - offset, size, dtype, shape)
             return ndarray(shape, dtype, data, offset)
         used += 1
         if len(data) != offset or used >= len(frames):
-            raise WireError("frames", f"an array's frame is missing: got {len(frames)} frames")
+            raise WireError(
+                "frames", f"the frame of an array is missing; found {len(frames)} frames"
+            )
         view = _read_only(frames[used])
         if len(view) != size:
-            raise _wrong_size(len(view), size, dtype, shape)
-        # frombuffer, because an array made from the view by its constructor can be unlocked again.
+            raise _array_size_error(len(view), size, dtype, shape)
+        # frombuffer, because an array from the constructor could be made writeable again.
         return np.frombuffer(view, dtype).reshape(shape)
 
     if not frames:
-        raise WireError("frames", "a message without frames")
+        raise WireError("frames", "the message has no frames")
     try:
-        # A zmq.Frame is no buffer to msgpack; its bytes are.
+        # msgpack accepts the buffer of a zmq.Frame, not the frame.
         first = frames[0] if isinstance(frames[0], _BUFFERS) else frames[0].buffer
-        if len(first) > HEADER_BYTES_MAX:
-            raise _too_much_header(frames)
+        if len(first) > MAX_HEADER_BYTES:
+            raise _header_size_error(frames)
         unpacked = unpackb(
             first,
             ext_hook=unpack,
             use_list=False,
-            max_array_len=ELEMENTS_MAX,
-            max_map_len=ELEMENTS_MAX,
+            max_array_len=MAX_ELEMENTS,
+            max_map_len=MAX_ELEMENTS,
         )
     except WireError:
         raise
-    # Foreign bytes make msgpack raise ValueError, TypeError, struct.error and more.
+    # For invalid bytes msgpack raises ValueError, TypeError, struct.error and others.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"[:200]
-        raise WireError("malformed", f"not a message of flexsheet: {reason}") from error
+        raise WireError("malformed", f"not a flexsheet message: {reason}") from error
     if used != len(frames) - 1:
-        raise WireError("frames", f"got {len(frames)} frames, the header speaks of {used + 1}")
+        raise WireError("frames", f"expected {used + 1} frames by the header, found {len(frames)}")
     return unpacked
 
 
-def _too_much_header(frames: Sequence[Any]) -> WireError:
+def _header_size_error(frames: Sequence[Any]) -> WireError:
     return WireError(
-        "size", f"a header of {len(frames[0])} bytes, at most {HEADER_BYTES_MAX} are allowed"
+        "size", f"header of {len(frames[0])} bytes, at most {MAX_HEADER_BYTES} are allowed"
     )
 
 
-def _wrong_size(got: int, wanted: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> WireError:
+def _array_size_error(
+    found: int, expected: int, dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> WireError:
     return WireError(
-        "frames", f"an array of {dtype} and shape {shape} needs {wanted} bytes, got {got}"
+        "frames", f"array of {dtype} and shape {shape}: expected {expected} bytes, found {found}"
     )
 
 
@@ -303,40 +310,40 @@ def _read_only(frame: Any) -> Buffer:
 @lru_cache(maxsize=1024)
 def _dtype_and_shape(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     if dtype.str not in _DTYPE_CODES:
-        raise TypeError(f"arrays of {dtype.str} have no form on the wire")
+        raise TypeError(f"arrays of {dtype.str} cannot be encoded")
     head = struct.pack(f"<BBxx{len(shape)}I", _DTYPE_CODES[dtype.str], len(shape), *shape)
     return head + bytes(-len(head) % 8)
 
 
 @lru_cache(maxsize=1024)
 def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, int]:
-    """dtype, shape, length of `head`, and bytes of the elements."""
+    """Return dtype, shape, length of `head`, and size of the elements in bytes."""
     code, axes = head[0], head[1]
     if code >= len(DTYPES) or axes > 8 or len(head) != (4 * axes + 11) & ~7:
-        raise WireError("malformed", f"no dtype and shape: {head[:16].hex()}")
+        raise WireError("malformed", f"invalid dtype or shape: {head[:16].hex()}")
     shape = struct.unpack_from(f"<{axes}I", head, 4)
     return DTYPES[code], shape, len(head), DTYPES[code].itemsize * prod(shape)
 
 
-def _too_large(frames: Sequence[Any], max_bytes: int, what: str) -> WireError:
+def _message_size_error(frames: Sequence[Any], max_bytes: int, what: str) -> WireError:
     return WireError(
         "size",
-        f"{what}: message of {size_of(frames)} bytes, at most {max_bytes} are allowed",
+        f"{what}: message of {count_bytes(frames)} bytes, at most {max_bytes} are allowed",
     )
 
 
 def _describe(error: ValidationError, name: str) -> str:
-    """The first wrong field, in one sentence; foreign values themselves are not repeated."""
+    """Describe the first invalid field without its value."""
     details = error.errors(include_url=False, include_input=False, include_context=False)
     where = ".".join(str(step) for step in details[0]["loc"]) or "message"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     return f"{name}.{where[:NAME_LENGTH]}: {details[0]['msg'][:NAME_LENGTH]}{more}"
 
 
-def _shown(value: object) -> str:
-    """A foreign value, cut short for a sentence; of one that holds others its kind alone.
+def _format_value(value: object) -> str:
+    """Describe a received value, truncated; for a container only its type.
 
-    What is nested deeply has no repr.
+    Deeply nested values would break `repr`.
     """
     if isinstance(value, bytes):
         return repr(value[:60].hex())[:60]

@@ -43,7 +43,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import ArmState, PortStatus, Status
 from flexsheet.nodes import NodeRole
 
@@ -323,7 +323,7 @@ class Node:
             epoch = self.started_ns
         declared = find_ports(type(self))
         for port in declared.values():
-            topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
+            topic = find_topic((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
                     f"{name}.{port.name}: expected a topic of {port.message.__name__}, "
@@ -344,7 +344,7 @@ class Node:
                 setattr(self, port.name, self.outputs[port.name])
         for further, topic_name in (topics or {}).items():
             if further not in declared:
-                self.inputs[further] = Input(topic_named(topic_name), clock)
+                self.inputs[further] = Input(find_topic(topic_name), clock)
         self._mailboxes = {
             port: Mailbox(self, port)
             for port in self.inputs
@@ -382,7 +382,7 @@ class Node:
     def _localise(self, message: Message, header: Header) -> tuple[Message, Header, str]:
         if self.measures_clocks:
             return message, header, ""
-        return self.clock_table.localised(message, header, self.clock.now_ns())
+        return self.clock_table.localize(message, header, self.clock.now_ns())
 
     async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
         """Pass a message with stamps of this clock to its input, and await its handler."""

@@ -26,7 +26,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.security import KeyRing, SecurityError
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.log_limit import RepeatLimiter
@@ -89,7 +89,7 @@ class NodeTransport:
     def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
             if output.endpoints:
-                topic = topic_named(output.topic)
+                topic = find_topic(output.topic)
                 endpoints = [str(one) for one in output.endpoints]
                 on_refused = self._make_refusal_handler(node.outputs[output.port].counts, topic)
                 self._publishers[topic.name] = Publisher(
@@ -108,7 +108,7 @@ class NodeTransport:
     def open_inputs(self, node: Node) -> None:
         if self._config.clocks is not None:
             subscriber = Subscriber(
-                topic_named(self._config.clocks.topic),
+                find_topic(self._config.clocks.topic),
                 self._config.clocks.endpoints,
                 lambda clocks, _: node.clock_table.update(clocks),
                 PortCounts(),
@@ -129,7 +129,7 @@ class NodeTransport:
                 deliver_to(config.port),
                 node_input.counts,
                 on_problem=partial(self._report_problem, node),
-                unopened=node.takes_frames,
+                raw=node.takes_frames,
                 keys=self.keys,
                 # The status of nodes with another plan must be accepted.
                 plan=None

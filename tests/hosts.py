@@ -10,8 +10,8 @@ from pathlib import Path
 
 from flexsheet.messages.security import (
     KeyRing,
+    derive_public_key,
     new_key_pair,
-    public_of,
     read_secret,
     write_ring,
     write_secret,
@@ -25,13 +25,13 @@ class Hosts:
         self.folder, self.names = folder, names
         for name in (*names, "stranger"):
             self.make_key(name)
-        self.public = {name: self.public_of(name) for name in names}
+        self.public = {name: self.derive_public_key(name) for name in names}
 
     def secret_file(self, name: str) -> Path:
         return self.folder / f"{name}.secret"
 
-    def public_of(self, name: str) -> str:
-        return public_of(read_secret(self.secret_file(name)))
+    def derive_public_key(self, name: str) -> str:
+        return derive_public_key(read_secret(self.secret_file(name)))
 
     def make_key(self, name: str) -> str:
         public, secret = new_key_pair()
@@ -42,7 +42,11 @@ class Hosts:
         """What a host's processes read.  A stranger stands in his own beside the others, not in
         theirs."""
         file = self.folder / f"keys-{name}.json"
-        public = self.public if name in self.names else self.public | {name: self.public_of(name)}
+        public = (
+            self.public
+            if name in self.names
+            else self.public | {name: self.derive_public_key(name)}
+        )
         write_ring(file, host=name, secret_file=self.secret_file(name), public=public)
         return file
 

@@ -32,9 +32,9 @@ from flexsheet.launch.running.runs import ROOT_VARIABLE, Run
 from flexsheet.launch.running.tools import GraphWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
-from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.security import new_key_pair, write_secret
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, FingerPath, HostStatus, TwinFinger
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.node import PortCounts
@@ -118,7 +118,7 @@ def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
     """Strokes around the scene's cylinder, back and forth without a rest; they end at the top."""
     times = np.linspace(0.0, count * STROKE_S, round(count * STROKE_S * STROKE_POINTS_HZ) + 1)
     angles = 0.5 * STROKE_ANGLE_RAD * (1.0 - np.cos(np.pi * times / STROKE_S))
-    radius = cylinder_of(scene).radius_m
+    radius = require_cylinder(scene).radius_m
     points = np.column_stack([0.0 * angles, radius * np.sin(angles), radius * np.cos(angles)])
     return FingerPath(
         label=STROKES,
@@ -281,7 +281,7 @@ class Lab:
                 for writer in plan.writers[topic]
                 if writer.host == host and writer.name != "tools"
             ]
-            subscriber = Subscriber(topic_named(topic), ends, self._take(topic, host), PortCounts())
+            subscriber = Subscriber(find_topic(topic), ends, self._take(topic, host), PortCounts())
             subscriber.start()
             subscribers.append(subscriber)
         self._subscribers[host] = subscribers

@@ -480,7 +480,7 @@ async def test_without_a_scene_the_node_waits() -> None:
     )
     await node.setup()
     await node.cycle()
-    assert node.note == "waits for a scene"
+    assert node.note == "waiting for a scene"
     assert not any(isinstance(message, ArmState) for message in sent)
     await node.close()
 

@@ -194,7 +194,7 @@ async def test_a_status_that_is_repeated_makes_no_arm_leap(
         ("slow", "no answer"),
         ("exception", "Modbus exception 4"),
         ("bad_crc", "fails its CRC"),
-        ("old_version", "register map version 0, wanted 1"),
+        ("old_version", "register map version 0, expected 1"),
         ("repeated", "answer to command"),
     ],
 )

@@ -17,7 +17,7 @@ import pytest
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Source, Subscriber
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, Clocks, Status
 from flexsheet.nodes.node import PortCounts
 from flexsheet.nodes.runner import NodeConfig, PortConfig
@@ -185,7 +185,7 @@ async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple
             ]
             for topic, file, take in heard:
                 subscribers.append(
-                    Subscriber(topic_named(topic), [f"ipc://{folder}/{file}"], take, PortCounts())
+                    Subscriber(find_topic(topic), [f"ipc://{folder}/{file}"], take, PortCounts())
                 )
                 subscribers[-1].start()
             await until(lambda: "none" not in watch.modes() and len(watch.clocks) == len(AHEAD_S))

@@ -124,7 +124,7 @@ def test_where_waiting_is_not_measured_the_load_decides() -> None:
     assert not is_busy(host(load_ratio=1.4))
     assert describe_busy(host(load_ratio=1.4)) == ""
     assert describe_busy(host(load_ratio=8.14)) == (
-        "the computer main is busy: 8.1 processes per core want to run"
+        "the computer main is busy: 8.1 runnable processes per core"
     )
 
 

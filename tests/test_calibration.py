@@ -245,14 +245,14 @@ def without(key: str) -> Callable[[str], str]:
     [
         (
             lambda text: text.replace("version: 2", "version: 1", 1),
-            "version: 1, this program reads 2; calibrate again",
+            "version: expected 2, found 1; calibrate again",
         ),
-        (without("version"), 'no key "version"'),
+        (without("version"), 'does not contain the key "version"'),
         (without("device"), "device: Field required"),
         (lambda text: text + "\nflavour: salt\n", "flavour: Extra inputs"),
         (lambda text: text.replace("width_px: 480", "width_px: wide"), "width_px: .*valid integer"),
         (lambda text: text[: len(text) // 3] + "\n{", "not YAML"),
-        (lambda text: "", 'no key "version"'),
+        (lambda text: "", 'does not contain the key "version"'),
     ],
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
 )

@@ -447,7 +447,7 @@ def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> No
     for old, new, said in (
         ("device: twin-bumblebee", "device: other", 'is of device "other", the scene\'s camera'),
         ("width_px: 640", "width_px: 320", "is for 320x480 px"),
-        ("version: 2", "version: 1", "this program reads 2; calibrate again"),
+        ("version: 2", "version: 1", "version: expected 2, found 1; calibrate again"),
     ):
         (tmp_path / "foreign.yaml").write_text(shipped.replace(old, new))
         with pytest.raises(BadInputError, match=said) as refused:

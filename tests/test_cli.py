@@ -395,7 +395,10 @@ def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path:
     bare = tmp_path / "bare.mcap"
     with BagWriter(bare):
         pass
-    assert 'no attachment "plan.json"' in flexsheet("bag", "verify", "listener", bare).err
+    assert (
+        'does not contain the attachment "plan.json"'
+        in flexsheet("bag", "verify", "listener", bare).err
+    )
     assert flexsheet("bag", "info", tmp_path / "no.mcap").code == 1
 
 

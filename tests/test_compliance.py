@@ -140,7 +140,7 @@ def test_a_stiffer_object_is_said_to_be_and_by_how_much() -> None:
     shown = compliance(soft_curve(4.0))
     assert "stiffer than the sheet can present" in shown.note
     assert "15 to 22 %" in shown.note
-    at = int(np.argmin(shown.centre.force_n - shown.centre.wanted_n))
+    at = int(np.argmin(shown.centre.force_n - shown.centre.object_force_n))
     error = -100 * shown.centre.error_ratio[at]
     assert f"{error:.0f} % too soft at {1e3 * shown.centre.depths_m[at]:.0f} mm" in shown.note
 

@@ -24,7 +24,7 @@ from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Bookmark, EStop, FingerPath, Recording, TwinFinger
 from flexsheet.nodes.node import PortCounts
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
@@ -73,7 +73,7 @@ async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[Heard]:
     heard, subscribers = Heard(), []
     for name in names:
         subscriber = Subscriber(
-            topic_named(name),
+            find_topic(name),
             local_endpoints(graph.run, graph.plan.endpoints_to_read(name)),
             lambda message, header, name=name: heard.take(name, message, header),
             PortCounts(),
@@ -278,7 +278,7 @@ async def run_session(folder: Path) -> Session:
     (folder / "bags").mkdir()
     with BagWriter(folder / "bags" / "older.mcap") as writer:
         header = Header(1, 1, 1, "clock", "triangulator", 1)
-        writer.write(topic_named("fingertip"), fingertip(np.zeros(3)), header, 1)
+        writer.write(find_topic("fingertip"), fingertip(np.zeros(3)), header, 1)
     port = free_port()
     settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]
     plan = load_graph(file, console=True, settings=settings)

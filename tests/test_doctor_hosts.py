@@ -367,7 +367,7 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
-    assert "there is no key" in (find_key_problem(three, "main") or "")
+    assert "does not exist; create a key" in (find_key_problem(three, "main") or "")
     public, secret = new_key_pair()
     write_secret(secret_file("main"), secret)
     assert "does not match hosts.main.key" in (find_key_problem(three, "main") or "")
@@ -375,7 +375,7 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
     assert find_key_problem(fitting, "main") is None
     secret_file("main").chmod(0o644)
     problem = find_key_problem(fitting, "main")
-    assert "others may read it" in (problem or "")
+    assert "other users may read it" in (problem or "")
     failed = {
         one.check for one in check_before_start(fitting, "main", problem) if one.state == "failed"
     }

@@ -14,7 +14,7 @@ from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
-from flexsheet.messages.topics import UnknownTopicError, topic_named
+from flexsheet.messages.topics import UnknownTopicError, find_topic
 from flexsheet.messages.types import FingertipReason
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,7 +47,7 @@ def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
         ("handler failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),
-        ("a.mcap: exists already; a bag is never written over", "bag"),
+        ("a.mcap: exists already; bags are not overwritten", "bag"),
         ("no graph is running; start one with: flexsheet launch FILE", "no-graph"),
     ],
 )
@@ -76,7 +76,7 @@ def test_errors_of_users_end_a_command_with_a_code(error: Exception, code: int |
 
 def test_the_text_of_an_error_is_not_quoted() -> None:
     with pytest.raises(UnknownTopicError) as raised:
-        topic_named("fingr")
+        find_topic("fingr")
     assert str(raised.value).startswith('unknown topic "fingr"')
 
 

@@ -29,7 +29,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import EStop
 from flexsheet.nodes.arm_bridge.control import ArmControl, Timeouts
 from flexsheet.nodes.node import PortCounts
@@ -87,7 +87,7 @@ class Launchers:
             self.agents[host].start()
         writer = self.plan.writer("estop", "tools")
         assert writer is not None
-        self._tool = Publisher(topic_named("estop"), [self._near(one) for one in writer.endpoints])
+        self._tool = Publisher(find_topic("estop"), [self._near(one) for one in writer.endpoints])
         return self
 
     async def arms(self, modes: dict[str, str]) -> None:
@@ -96,7 +96,7 @@ class Launchers:
         for side in modes:
             writer = self.plan.writers[f"arm_{side}"][0]
             ends = [self._near(one) for one in writer.endpoints]
-            publishers[side] = writer.name, Publisher(topic_named(f"arm_{side}"), ends)
+            publishers[side] = writer.name, Publisher(find_topic(f"arm_{side}"), ends)
         try:
             for number in count(1):
                 for side, (name, publisher) in publishers.items():
@@ -136,7 +136,7 @@ class Launchers:
         found: set[str] = set()
         others = [one for one in self.plan.sources_to_read("estop") if one.writer != "tools"]
         subscriber = Subscriber(
-            topic_named("estop"),
+            find_topic("estop"),
             [Source(self._near(one.endpoint), one.writer, one.host) for one in others],
             lambda estop, _: found.add(estop.reason),
             PortCounts(),

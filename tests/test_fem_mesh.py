@@ -508,11 +508,11 @@ def test_what_cannot_be_meshed_is_refused_with_the_reason(
 
 
 def test_supports_of_a_scene_are_checked() -> None:
-    with pytest.raises(ValueError, match="keep one of them"):
+    with pytest.raises(ValueError, match="remove one of them"):
         scene(SPHERE, support_angle_rad=1.0)
     with pytest.raises(ValueError, match="down_world"):
         scene(SPHERE, support={"kind": "base", "height_m": 0.01, "down_world": [0, 0, 0]})
-    with pytest.raises(ValueError, match="is not below"):
+    with pytest.raises(ValueError, match="must be below"):
         scene(SPHERE, support={"kind": "box_patch", "min_m": [0, 0, 0], "max_m": [1, 0, 1]})
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     short = Scene.model_validate(content).object

@@ -17,7 +17,7 @@ from flexsheet.launch.experiments import ExperimentError, gestures
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Fingertip, TwinFinger
 from flexsheet.nodes.twin.finger import FingerMotion
 
@@ -109,7 +109,7 @@ def write(bag: Path, *tracked: Tracked) -> Path:
             for number, (topic, message, at_ns) in enumerate(one.messages()):
                 at = at_ns + i * 60 * 10**9
                 header = Header(number, at, at + 10**7, "virtual", "test", 1)
-                writer.write(topic_named(topic), message, header, at + 10**7)
+                writer.write(find_topic(topic), message, header, at + 10**7)
     return bag
 
 

@@ -28,7 +28,7 @@ from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.topics import TOPICS, Delivery, topic_named
+from flexsheet.messages.topics import TOPICS, Delivery, find_topic
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
 from tests.waiting import DEADLINE_S, until
 
@@ -195,7 +195,7 @@ def test_nothing_was_lost_or_refused_on_the_way(session: Session) -> None:
             writers.add(message.node)
             for port in message.inputs:
                 # Only a reader of a `latest` topic may skip messages, and only older ones.
-                skipped = 0 if topic_named(port.topic).delivery is Delivery.LATEST else port.gaps
+                skipped = 0 if find_topic(port.topic).delivery is Delivery.LATEST else port.gaps
                 problems[message.node, port.topic] = skipped + port.rejected
     assert {"planner", "renderer", "fem_solver", "arm_left_bridge", "recorder"} <= writers
     assert not +problems

@@ -497,8 +497,8 @@ def test_pictures_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("[1]", 'no key "version"'),
-        ("version: 99", "version: 99, this program reads 1"),
+        ("[1]", 'does not contain the key "version"'),
+        ("version: 99", "version: expected 1, found 99"),
         ("version: 1", "date"),
         ("a: [", "not YAML"),
     ],

@@ -15,13 +15,13 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     CENTRE_RAD,
     ELBOW_ANGLE_RAD,
     FLANGE_M,
-    HELD_ERROR,
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
+    MAX_FIXED_ERROR_RATIO,
     MAX_FREE_ROTATION_RAD,
     MAX_WRIST_M,
-    SHOULDER_HELD_M,
-    WRIST_HELD_RAD,
+    SHOULDER_FIXED_M,
+    WRIST_FIXED_RAD,
     WRIST_NEAR_RAD,
     Branch,
     UnreachableError,
@@ -280,7 +280,9 @@ def follow(poses: list[Floats]) -> tuple[Floats, Floats]:
 def test_a_path_past_the_wrists_singularity_goes_straight_through(past_deg: float) -> None:
     step_rad = 0.002
     joints, errors = follow(wrist_path(np.radians(past_deg), step_rad))
-    assert errors.max() <= min(3.0 * np.radians(past_deg) + 1e-8, HELD_ERROR * WRIST_HELD_RAD)
+    assert errors.max() <= min(
+        3.0 * np.radians(past_deg) + 1e-8, MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD
+    )
     assert errors[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-7)
     # J5 changes its sign, J4 and J6 turn little and not fast.
     assert joints[0, 4] * joints[-1, 4] < 0
@@ -294,7 +296,7 @@ def test_a_bend_at_the_wrists_singularity_costs_no_more_than_the_held_error(
     bend_deg: float,
 ) -> None:
     joints, errors = follow(wrist_path(1e-4, 0.002, np.radians(bend_deg)))
-    assert errors.max() <= HELD_ERROR * WRIST_HELD_RAD
+    assert errors.max() <= MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD
     assert errors[-1] == pytest.approx(0.0, abs=1e-7)
     # J4 has to turn by the bend, while the axis moves a degree; the exact solution does so at once.
     assert np.abs(np.diff(joints, axis=0)).max() < 0.2
@@ -325,7 +327,7 @@ def test_a_path_past_the_shoulders_singularity_goes_straight_over(past_m: float)
         assert np.abs(present - before).max() < 0.1
         found = forward(present)
         off = float(np.linalg.norm(found[:3, 3] - pose[:3, 3]))
-        assert off <= HELD_ERROR * SHOULDER_HELD_M
+        assert off <= MAX_FIXED_ERROR_RATIO * SHOULDER_FIXED_M
         assert found[:3, :3] == pytest.approx(pose[:3, :3], abs=1e-9)
     assert found == pytest.approx(pose, abs=1e-9)
     assert abs(present[0] - 0.3) < 0.1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.launch.bags.player import shifted
+from flexsheet.launch.bags.player import shift_stamps
 from flexsheet.launch.bags.replay import field_differences, replay, verify
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagError, BagWriter
@@ -123,11 +123,11 @@ def test_instants_in_a_message_move_with_its_stamps() -> None:
         contact_sheet_m=np.zeros(2),
         push_depth_m=0.0,
     )
-    moved = shifted(target, 700)
+    moved = shift_stamps(target, 700)
     assert isinstance(moved, SheetTarget)
     assert moved.valid_at_ns == 5_700
     never = target.model_copy(update={"valid_at_ns": 0})
-    assert shifted(never, 700) is never
+    assert shift_stamps(never, 700) is never
 
 
 class Timed(Message):
@@ -136,7 +136,7 @@ class Timed(Message):
 
 
 def test_a_duration_is_no_instant() -> None:
-    assert shifted(Timed(seen_ns=10, duration_ns=20), 5) == Timed(seen_ns=15, duration_ns=20)
+    assert shift_stamps(Timed(seen_ns=10, duration_ns=20), 5) == Timed(seen_ns=15, duration_ns=20)
 
 
 @pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)

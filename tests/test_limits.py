@@ -20,7 +20,7 @@ from flexsheet.launch.plans.documents import BadInputError, read_document, valid
 from flexsheet.launch.plans.launch_file import LaunchFile
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.calibration import StereoCalibration
-from flexsheet.messages.limits import LimitedModel, max_of
+from flexsheet.messages.limits import LimitedModel, find_max_magnitude
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import NodeParameters, find_parameters_type
@@ -178,7 +178,7 @@ def test_what_files_hold_is_limited() -> None:
 
 
 def test_units_have_their_limits() -> None:
-    assert max_of("radius_m") == 10.0
-    assert max_of("speed_m_per_s") == 10.0
-    assert max_of("max_tool_speed_m_per_s") == 2.2
-    assert max_of("mark_max_area_px") > max_of("width_px")
+    assert find_max_magnitude("radius_m") == 10.0
+    assert find_max_magnitude("speed_m_per_s") == 10.0
+    assert find_max_magnitude("max_tool_speed_m_per_s") == 2.2
+    assert find_max_magnitude("mark_max_area_px") > find_max_magnitude("width_px")

@@ -182,7 +182,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image, image_file: huge.png", "2050x1 pixels, at most 2048"),
         ("texture: grid, image_file: bad.png", "needs texture: image"),
         ("texture: image, image_file: 7", "not a file name"),
-        ("texture: image", "has no image"),
+        ("texture: image", "needs an image"),
     ],
 )
 def test_a_file_that_is_no_texture_is_told(tmp_path: Path, appearance: str, told: str) -> None:

@@ -449,7 +449,7 @@ def test_queue_lengths_are_bounded_for_every_topic() -> None:
 
 async def test_twice_started(room: Room) -> None:
     ear = room.ear(TOPICS["estop"])
-    with pytest.raises(BusError, match="started already"):
+    with pytest.raises(BusError, match="is started already"):
         ear.subscriber.start()
 
 
@@ -502,7 +502,7 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 
     problems: list[str] = []
     ear = Subscriber(
-        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, unopened=True
+        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, raw=True
     )
     ear.start()
     room.closers.append(ear.close)

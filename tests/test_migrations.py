@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from flexsheet.messages import migrations
 from flexsheet.messages.bag import BagError, BagReader, BagWriter, info
 from flexsheet.messages.base import Header, Message, schema_fingerprint
-from flexsheet.messages.migrations import fits, migration_for
+from flexsheet.messages.migrations import find_migration, is_compatible
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Fingertip, Frame, TwinFinger
@@ -54,7 +54,7 @@ def test_a_recorded_scene_is_read_with_todays_methods_and_without_removed_ones(
     recorded = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "scene")
     fields = recorded.model_dump()
     fields["methods"] = {"kinematics": kinematics, "mark": "moments", "tracking": "hand"}
-    migration = migration_for(Scene, "d7307561a5180666", recorded_schema("Scene"))
+    migration = find_migration(Scene, "d7307561a5180666", recorded_schema("Scene"))
     assert migration is not None
     methods = Scene.model_validate(migration(fields)).methods
     assert not hasattr(methods, "kinematics")
@@ -71,7 +71,7 @@ def test_renamed_fields_of_a_recorded_fingertip_are_read() -> None:
 @pytest.mark.parametrize(("label", "seconds"), [("stroke 2.5 s", 2.5), ("push 30 mm", None)])
 def test_a_recorded_stroke_has_its_duration(label: str, seconds: float | None) -> None:
     finger = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "twin/finger")
-    migration = migration_for(TwinFinger, "c1881b3029f02367", recorded_schema("TwinFinger"))
+    migration = find_migration(TwinFinger, "c1881b3029f02367", recorded_schema("TwinFinger"))
     assert migration is not None
     recorded = finger.model_dump(exclude={"path_stroke_s"}) | {"path_label": label}
     assert TwinFinger.model_validate(migration(recorded)).path_stroke_s == seconds
@@ -140,21 +140,21 @@ class Retyped(Message):
 
 @pytest.mark.parametrize("today", [Before, More])
 def test_gains_need_nothing(today: type[Message]) -> None:
-    assert fits(Before.model_json_schema(), today.model_json_schema())
+    assert is_compatible(Before.model_json_schema(), today.model_json_schema())
     today.model_validate(Before(mode="on", size_mm=1.0).model_dump())
 
 
 @pytest.mark.parametrize("today", [Renamed, Demanding, Narrower, Poorer, Retyped])
 def test_anything_else_does(today: type[Message]) -> None:
-    assert not fits(Before.model_json_schema(), today.model_json_schema())
+    assert not is_compatible(Before.model_json_schema(), today.model_json_schema())
     fingerprint = schema_fingerprint(Before).hex()
-    assert migration_for(today, fingerprint, Before.model_json_schema()) is None
+    assert find_migration(today, fingerprint, Before.model_json_schema()) is None
 
 
 @pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)
 def test_each_type_fits_itself(topic: Topic) -> None:
     schema = topic.message.model_json_schema()
-    assert fits(schema, schema)
+    assert is_compatible(schema, schema)
 
 
 def row(message_type: type[Message]) -> Topic:
@@ -214,4 +214,4 @@ def test_a_migration_that_gives_a_wrong_field_is_an_error(
                                          "items", "type", "$defs"]), parts)))  # fmt: skip
 def test_a_damaged_schema_fits_nothing_and_breaks_nothing(schema: Any) -> None:
     if schema != {}:
-        assert not fits(schema, Before.model_json_schema())
+        assert not is_compatible(schema, Before.model_json_schema())

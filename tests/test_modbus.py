@@ -73,8 +73,8 @@ def test_a_sound_status_is_decoded() -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"magic": 0x1234}, "magic 0x1234, wanted 0x4653"),
-        ({"version": 2}, "register map version 2, wanted 1"),
+        ({"magic": 0x1234}, "magic 0x1234, expected 0x4653"),
+        ({"version": 2}, "register map version 2, expected 1"),
         ({"crc": 1}, "fails its CRC"),
         ({"state": 9}, "unknown arm state 9"),
         ({"j3": float("nan")}, "not finite"),

@@ -24,7 +24,7 @@ from flexsheet.launch.health.layout import (
     sample_contacts,
 )
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import (
     CENTRE_RAD,
@@ -304,7 +304,7 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert np.ptp(demo.samples.contact_world_m[:, 0]) == pytest.approx(0.12, abs=1e-6)
     contact = demo.samples.contact_world_m - demo.samples.places.world_from_sheet[:, :3, 3]
     along = np.einsum("ni,ni->n", contact, demo.samples.places.world_from_sheet[:, :3, 1])
-    rolled = most * cylinder_of(SCENE).radius_m
+    rolled = most * require_cylinder(SCENE).radius_m
     assert along.max() > rolled
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
 

@@ -294,12 +294,12 @@ import asyncio, time
 import numpy as np
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Subscriber
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.node import PortCounts
 
 async def main():
-    topic, endpoint = topic_named("stereo"), ["ipc://" + sys.argv[1]]
+    topic, endpoint = find_topic("stereo"), ["ipc://" + sys.argv[1]]
     pixels = np.zeros((480, 640), np.uint8)
     pair = StereoPair(device="", exposure_s=0, dropped_frames=0, left=pixels, right=pixels)
     publisher, heard = Publisher(topic, endpoint), asyncio.Event()

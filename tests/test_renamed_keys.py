@@ -21,7 +21,7 @@ from flexsheet.messages import migrations
 from flexsheet.messages.bag import BagReader, BagWriter, recover
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import TOPICS, Delivery, Topic, UnknownTopicError, topic_named
+from flexsheet.messages.topics import TOPICS, Delivery, Topic, UnknownTopicError, find_topic
 from flexsheet.messages.types import (
     Bookmark,
     Display,
@@ -111,7 +111,7 @@ def test_a_recorded_field_of_an_old_name_is_read(type_name: str, old: str, new: 
     recorded = today | {
         "properties": {{new: old}.get(name, name): one for name, one in today["properties"].items()}
     }
-    migration = migrations.migration_for(TYPES[type_name], "0" * 16, recorded)
+    migration = migrations.find_migration(TYPES[type_name], "0" * 16, recorded)
     assert migration is not None
     assert migration({old: 0.25}) == {new: 0.25}
 
@@ -120,7 +120,7 @@ def test_a_recorded_value_of_an_old_name_is_read() -> None:
     recorded: dict[str, Any] = Display.model_json_schema()
     pattern = recorded["properties"]["pattern"]
     pattern["enum"] = [one.replace("coordinate_ramp", "places") for one in pattern["enum"]]
-    migration = migrations.migration_for(Display, "0" * 16, recorded)
+    migration = migrations.find_migration(Display, "0" * 16, recorded)
     assert migration is not None
     assert migration({"pattern": "places_x"}) == {"pattern": "coordinate_ramp_x"}
     assert migration({"pattern": "grid"}) == {"pattern": "grid"}
@@ -135,7 +135,7 @@ def test_a_recorded_value_of_an_old_name_is_read() -> None:
 def test_the_recorded_text_of_a_sheet_target_is_read_as_its_reason(text: str, reason: str) -> None:
     recorded: dict[str, Any] = SheetTarget.model_json_schema()
     recorded["properties"]["reason"] = {"type": "string"}
-    migration = migrations.migration_for(SheetTarget, "0" * 16, recorded)
+    migration = migrations.find_migration(SheetTarget, "0" * 16, recorded)
     assert migration is not None
     assert reason in get_args(SheetReason)
     assert migration({"reason": text}) == {"reason": reason}
@@ -146,7 +146,7 @@ def test_a_recorded_value_within_a_part_is_read() -> None:
     recorded: dict[str, Any] = Scene.model_json_schema()
     options = recorded["$defs"]["Methods"]["properties"]["sheet_shape"]["anyOf"]
     options[0]["enum"] = ["flat", "four_triangles", "dents"]
-    migration = migrations.migration_for(Scene, "0" * 16, recorded)
+    migration = migrations.find_migration(Scene, "0" * 16, recorded)
     assert migration is not None
     scene = {"methods": {"sheet_shape": "dents", "correction": "two_pass"}}
     assert migration(scene) == {
@@ -157,7 +157,7 @@ def test_a_recorded_value_within_a_part_is_read() -> None:
 def test_a_value_that_never_was_is_not_read() -> None:
     recorded: dict[str, Any] = Display.model_json_schema()
     recorded["properties"]["pattern"]["enum"].append("stripes")
-    assert migrations.migration_for(Display, "0" * 16, recorded) is None
+    assert migrations.find_migration(Display, "0" * 16, recorded) is None
 
 
 def test_the_old_bag_is_read_with_todays_names() -> None:
@@ -217,7 +217,7 @@ def test_a_bag_with_old_topic_type_and_field_names_is_read_and_replayed(
 def test_a_recorded_value_within_a_list_of_parts_is_read() -> None:
     recorded: dict[str, Any] = HostStatus.model_json_schema()
     recorded["$defs"]["NodeProcess"]["properties"]["state"]["enum"] = ["starting", "ready", "away"]
-    migration = migrations.migration_for(HostStatus, "0" * 16, recorded)
+    migration = migrations.find_migration(HostStatus, "0" * 16, recorded)
     assert migration is not None
     nodes = [{"name": "one", "state": "away"}, {"name": "two", "state": "ready"}]
     states = [one["state"] for one in migration({"nodes": nodes})["nodes"]]
@@ -228,7 +228,7 @@ def test_a_recorded_value_within_a_list_of_parts_is_read() -> None:
 def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -> None:
     assert new in TOPICS
     with pytest.raises(UnknownTopicError, match=f'unknown topic "{old}"; it is now "{new}"'):
-        topic_named(old)
+        find_topic(old)
 
 
 def test_a_removed_method_in_a_scene_gets_an_error_that_says_to_remove_it(tmp_path: Path) -> None:

@@ -380,7 +380,7 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) - 400])
     found = make_result(read_session(cut))
-    assert found["findings"][0]["text"].startswith("The bag is incomplete (cut after")
+    assert found["findings"][0]["text"].startswith("The bag is incomplete (truncated after")
     assert found["bag"]["messages"] > 100
 
 

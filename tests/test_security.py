@@ -118,8 +118,8 @@ async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> Non
     await street.speak(mouth, lambda: friend.heard and stranger.problems and street.refused)
     await street.speak(mouth, lambda: len(friend.heard) > 100)
     assert (stranger.heard, without.heard) == ([], [])
-    assert "refuses our key" in stranger.problems[0]
-    assert street.known.public_of("stranger") in street.refused[0]
+    assert "rejects the key of this host" in stranger.problems[0]
+    assert street.known.derive_public_key("stranger") in street.refused[0]
 
 
 @pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
@@ -170,7 +170,7 @@ async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(street: S
 async def test_an_added_host_disturbs_no_connection(street: Street) -> None:
     mouth, ear = street.mouth(), street.ear(street.rings["left"])
     await street.speak(mouth, lambda: ear.heard)
-    street.known.public["right"] = street.known.public_of("stranger")
+    street.known.public["right"] = street.known.derive_public_key("stranger")
     street.known.write_ring("main")
     change = street.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset())

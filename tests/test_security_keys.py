@@ -22,9 +22,9 @@ from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.security import (
     SecurityError,
+    derive_public_key,
     is_key,
     new_key_pair,
-    public_of,
     read_secret,
     write_secret,
 )
@@ -77,11 +77,11 @@ def test_a_secret_is_for_its_owner_alone(keys: Path) -> None:
     public = make(keys, "main")
     file = keys / "main.secret"
     assert (file.stat().st_mode & 0o777, keys.stat().st_mode & 0o777) == (0o600, 0o700)
-    assert public_of(read_secret(file)) == public
-    with pytest.raises(SecurityError, match="there is a key already"):
+    assert derive_public_key(read_secret(file)) == public
+    with pytest.raises(SecurityError, match="exists already; --replace"):
         make(keys, "main")
-    assert public_of(read_secret(file)) == public
-    assert make(keys, "main", replace=True) == public_of(read_secret(file)) != public
+    assert derive_public_key(read_secret(file)) == public
+    assert make(keys, "main", replace=True) == derive_public_key(read_secret(file)) != public
     assert sorted(path.name for path in keys.iterdir()) == ["main.secret"]
 
 
@@ -90,7 +90,7 @@ def test_a_secret_that_others_may_read_is_not_used(keys: Path, mode: int) -> Non
     make(keys, "main")
     file = keys / "main.secret"
     file.chmod(mode)
-    with pytest.raises(SecurityError, match=f"others may read it .mode {mode:04o}.*chmod 600"):
+    with pytest.raises(SecurityError, match=f"other users may read it .mode {mode:04o}.*chmod 600"):
         read_secret(file)
 
 
@@ -98,7 +98,7 @@ def test_a_secret_that_others_may_read_is_not_used(keys: Path, mode: int) -> Non
 def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
     make(keys, "main")
     os.chown(keys / "main.secret", 12345, -1)
-    with pytest.raises(SecurityError, match="belongs to somebody else"):
+    with pytest.raises(SecurityError, match="belongs to another user"):
         read_secret(keys / "main.secret")
 
 
@@ -106,7 +106,7 @@ def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
 def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
     make(keys, "main")
     (keys / "main.secret").write_text(text)
-    with pytest.raises(SecurityError, match="holds no key"):
+    with pytest.raises(SecurityError, match="does not contain a key"):
         read_secret(keys / "main.secret")
     assert not is_key(text)
 
@@ -225,7 +225,7 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
     assert command("keys", "show", "left").out.strip() == made["public"]
     again = command("keys", "new", "left")
     assert again.code == 1
-    assert "there is a key already" in again.err
+    assert "exists already; --replace" in again.err
     file = tmp_path / "lab.yaml"
     file.write_text(LAB)
     assert command("keys", "install", file, "left").code == 0
@@ -234,7 +234,7 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
     (keys / "left.secret").chmod(0o644)
     shown = command("keys", "show", "--json")
     assert shown.code == 1
-    assert "others may read it" in shown.json()["problems"][0]
+    assert "other users may read it" in shown.json()["problems"][0]
     assert command("keys", "new", "Left Arm").code == 2
 
 
@@ -276,7 +276,7 @@ async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, key
         await heard(plan, main)
         pids = main.pids | left.pids
         new = make(keys, "left", replace=True)
-        await until(lambda: any("is not the key that the launch file has" in line for line in said))
+        await until(lambda: any("does not match the key" in line for line in said))
         install(Path(plan.launch_file), "left", new)
         await until(lambda: sum("keys of" in line for line in said) >= 2)
         plan = load_graph(Path(plan.launch_file))
@@ -288,8 +288,10 @@ async def test_a_host_without_its_secret_does_not_start(tmp_path: Path, keys: Pa
     public = {name: make(keys, name) for name in HOSTS}
     plan = plan_with_keys(tmp_path, public)
     make(keys, "left", replace=True)
-    with pytest.raises(BadInputError, match="is not the key that the launch file has for host"):
+    with pytest.raises(BadInputError, match="does not match the key of host"):
         await RunningGraph(plan, host="left").__aenter__()
     (keys / "left.secret").unlink()
-    with pytest.raises(BadInputError, match="there is no key; make one: flexsheet keys new left"):
+    with pytest.raises(
+        BadInputError, match="does not exist; create a key: flexsheet keys new left"
+    ):
         await RunningGraph(plan, host="left").__aenter__()

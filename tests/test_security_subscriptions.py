@@ -81,7 +81,7 @@ from flexsheet.messages.security import KeyRing
 context = zmq.Context()
 opened = context.socket(zmq.XSUB)
 opened.setsockopt(zmq.SNDTIMEO, 200)
-KeyRing(Path(sys.argv[2])).seek(opened, "main")
+KeyRing(Path(sys.argv[2])).set_client_keys(opened, "main")
 opened.connect(sys.argv[1])
 random = Random(1)
 try:
@@ -129,7 +129,7 @@ def subscribed(endpoint: str, street: Street | None = None) -> Iterator[zmq.Sock
         opened.setsockopt(zmq.SUBSCRIBE, b"")
         opened.setsockopt(zmq.RCVTIMEO, 1000 * DEADLINE_S)
         if street is not None:
-            street.rings["left"].seek(opened, "main")
+            street.rings["left"].set_client_keys(opened, "main")
         opened.connect(endpoint)
         opened.recv()
         yield opened

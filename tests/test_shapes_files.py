@@ -14,7 +14,7 @@ from flexsheet.launch.objects.meshes import MAX_BYTES, read_mesh
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
+from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, require_cylinder
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.wire import decode, encode
 from flexsheet.nodes.models.shapes import GEOMETRIES, MeshError, SmoothMeshShape, make_shape
@@ -112,7 +112,7 @@ def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[s
         ({"shape": "ellipsoid", "semi_axes_m": [0.1, 0.1, -0.1]}, "semi_axes_m.2: -0.1"),
         (
             {"shape": "rounded_box", "size_m": [0.1, 0.1, 0.02], "edge_radius_m": 0.02},
-            "round the edges less",
+            "reduce it",
         ),
         ({"shape": "mesh_file", "file": "a.stl"}, '"metres_per_unit" is missing'),
         (
@@ -211,7 +211,7 @@ def test_the_real_mesh_is_taken_as_it_is() -> None:
 
 def test_who_handles_cylinders_only_says_so(tmp_path: Path) -> None:
     with pytest.raises(UnfitGeometryError, match=r'object.geometry.shape: "mesh" .* "cylinder"'):
-        cylinder_of(mesh_scene(tmp_path))
+        require_cylinder(mesh_scene(tmp_path))
 
 
 def test_the_message_is_enough_to_make_the_shape(tmp_path: Path) -> None:

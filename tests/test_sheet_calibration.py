@@ -279,7 +279,7 @@ def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_p
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"version": 9}, "version: 9, this program reads 1"),
+        ({"version": 9}, "version: expected 1, found 9"),
         ({"slack_width_m": None}, "slack_width_m"),
         ({"left_oot": []}, "left_oot"),
     ],

@@ -13,8 +13,8 @@ from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter, topi
 from flexsheet.messages.bag import BagError, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock
-from flexsheet.messages.clock_table import shifted
-from flexsheet.messages.topics import Delivery, topic_named
+from flexsheet.messages.clock_table import shift_stamps
+from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
 """Called with (seconds of the bag played, seconds in all)."""
@@ -92,7 +92,7 @@ async def play(
         same_clock = recorded_clock in (None, header.clock_id)
         shift_ns = due_ns - log_ns
         source_ns = header.source_ns + shift_ns if same_clock else due_ns
-        writer.publish(name, shifted(message, shift_ns), source_ns=max(0, source_ns))
+        writer.publish(name, shift_stamps(message, shift_ns), source_ns=max(0, source_ns))
         sent += 1
 
     try:
@@ -119,7 +119,7 @@ def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
     """Return the last message of every latched topic before `begin_ns`."""
-    latched = [name for name in topics if topic_named(name).delivery is Delivery.LATCHED]
+    latched = [name for name in topics if find_topic(name).delivery is Delivery.LATCHED]
     last = {}
     for entry in BagReader(bag, latched, end_ns=begin_ns):
         last[entry[0]] = entry

@@ -342,7 +342,7 @@ def _calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsC
 def _arm_base(fit: BaseFit) -> ArmBase:
     import numpy as np
 
-    from flexsheet.messages.arms_calibration import ArmBase, ArmPlace
+    from flexsheet.messages.arms_calibration import ArmBase, ArmPoseFit
     from flexsheet.messages.scene import Pose
     from flexsheet.nodes.models.rigid import rpy_from_rotation
 
@@ -366,7 +366,7 @@ def _arm_base(fit: BaseFit) -> ArmBase:
         arm_sigma_m=fit.arm_sigma_m,
         arm_sigma_rad=fit.arm_sigma_rad,
         places=tuple(
-            ArmPlace(
+            ArmPoseFit(
                 name=one.name,
                 used=not one.reason,
                 reason=one.reason,

@@ -103,7 +103,7 @@ def _words(text: str) -> set[str]:
     epilog=examples(
         "flexsheet explain bag",
         "flexsheet explain saturated --json",
-        "flexsheet explain 'topic arm_left: host left refuses our key'",
+        "flexsheet explain 'topic arm_left: host left rejects the key of this host'",
     )
 )
 def explain(

@@ -87,7 +87,7 @@ def show(
 ) -> None:
     """Print the public keys of the key pairs here; exit code 1 if one cannot be used."""
     from flexsheet.launch.running.keys import directory, secret_file
-    from flexsheet.messages.security import SecurityError, public_of, read_secret
+    from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
@@ -96,7 +96,7 @@ def show(
     problems = []
     for file in files:
         try:
-            public = public_of(read_secret(file))
+            public = derive_public_key(read_secret(file))
             rows.append({"host": file.stem, "public": public, "secret_file": str(file)})
         except SecurityError as error:
             problems.append(str(error))
@@ -143,11 +143,11 @@ def install(
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, public_of, read_secret
+    from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 
     if key is None:
         try:
-            key = public_of(read_secret(secret_file(host)))
+            key = derive_public_key(read_secret(secret_file(host)))
         except SecurityError as error:
             raise CommandError(str(error)) from error
     install_key(file, host, key)

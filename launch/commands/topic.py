@@ -306,10 +306,10 @@ def _word(value: Any) -> str:
 
 
 def _topic(name: str) -> Topic:
-    from flexsheet.messages.topics import UnknownTopicError, topic_named
+    from flexsheet.messages.topics import UnknownTopicError, find_topic
 
     try:
-        return topic_named(name)
+        return find_topic(name)
     except UnknownTopicError as error:
         raise CommandError(str(error), BAD_INPUT) from error
 
@@ -380,7 +380,7 @@ async def _read(
 async def _collect_headers(
     topic: Topic, run: Path | None, headers: list[Header], duration_s: float
 ) -> int:
-    subscriber = listener(topic, run, lambda _, header: headers.append(header), unopened=True)
+    subscriber = listener(topic, run, lambda _, header: headers.append(header), raw=True)
     subscriber.start()
     try:
         await asyncio.sleep(duration_s)
@@ -390,7 +390,7 @@ async def _collect_headers(
 
 
 def listener(
-    topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
+    topic: Topic, run_directory: Path | None, handler: Handler, *, raw: bool = False
 ) -> Subscriber:
     """Make a subscriber to a topic of the running graph.  Raises CommandError without a writer."""
     from flexsheet.launch.running.tools import make_subscriber
@@ -404,7 +404,7 @@ def listener(
         run,
         handler,
         on_problem=lambda text: words.print(text, markup=False),
-        unopened=unopened,
+        raw=raw,
     )
 
 

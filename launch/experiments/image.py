@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.stroke import object_pose
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.types import Correction, FingerPath, Pattern, TwinEye
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.twin.error_map import ErrorMap, error_map
@@ -36,7 +36,7 @@ def reach_path(
 
     along_m: position along the cylinder's axis, from its middle.
     """
-    radius = cylinder_of(scene).radius_m
+    radius = require_cylinder(scene).radius_m
     local = [
         [along_m, (radius + height_m) * np.sin(angle_rad), (radius + height_m) * np.cos(angle_rad)]
         for angle_rad, height_m in points
@@ -63,7 +63,7 @@ def push_path(
     along_mm: position along the axis, from the middle.  tilt_deg: angle around the axis, from the
     front.  Raises ExperimentError for a position that cannot be touched.
     """
-    cylinder = cylinder_of(scene)
+    cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
         raise ExperimentError(
             f"--at {along_mm:g} mm, --tilt {tilt_deg:g}°: the cylinder's side can be touched to "

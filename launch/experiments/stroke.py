@@ -14,7 +14,7 @@ from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.lag import lag_s
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.scene import ArmSpec, Cylinder, Scene, cylinder_of
+from flexsheet.messages.scene import ArmSpec, Cylinder, Scene, require_cylinder
 from flexsheet.messages.types import (
     ArmState,
     FingerPath,
@@ -78,7 +78,7 @@ def stroke_label(seconds: float) -> str:
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
     """Make a path: approach, touch, dwell, stroke 60 degrees at constant speed, lift."""
-    radius = cylinder_of(scene).radius_m
+    radius = require_cylinder(scene).radius_m
     world_from_object = object_pose(scene)
     stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
     angles = np.concatenate(
@@ -388,7 +388,7 @@ def sheet_errors(
         off = on_surface - project_presented_point(foot, centre, normal)
         return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
-    radius = cylinder_of(scene).radius_m - normal_offset_m
+    radius = require_cylinder(scene).radius_m - normal_offset_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
     presented_points, presented_angles = find_presented_points(
         edges, world_from_object, times_ns, points[:, 0]
@@ -506,7 +506,7 @@ def arcs(
     local = apply(inverse(world_from_object), points)
     _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])
     both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
-    return np.asarray(cylinder_of(scene).radius_m * both)
+    return np.asarray(require_cylinder(scene).radius_m * both)
 
 
 def tangential_distance(
@@ -518,7 +518,7 @@ def tangential_distance(
     for array in (points, others):
         local = apply(object_from_world, array)
         angle = np.arctan2(local[:, 1], local[:, 2])
-        radius = cylinder_of(scene).radius_m
+        radius = require_cylinder(scene).radius_m
         on_surface.append(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
     return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 
@@ -532,7 +532,7 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
     """
     span = stroke_span_ns(recording, seconds)
     world_from_object = object_pose(recording.scene)
-    radius = cylinder_of(recording.scene).radius_m
+    radius = require_cylinder(recording.scene).radius_m
 
     def within(samples: list[tuple[int, Floats]]) -> list[tuple[int, Floats]]:
         return [sample for sample in samples if span[0] <= sample[0] <= span[1]]

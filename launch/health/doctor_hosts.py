@@ -30,7 +30,7 @@ from flexsheet.launch.running.host import (
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
-from flexsheet.messages.security import SecurityError, public_of, read_secret
+from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
 from flexsheet.nodes import NodeRole
@@ -492,7 +492,7 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
         return None
     file = secret_file(here)
     try:
-        own = public_of(read_secret(file))
+        own = derive_public_key(read_secret(file))
     except SecurityError as error:
         return str(error)
     if own != plan.keys[here]:

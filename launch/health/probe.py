@@ -23,7 +23,7 @@ from flexsheet.launch.running.runs import Run, local_sources
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Source, Subscriber
 from flexsheet.messages.security import KeyRing
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, Clocks, HostStatus, Status
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
@@ -179,7 +179,7 @@ async def _try_handshake(endpoint: str, host: str, keys: KeyRing | None) -> Reac
     monitor = opened.get_monitor_socket(sum(HANDSHAKES))
     try:
         if keys is not None:
-            keys.seek(opened, host)
+            keys.set_client_keys(opened, host)
         opened.connect(endpoint)
         for _ in range(round(HANDSHAKE_S / POLL_PERIOD_S)):
             try:
@@ -232,7 +232,7 @@ async def _listen(
         if own:
             subscribers.append(
                 Subscriber(
-                    topic_named(topic),
+                    find_topic(topic),
                     [find_source(one) for one in own],
                     handler,
                     PortCounts(),

@@ -28,7 +28,7 @@ from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.security import KeyChange, KeyRing
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
@@ -88,7 +88,7 @@ class HostAgent:
             writer = plan.writer(topic, self._name)
             if writer is not None:
                 self.publishers[topic] = Publisher(
-                    topic_named(topic),
+                    find_topic(topic),
                     endpoints(writer.endpoints),
                     keys=keys,
                     on_refused=on_problem,
@@ -140,7 +140,7 @@ class HostAgent:
 
     def _subscribe(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
-            topic_named(topic),
+            find_topic(topic),
             self._sources(sources),
             handler,
             PortCounts(),
@@ -179,7 +179,7 @@ class HostAgent:
 
     def _latch_estop(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
-        _, header, clock_problem = self._clock_table.localised(estop, header, now_ns)
+        _, header, clock_problem = self._clock_table.localize(estop, header, now_ns)
         if estop.engaged:
             if self._latched is not None and header.writer in self._launchers:
                 return

@@ -9,7 +9,7 @@ from typing import Literal
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import SheetShapeMethod, chosen
+from flexsheet.messages.methods import SheetShapeMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.cache import default_cache_dir
@@ -43,7 +43,7 @@ def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
 
 def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
     """Return whether a renderer draws a pushed sheet by the membrane's deflection shapes."""
-    shape: SheetShapeMethod = chosen(requested, scene.methods.sheet_shape, "reduced_order")
+    shape: SheetShapeMethod = resolve_method(requested, scene.methods.sheet_shape, "reduced_order")
     return shape == "reduced_order"
 
 

@@ -58,7 +58,7 @@ from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.security import KeyRing, SecurityError
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
 from flexsheet.nodes.runner import NodeConfig, PortConfig
 
@@ -410,7 +410,7 @@ class RunningGraph:
         if scene is None or writer is None:
             return
         publisher = Publisher(
-            topic_named("scene"),
+            find_topic("scene"),
             local_endpoints(self.run, writer.endpoints),
             keys=self._rings.get(MAIN),
             on_refused=partial(self._report, LAUNCHER),

@@ -18,7 +18,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Problem, Publisher, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.security import KeyRing
-from flexsheet.messages.topics import topic_named
+from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import HostStatus, Status
 
 if TYPE_CHECKING:
@@ -60,17 +60,17 @@ def make_subscriber(
     on_message: Handler,
     *,
     on_problem: Problem,
-    unopened: bool = False,
+    raw: bool = False,
 ) -> Subscriber:
     """Make a subscriber to all writers of a topic in a running graph, without starting it."""
-    definition = topic_named(topic)
+    definition = find_topic(topic)
     return Subscriber(
         definition,
         local_sources(run, plan.sources_to_read(topic, tools_host(run))),
         on_message,
         ToolCounts(),
         on_problem=on_problem,
-        unopened=unopened,
+        raw=raw,
         keys=load_tool_keys(plan, run),
         # The states of nodes and hosts with another plan are read, too, to report them.
         plan=None if definition.message in (Status, HostStatus) else plan.hash,
@@ -123,7 +123,7 @@ class GraphWriter:
                 if writer is None:
                     raise _make_refusal(plan, name, host)
                 endpoints = local_endpoints(run, writer.endpoints)
-                self._publishers[name] = Publisher(topic_named(name), endpoints, keys=keys)
+                self._publishers[name] = Publisher(find_topic(name), endpoints, keys=keys)
         except BaseException:
             self.close()
             raise

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class CommandScheduler:
-    """Decide when the next command is sent and which duration it covers.
+    """Schedule of an arm's commands.
 
-    period_s: of periodic commands.  target_period_s: of targets.  idle_period_s: of commands to an
-    idle arm, short enough for its watchdog.
-
-    sent_ns, in all methods: when the last command was sent; 0: none was.
+    period_s: period of periodic commands.  target_period_s: period of targets.
+    idle_period_s: period of commands to an idle arm, short enough for its watchdog.
+    sent_ns, in all methods: time of the last command; 0: none.
     """
 
     period_s: float
@@ -35,7 +34,7 @@ class CommandScheduler:
     def is_due(self, now_ns: int, sent_ns: int, target_ns: int) -> bool:
         """Return whether a periodic command is sent now; target_ns: arrival of the newest target.
 
-        None is sent shortly before the next target, which would wait for the arm's answer.
+        No command is sent shortly before the next target, which would have to wait for the answer.
         """
         due_s = self.target_period_s - (now_ns - target_ns) * 1e-9
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s

@@ -111,7 +111,7 @@ MAX_WAIT_FOR_OTHER_S = 1.0
 """An armed arm is disarmed if the other one is not armed within this time."""
 
 MAX_ARMING_AGE_S = 1.0
-"""An older arming command was delayed; the person may no longer mean it."""
+"""Maximum age of an arming command; a later one may contradict the operator's intention."""
 
 ALIGNED_RAD = 1e-4
 """Joints this near to the end of an alignment have reached it."""
@@ -125,7 +125,7 @@ RECHECK_PERIOD_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """Hold the lateness (s) of an input after which the arm holds, and after which it stops."""
+    """Lateness (s) of an input after which the arm decelerates, and after which it stops."""
 
     hold_after_s: float
     stop_after_s: float
@@ -133,21 +133,20 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Hold a command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
+    """Command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
 
     mode: str
     joints_rad: Floats
 
 
 class ArmControl:
-    """Control one arm from cycle to cycle.
+    """Control of one arm, cycle by cycle.
 
     state: changes only by `handle`, through the table of `state_machine`.
-    mode, faults, reason: for people and for the other arm.  faults are latched until `reset`.
-        reason says why the arm does not follow.
-    ready: whether the arm may move.  A person arms it; every interlock disarms it.  When the
-        interlock has gone, the arm stays where it is.  With `auto_arming` it is armed whenever no
-        interlock holds.
+    mode, faults, reason: published for the operator and the other arm.  faults are latched until
+        `reset`.  reason: why the arm does not follow.
+    ready: whether the arm may move.  The operator arms it; every interlock disarms it, also after
+        its cause has ended.  With `auto_arming` the arm is armed whenever there is no interlock.
     pending_check: the path whose check is awaited by `on_path_result`, or None.
     """
 
@@ -221,7 +220,7 @@ class ArmControl:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether nothing moves before a person acts; fewer exchanges suffice meanwhile."""
+        """Return whether the arm rests until a command of the operator, with fewer exchanges."""
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
@@ -229,8 +228,8 @@ class ArmControl:
         target = TRANSITIONS[self._state, event]
         if target is None:
             return
-        keeps_path = target in TRACKING | RELAXING
-        if self._state in TRACKING | RELAXING and not keeps_path:
+        preserves_path = target in TRACKING | RELAXING
+        if self._state in TRACKING | RELAXING and not preserves_path:
             self._drop_path()
         self._state = target
 
@@ -270,7 +269,7 @@ class ArmControl:
         self._standstill.forget()
         self._inhibit(text, Event.CONNECTION_LOST)
         self.reason = text
-        self._forget_motion()
+        self._discard_motion()
 
     def on_measurement(
         self,
@@ -289,7 +288,7 @@ class ArmControl:
         if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
         if arm_faults == (ArmFault.WATCHDOG,):
-            # A cycle came late, and the arm has stopped by itself: restart from where it stands.
+            # A cycle was late, and the arm has stopped automatically: restart from its position.
             self._restart_idle()
             self.reason = "the arm's watchdog stopped it"
             self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
@@ -297,8 +296,8 @@ class ArmControl:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
     def _restart_idle(self) -> None:
-        """Forget the motion and command `idle` next; the arm rests without a command."""
-        self._forget_motion()
+        """Discard the motion and command `idle` next; the arm rests without a command."""
+        self._discard_motion()
         self._standstill.restart()
         self._must_idle = True
 
@@ -349,7 +348,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm at a person's command; return why arming is refused, or None."""
+        """Arm or disarm by the operator's command; return why arming is refused, or None."""
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
             return None
@@ -368,7 +367,7 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm by an event, and keep the reason."""
+        """Disarm the arm by an event, and store the reason."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -397,12 +396,12 @@ class ArmControl:
         if clock_problem:
             self._inhibit(clock_problem)
         if silent or stopped or clock_problem:
-            # Relaxing belongs to a stop; it must not begin after the other arm was away.
+            # The arm may relax the sheet only at a stop, not after the other arm has been silent.
             self.handle(Event.ISOLATED)
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return why the arm must not move, apart from a person's command; other None: silent."""
+        """Return why the arm must not move, except an operator's command; other None: silent."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if self.faults:
@@ -485,8 +484,8 @@ class ArmControl:
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
         """Stop because the other arm is not ready; before a motion, wait for it for a while."""
         reason = "the other arm is not ready"
-        has_begun = self._sheet is not None or not self.at_rest
-        if not self.auto_arming and (has_begun or self._waited_s > MAX_WAIT_FOR_OTHER_S):
+        has_started = self._sheet is not None or not self.at_rest
+        if not self.auto_arming and (has_started or self._waited_s > MAX_WAIT_FOR_OTHER_S):
             self._inhibit(reason)
         else:
             self.handle(Event.WAIT_FOR_OTHER)
@@ -577,7 +576,7 @@ class ArmControl:
     ) -> Command:
         """Start the motion if its path is known to be clear; else rest and request a check.
 
-        The other bridge checks the same path of the same arms.  Neither moves before both follow.
+        The other bridge checks the same path of the same arms.  No arm moves before both follow.
         """
         if not self._stands_still(measured):
             return self._decelerate("waits for the arm to stand still", geometry, step_s)
@@ -642,7 +641,7 @@ class ArmControl:
     def _align(
         self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Continue the alignment unless this arm holds or waits; end it when it is complete."""
+        """Continue the alignment unless this arm is late or waits; end it when it is complete."""
         if self._state is State.FOLLOW and self._together:
             self._aligned_s += step_s
         goal_rad = alignment.joints_at(self._aligned_s)
@@ -721,8 +720,8 @@ class ArmControl:
         """Stop; at rest, slacken the sheet by moving this edge towards the other one."""
         self._settle()
         measured = self.measured_rad
-        begins = self._state is State.TAUT
-        if not (begins or self._state is State.RELAX) or other is None or measured is None:
+        starts = self._state is State.TAUT
+        if not (starts or self._state is State.RELAX) or other is None or measured is None:
             return self._decelerate(reason, geometry, step_s)
         between = geometry.sheet_between(
             geometry.world_from_edge(measured),
@@ -735,18 +734,18 @@ class ArmControl:
         if between.stretch_ratio > IMPLAUSIBLE_LENGTH_RATIO * limits.max_length_m / limits.width_m:
             text = f"{reason}; the measured length is not possible"
             return self._decelerate(text, geometry, step_s)
-        if begins and not self._stands_still(measured):
+        if starts and not self._stands_still(measured):
             return self._decelerate(reason, geometry, step_s)
         refusal = (
             self._restart_refusal(measured)
-            if begins
+            if starts
             else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
         if refusal is not None:
-            # The arm does not obey; further commands would make it jump once it does.
+            # The arm does not obey; further commands would make it jump when it obeys again.
             self.handle(Event.RELAX_ENDED)
             return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
-        if begins or self._sheet is None or self._relax_from is None:
+        if starts or self._sheet is None or self._relax_from is None:
             self._restart_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
         # The other arm rests, so this arm covers the whole stretch: twice its half.
@@ -820,8 +819,8 @@ class ArmControl:
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
         """Return the command for these joints; every command is made here.
 
-        Two last checks hold whatever has been decided.  A state without motion sends no motion.
-        No command exceeds the joint speeds or the tool speed.  A violation of either is a fault.
+        Two final checks apply to every decision.  A state without motion sends no motion.  No
+        command exceeds the joint speeds or the tool speed.  A violation of either is a fault.
         """
         before = self.commanded_rad
         if mode == "move" and self._state not in MOTION_STATES:
@@ -849,7 +848,7 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats) -> bool:
-        """Whether the arm is near enough to its last command to restart from the measurement."""
+        """Return whether the arm is so near to its last command that it may restart there."""
         return edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
@@ -858,8 +857,8 @@ class ArmControl:
     def _restart_refusal(self, measured: Floats) -> str | None:
         """Return why a motion must not restart from the measured joints, or None.
 
-        For an arm that stands still.  One at its last command may restart.  Elsewhere, either the
-        arm has not obeyed, or the measurement is wrong and would make the arm jump.
+        The arm must be at rest.  At its last command it may restart.  At another position, either
+        the arm has not obeyed, or the measurement is wrong and would make the arm jump.
         """
         beyond = max(
             float((JOINT_MIN_RAD - measured).max()), float((measured - JOINT_MAX_RAD).max())
@@ -887,11 +886,11 @@ class ArmControl:
             self.faults = self.faults or ("commanded: a start before the arm stands still",)
             self._inhibit(self.faults[0], Event.FAULT)
             return
-        self._forget_motion()
+        self._discard_motion()
         self.commanded_rad = measured.copy()
         self._standstill.has_jumped = False
 
-    def _forget_motion(self) -> None:
+    def _discard_motion(self) -> None:
         self._velocity = np.zeros(6)
         self._drop_path()
 

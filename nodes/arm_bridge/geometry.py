@@ -32,7 +32,7 @@ EDGE_SPEED_FRACTION = 0.95
 
 @lru_cache(maxsize=16)
 def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
-    """Compute `forward` once per cycle for the same joints; the result is read-only."""
+    """Return the cached flange pose of joints (6,) rad, read-only."""
     pose = forward(joints_rad)
     pose.flags.writeable = False
     return pose
@@ -43,7 +43,7 @@ def _transform(pose: Pose) -> Floats:
 
 
 class ArmGeometry:
-    """Hold the pose of an arm's base, its edge of the sheet, and its limits."""
+    """Geometry of one arm: poses of its base and of its edge of the sheet, and its limits."""
 
     def __init__(self, scene: Scene, side: Side) -> None:
         self.side: Side = side
@@ -84,9 +84,11 @@ class ArmGeometry:
         )
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
+        """Return the world pose (4, 4) of the flange for joints (6,) rad."""
         return self.world_from_base @ _base_from_flange(tuple(joints_rad.tolist()))
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
+        """Return the world pose (4, 4) of the clamped edge for joints (6,) rad."""
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
@@ -94,7 +96,7 @@ class ArmGeometry:
         return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad that hold this arm's edge of the sheet, near the present ones.
+        """Return joints (6,) rad for this arm's edge of the sheet, near the present ones.
 
         Raises UnreachableError if there are none.
         """

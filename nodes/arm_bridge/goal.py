@@ -32,7 +32,7 @@ SKEW_LENGTH_M = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Hold the sheet's target at the time when a command acts.
+    """Target of the sheet at the time when a command acts.
 
     overdue_s: time since the next target was due; below 0 while it is not.
     """
@@ -57,10 +57,10 @@ def extrapolate_goal(
 
 @dataclass(frozen=True, slots=True)
 class GoalTiming:
-    """Hold the times (s) that convert a target to a goal.
+    """Times (s) for the conversion of a target to a goal.
 
-    servo_lag_s: from sending a command until it acts.
-    target_period_s: from a target's arrival until the next is due.
+    servo_lag_s: time from sending a command until it acts.
+    target_period_s: time from a target's arrival until the next is due.
     max_extrapolation_s: longest extrapolation of a target.
     """
 
@@ -124,7 +124,7 @@ def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
 
 
 def _sheet_centre(edge: Floats, along_m: float) -> Floats:
-    """Return the sheet's pose seen from one edge; its centre lies `along_m` along the edge's x."""
+    """Return the sheet's pose (4, 4) from one edge; its centre is at `along_m` on the edge's x."""
     return transform(edge[:3, :3], edge[:3, 3] + along_m * edge[:3, 0])
 
 

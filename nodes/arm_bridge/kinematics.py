@@ -32,19 +32,19 @@ JOINT_MAX_RAD = np.radians([150.0, 120.0, 155.0, 160.0, 90.0, 200.0])
 JOINT_SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
 
 WRIST_SINGULAR = 1e-7
-"""|sin J5| below which the axes of J4 and J6 coincide; J4 then keeps its angle."""
+"""|sin J5| below which the axes of J4 and J6 coincide; J4 then stays constant."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""Distance of the wrist centre from the axis of J1 below which J1 keeps its angle."""
+"""Distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
-WRIST_HELD_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""|J5| up to which J4 keeps its angle, and from which J4 is exact."""
+WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
+"""|J5| up to which J4 stays constant, and from which J4 is exact."""
 
-SHOULDER_HELD_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""Distance of the wrist centre from the axis of J1, likewise."""
+SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
+"""The same bounds for J1: distances of the wrist centre from its axis."""
 
-HELD_ERROR = 1.4
-"""Largest error between both, as a multiple of the first of them: 1.05 degrees, 1 mm."""
+MAX_FIXED_ERROR_RATIO = 1.4
+"""Maximum error between both bounds, as a multiple of the first: 1.05 degrees, 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
 """Largest rotation of J4 or J1 in one step near a singularity: half their speed at 140 Hz."""
@@ -72,9 +72,9 @@ Wrist = Literal["plain", "flipped"]
 
 
 class Branch(NamedTuple):
-    """Name one of the eight solutions for a flange pose.
+    """One of the eight joint solutions for a flange pose.
 
-    shoulder: whether the wrist centre lies before or behind the plane through the axes of J1 and
+    shoulder: whether the wrist centre is before or behind the plane through the axes of J1 and
         J2.
     elbow: "up" with J3 beyond `ELBOW_ANGLE_RAD`, as in its whole range, else "down".
     wrist: "flipped" with J5 below zero.
@@ -163,12 +163,12 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
                 q6 = atan2(wrist[2][1], -wrist[2][0])
             elif wrist[2][2] > 0:
                 q4 = present[3]
-                q6 = _wrapped(atan2(wrist[1][0], wrist[0][0]) - q4)
+                q6 = _wrap(atan2(wrist[1][0], wrist[0][0]) - q4)
             else:
                 q4 = present[3]
-                q6 = _wrapped(q4 - atan2(-wrist[1][0], -wrist[0][0]))
+                q6 = _wrap(q4 - atan2(-wrist[1][0], -wrist[0][0]))
             found.append((q1, q2, q3, q4, q5, q6))
-            found.append((q1, q2, q3, _wrapped(q4 + pi), -q5, _wrapped(q6 + pi)))
+            found.append((q1, q2, q3, _wrap(q4 + pi), -q5, _wrap(q6 + pi)))
     return found
 
 
@@ -200,7 +200,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
     vector of length sin(J5), which rotates arbitrarily fast when it passes zero closely.  There J4
     may lag.  J5 takes the component of the vector along J4, which may be negative.  The rest is an
-    error of the flange's orientation of at most HELD_ERROR * WRIST_HELD_RAD.
+    error of the flange's orientation of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
 
     J1 does the same for a wrist centre near its axis.  A path that passes a singularity within the
     first length is therefore followed straight, with little motion of J4 or J1.  A path further
@@ -212,10 +212,10 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
     x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
-    q1 = present[0] + _held_rotation(
+    q1 = present[0] + _limited_rotation(
         x * cos(present[0]) + y * sin(present[0]),
         y * cos(present[0]) - x * sin(present[0]),
-        held=SHOULDER_HELD_M,
+        fixed=SHOULDER_FIXED_M,
         near=SHOULDER_NEAR_M,
     )
     out, height = x * cos(q1) + y * sin(q1), z - SHOULDER_HEIGHT_M
@@ -226,10 +226,10 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     q2 = _solve_shoulder(out, height, q3)
     wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
     c4, s4 = cos(present[3]), sin(present[3])
-    q4 = present[3] + _held_rotation(
+    q4 = present[3] + _limited_rotation(
         c4 * wrist[0][2] + s4 * wrist[1][2],
         c4 * wrist[1][2] - s4 * wrist[0][2],
-        held=WRIST_HELD_RAD,
+        fixed=WRIST_FIXED_RAD,
         near=WRIST_NEAR_RAD,
     )
     c4, s4 = cos(q4), sin(q4)
@@ -244,11 +244,11 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     return inverse_kinematics(base_from_flange, present)
 
 
-def _held_rotation(along: float, across: float, *, held: float, near: float) -> float:
+def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
     """Return the rotation (rad) of an axis towards a vector, or towards its opposite if nearer.
 
     along, across: the vector's components along the axis, and 90 degrees further.
-    held, near: lengths up to which the vector needs no rotation, and from which it needs all of it.
+    fixed, near: lengths up to which there is no rotation, and from which there is full rotation.
 
     In between, the direction may be off by an angle that falls from 90 degrees to zero.  The rest
     is corrected by at most MAX_FREE_ROTATION_RAD.
@@ -259,10 +259,10 @@ def _held_rotation(along: float, across: float, *, held: float, near: float) -> 
     turn = atan2(across, along) if along >= 0.0 else atan2(-across, -along)
     if length >= near:
         return turn
-    slack = 0.5 * pi * min(1.0, held / length) * min(1.0, (near - length) / (near - held))
-    wanted = abs(turn)
-    free = min(MAX_FREE_ROTATION_RAD * min(1.0, length / held), wanted, slack)
-    return copysign(max(wanted - slack, 0.0) + free, turn)
+    slack = 0.5 * pi * min(1.0, fixed / length) * min(1.0, (near - length) / (near - fixed))
+    full_angle = abs(turn)
+    free = min(MAX_FREE_ROTATION_RAD * min(1.0, length / fixed), full_angle, slack)
+    return copysign(max(full_angle - slack, 0.0) + free, turn)
 
 
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
@@ -289,7 +289,7 @@ def _solve_shoulder(out: float, height: float, q3: float) -> float:
     """Return the J2 (rad) that brings the wrist centre to a point in the arm's plane."""
     along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
     up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
-    return _wrapped(atan2(out, height) - atan2(along, up))
+    return _wrap(atan2(out, height) - atan2(along, up))
 
 
 def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
@@ -324,7 +324,7 @@ def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
     return found
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     """Return the angle within -pi..pi."""
     return atan2(sin(angle), cos(angle))
 
@@ -393,11 +393,11 @@ def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLi
 
 @dataclass(frozen=True, slots=True)
 class Singularities:
-    """Hold the distances of joints (..., 6) to the arm's three singularities.
+    """Distances of joints (..., 6) to the arm's three singularities.
 
-    shoulder_m: of the wrist centre from the axis of J1.
-    elbow_rad: of J3 from an angle with shoulder, elbow and wrist centre in line.
-    wrist_rad: of J5 from zero.
+    shoulder_m: distance of the wrist centre from the axis of J1.
+    elbow_rad: difference of J3 from its angle with shoulder, elbow and wrist centre in line.
+    wrist_rad: absolute value of J5.
     """
 
     shoulder_m: Floats

@@ -50,7 +50,7 @@ RANGE_BRAKE_FRACTION = 2.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Hold range, speed and acceleration of each joint, (6,)."""
+    """Range, speed and acceleration of each joint, (6,)."""
 
     min_rad: Floats
     max_rad: Floats
@@ -60,7 +60,7 @@ class JointLimits:
 
 @dataclass(frozen=True, slots=True)
 class SheetLimits:
-    """Hold the limits of the sheet and of the two arms that hold it."""
+    """Limits of the sheet and of the two arms that stretch it."""
 
     width_m: float
     height_m: float
@@ -108,15 +108,15 @@ def limit_velocity(
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
         raise ValueError(f"step_s is {step_s} s; a command covers {MIN_STEP_S} to {MAX_STEP_S} s")
     if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
-        wanted = find_desired_velocity(
+        desired = find_desired_velocity(
             joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s
         )
     else:
-        wanted = decelerate(velocity, limits=limits, step_s=step_s)
+        desired = decelerate(velocity, limits=limits, step_s=step_s)
     return limit_tool_speed(
         joints_rad,
         velocity,
-        clamp_to_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s),
+        clamp_to_range(joints_rad, velocity, desired, limits=limits, step_s=step_s),
         tool_points=tool_points,
         max_tool_speed=max_tool_speed,
         limits=limits,
@@ -143,14 +143,14 @@ def find_desired_velocity(
 
 
 def clamp_to_range(
-    joints_rad: Floats, velocity: Floats, wanted: Floats, *, limits: JointLimits, step_s: float
+    joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
     """Clamp desired velocities to the acceleration, and so that every joint can stop in range."""
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
     down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
     reach = max_acceleration * step_s
-    result = _clamp(_clamp(wanted, -down, up), velocity - reach, velocity + reach)
+    result = _clamp(_clamp(desired, -down, up), velocity - reach, velocity + reach)
     lower = (limits.min_rad - joints_rad) / step_s
     upper = (limits.max_rad - joints_rad) / step_s
     # Outside the range, as after a start there, only motion back into it is allowed.
@@ -176,17 +176,17 @@ def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Float
 def limit_tool_speed(
     joints_rad: Floats,
     velocity: Floats,
-    wanted: Floats,
+    desired: Floats,
     *,
     tool_points: Callable[[Floats], Floats],
     max_tool_speed: float,
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the nearest velocities (6,) to the desired ones that keep the tool speed.
+    """Return the velocities (6,) nearest to the desired ones within the tool speed.
 
-    Velocities between the desired ones and those of decelerating keep acceleration and range like
-    both.  If even decelerating is too fast, it is scaled down and exceeds the acceleration.
+    Any blend of the desired velocities and of decelerating ones is within acceleration and range.
+    If even decelerating is too fast, it is scaled down and exceeds the acceleration.
     """
     here = tool_points(joints_rad)
     max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
@@ -194,9 +194,9 @@ def limit_tool_speed(
     def shifts(candidate: Floats) -> Floats:
         return tool_points(joints_rad + candidate * step_s) - here
 
-    fast = shifts(wanted)
+    fast = shifts(desired)
     if _longest(fast) <= max_shift_m:
-        return wanted
+        return desired
     slower = clamp_to_range(
         joints_rad,
         velocity,
@@ -208,7 +208,7 @@ def limit_tool_speed(
     if (shift_m := _longest(slow)) <= max_shift_m:
         blend = _find_blend(slow, fast, max_shift_m)
         while blend > MIN_BLEND:
-            between = slower + blend * (wanted - slower)
+            between = slower + blend * (desired - slower)
             if _longest(shifts(between)) <= max_shift_m:
                 return between
             blend *= 0.8
@@ -221,21 +221,21 @@ def limit_tool_speed(
 
 def bound_step(
     joints_rad: Floats,
-    wanted_rad: Floats,
+    desired_rad: Floats,
     *,
     tool_points: Callable[[Floats], Floats],
     max_tool_speed: float,
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the joints (6,) towards `wanted_rad` that one step can reach.
+    """Return the joints (6,) towards `desired_rad` that one step can reach.
 
-    Joint speeds and tool speed bound the step.  Returns `wanted_rad` itself where it is within
-    them, else joints on the straight line to it.  Returns `joints_rad` where it is not finite.
+    Joint speeds and tool speed bound the step.  The result is `desired_rad` itself within these
+    bounds, joints on the straight line to it beyond them, and `joints_rad` if it is not finite.
     """
-    if wanted_rad is joints_rad:
-        return wanted_rad
-    step = wanted_rad - joints_rad
+    if desired_rad is joints_rad:
+        return desired_rad
+    step = desired_rad - joints_rad
     ratio = float((np.abs(step) / (limits.speed_rad_per_s * step_s)).max())
     if not np.isfinite(ratio):
         return joints_rad
@@ -244,10 +244,10 @@ def bound_step(
     here = tool_points(joints_rad)
     max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
     shift = _longest(
-        tool_points(joints_rad + step if ratio > ROUNDING_FACTOR else wanted_rad) - here
+        tool_points(joints_rad + step if ratio > ROUNDING_FACTOR else desired_rad) - here
     )
     if ratio <= ROUNDING_FACTOR and shift <= ROUNDING_FACTOR * max_shift_m:
-        return wanted_rad
+        return desired_rad
     while shift > max_shift_m:
         step = step * (0.99 * max_shift_m / shift)
         shift = _longest(tool_points(joints_rad + step) - here)
@@ -283,7 +283,8 @@ def relax_limits(
 ) -> SheetLimits:
     """Widen the limits where the arms (world poses) exceed them, or nearly do.
 
-    A motion that begins beyond a limit may lead back, and not further.  left: see `check_sheet`.
+    A motion that starts beyond a limit may return within it, but not go further.  left: see
+    `check_sheet`.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     apart = other_flange[:3, 3] - flange[:3, 3]

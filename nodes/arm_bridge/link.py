@@ -18,14 +18,14 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""Longest time that counters may stand still.  Two exchanges within a controller's cycle (7.1 ms)
-may see the same counters; 50 ms are seven such cycles."""
+"""Longest time for which counters may be unchanged.  Two exchanges within a controller's cycle of
+7.1 ms may return the same counters; 50 ms are seven cycles."""
 
 _COUNTER_PERIOD = 2**32
 
 
 class ArmLinkError(FlexsheetError):
-    """An exchange with an arm failed; the text gives the reason in one line."""
+    """A failed exchange with an arm; the text gives the reason in one line."""
 
     code = "arm-link"
     remedy = "Check the arm's address, power, cable and program."
@@ -78,7 +78,7 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """Classify the age of measured joints by the controller's counters."""
+    """Age of measured joints by the controller's counters."""
 
     FIRST = "first"
     """The first answer since the start of the link or of the controller."""
@@ -98,7 +98,7 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """Compare a controller's 32-bit counters from answer to answer; they may wrap."""
+    """Monitor of a controller's 32-bit counters, which may wrap around."""
 
     def __init__(self) -> None:
         self._last: tuple[int, ...] = ()
@@ -134,7 +134,7 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """Hold an arm's answer: measured joints (6,) rad, its faults, and its freshness."""
+    """Answer of an arm: measured joints (6,) rad, faults, and freshness."""
 
     joints_rad: Floats
     faults: tuple[ArmFault, ...]
@@ -142,7 +142,7 @@ class ArmStatus:
 
 
 class ArmLink(Protocol):
-    """Exchange commands and answers with one arm, one exchange at a time.
+    """Interface for the exchange of commands and answers with one arm, one exchange at a time.
 
     Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
     joints), `hold` and `stop` (stay).

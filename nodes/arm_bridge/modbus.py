@@ -1,4 +1,4 @@
-"""Exchange with an arm by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
+"""Exchange commands by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
 
 `COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
 docs/modbus.md from them.  Numbers of 32 bits take two registers, high word first.  The
@@ -44,7 +44,7 @@ STATUS_ADDRESS = 100
 
 @dataclass(frozen=True, slots=True)
 class RegisterField:
-    """Define one entry of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
+    """Field of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
 
     name: str
     kind: str
@@ -54,13 +54,11 @@ class RegisterField:
 
 COMMAND = (
     RegisterField("magic", "H", 1, "0x4653, the letters FS"),
-    RegisterField("version", "H", 1, "of this map: 1"),
+    RegisterField("version", "H", 1, "version of this map: 1"),
     RegisterField(
         "sequence", "I", 1, "increases with every command; an `idle` command may restart it"
     ),
-    RegisterField(
-        "time_us", "I", 1, "when the command was made, sender's clock, wraps after 71 minutes"
-    ),
+    RegisterField("time_us", "I", 1, "time of the command, sender's clock, wraps after 71 minutes"),
     RegisterField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
     RegisterField("reserved", "H", 1, "0"),
     RegisterField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
@@ -69,10 +67,10 @@ COMMAND = (
 
 STATUS = (
     RegisterField("magic", "H", 1, "0x4653"),
-    RegisterField("version", "H", 1, "of this map: 1"),
+    RegisterField("version", "H", 1, "version of this map: 1"),
     RegisterField("accepted", "I", 1, "sequence of the last accepted command"),
     RegisterField("cycle", "I", 1, "the controller's cycles since its start"),
-    RegisterField("time_us", "I", 1, "when the joints were measured, controller's clock"),
+    RegisterField("time_us", "I", 1, "time of the joint measurement, controller's clock"),
     RegisterField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
     RegisterField(
         "faults",
@@ -115,7 +113,7 @@ _STATUS_REGISTERS = register_count(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """Hold the contents of a status block."""
+    """Contents of a status block."""
 
     accepted: int
     cycle: int
@@ -143,7 +141,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
     """Decode a status block; raises ArmAnswerError with what is wrong."""
     if len(registers) != _STATUS_REGISTERS:
-        raise ArmAnswerError(f"status of {len(registers)} registers, wanted {_STATUS_REGISTERS}")
+        raise ArmAnswerError(f"status of {len(registers)} registers, expected {_STATUS_REGISTERS}")
     whole = struct.pack(f">{len(registers)}H", *registers)
     magic, version, accepted, cycle, time_us, state, faults, *rest = struct.unpack(
         _STATUS_FORMAT, whole
@@ -151,10 +149,10 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     *joints, refused, crc = rest
     if magic != MAGIC:
         raise ArmAnswerError(
-            f"status magic 0x{magic:04x}, wanted 0x{MAGIC:04x}: another register map"
+            f"status magic 0x{magic:04x}, expected 0x{MAGIC:04x}: another register map"
         )
     if version != VERSION:
-        raise ArmAnswerError(f"register map version {version}, wanted {VERSION}")
+        raise ArmAnswerError(f"register map version {version}, expected {VERSION}")
     if crc != zlib.crc32(whole[:-4]):
         raise ArmAnswerError("status block fails its CRC")
     if state >= len(STATES):
@@ -173,7 +171,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 
 
 class _Framer(FramerSocket):
-    """Fail the pending request when an answer cannot be decoded.
+    """Framer that fails the pending request when an answer cannot be decoded.
 
     The library raises the error into the event loop.  That ends the connection, prints a trace,
     and lets the request wait for its time-out.
@@ -200,7 +198,7 @@ class _Framer(FramerSocket):
 
 
 class ModbusLink:
-    """Implement `ArmLink` by one Modbus TCP connection to one arm.
+    """`ArmLink` by one Modbus TCP connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
     hand a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The

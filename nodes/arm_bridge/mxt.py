@@ -1,7 +1,7 @@
 """Exchange with a Mitsubishi controller by real-time external control (MXT) over UDP.
 
-A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`; from then on the controller
-takes one command packet in each of its cycles and answers each with what it measured.  Packets
+A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`; then the controller
+reads one command packet in each of its cycles and answers with its measurements.  Packets
 are 196 bytes, little-endian, of fixed-width fields.  `PACKET` is their layout; docs/mxt.md states
 which parts the manufacturer documents and which public sources leave open.
 """
@@ -48,7 +48,7 @@ MAX_PLAUSIBLE_RAD = 4.0 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class PacketField:
-    """Define one entry of the packet.
+    """Field of the packet.
 
     kind: a struct code, H (u16), I (u32), f (float32) or x (pad).
     """
@@ -62,14 +62,22 @@ class PacketField:
 PACKET = (
     PacketField("command", "H", 1, "0 none, 1 move, 255 end"),
     PacketField(
-        "send_type", "H", 1, "of `data`: 0 none, 1 pose, 2 joints, 3 pulses; in an answer 0 to 11"
+        "send_type",
+        "H",
+        1,
+        "type of `data`: 0 none, 1 pose, 2 joints, 3 pulses; in an answer 0 to 11",
     ),
     PacketField(
         "receive_type", "H", 1, "requested type of the answer's `data`: 0 to 11; 8 measured joints"
     ),
     PacketField("reserved", "x", 2, "0"),
     PacketField("data", "f", 8, "joints in rad, or x y z in mm and a b c in rad; the rest 0"),
-    PacketField("flags", "I", 2, "of a pose: structure (4 right, 2 above, 1 nonflip), and turns"),
+    PacketField(
+        "flags",
+        "I",
+        2,
+        "structure of a pose (4 right, 2 above, 1 nonflip), and number of revolutions",
+    ),
     PacketField("send_io_type", "H", 1, "0: no signals"),
     PacketField("receive_io_type", "H", 1, "0: no signals"),
     PacketField("bit_top", "H", 1, "0"),
@@ -93,7 +101,7 @@ _PACKET = struct.Struct(struct_format(PACKET))
 
 @dataclass(frozen=True, slots=True)
 class MxtStatus(ArmStatus):
-    """Hold the contents of an answer; count and timeouts are counters of the controller."""
+    """Contents of an answer; count and timeouts are counters of the controller."""
 
     count: int
     timeouts: int
@@ -145,7 +153,7 @@ def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
 def decode_answer(packet: bytes) -> MxtStatus:
     """Decode an answer; raises ArmAnswerError with what is wrong."""
     if len(packet) != PACKET_BYTES:
-        raise ArmAnswerError(f"answer of {len(packet)} bytes, wanted {PACKET_BYTES}")
+        raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
     command, send_type, receive_type, *data, _, _, _, _, _, _, _, timeouts, count = _PACKET.unpack(
         packet
     )
@@ -154,7 +162,7 @@ def decode_answer(packet: bytes) -> MxtStatus:
     # The manual puts the answer's type in both fields; one of them may be empty.
     if {send_type, receive_type} - {TYPE_NONE} != {TYPE_JOINTS_MEASURED}:
         raise ArmAnswerError(
-            f"answer of types {send_type} and {receive_type}, wanted {TYPE_JOINTS_MEASURED}"
+            f"answer of types {send_type} and {receive_type}, expected {TYPE_JOINTS_MEASURED}"
         )
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
@@ -168,7 +176,7 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 
 
 class MxtLink:
-    """Implement `ArmLink` for a controller that runs an `Mxt` program.
+    """`ArmLink` for a controller that runs an `Mxt` program.
 
     The socket, and so the port that the controller answers to, stays open.  Late answers are
     dropped before the next command.  The controller's counter detects the rest, since it must

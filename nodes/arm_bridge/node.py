@@ -37,7 +37,7 @@ class ArmBridge(Node):
     def replay_refusal(cls, parameters: Any) -> str:
         return (
             "it commands an arm, whose answers are in the bag only as this node's output; "
-            "`bag verify planner` shows the targets that it got"
+            "`bag verify planner` checks the targets that it received"
         )
 
     async def setup(self) -> None:
@@ -88,7 +88,7 @@ class ArmBridge(Node):
             self.log.warning("arming refused", reason=refusal)
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
-        """Use a target when it arrives; at the next periodic command it would be 7 ms older."""
+        """Use a target when it arrives; the next periodic command would be up to 7 ms later."""
         if self._control.is_idle:
             return
         async with self._cycling:
@@ -100,7 +100,7 @@ class ArmBridge(Node):
     async def cycle(self) -> None:
         """Send periodic commands between targets, and without any."""
         if self._geometry is None:
-            self.note = "waits for a scene"
+            self.note = "waiting for a scene"
             return
         now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
         if self._control.is_idle:
@@ -145,7 +145,7 @@ class ArmBridge(Node):
         control.on_measurement(status.joints_rad, status.faults, status.freshness)
 
     def _read_goal(self) -> Goal | None:
-        """Return the newest sheet target, extrapolated to when this cycle's command acts."""
+        """Return the newest sheet target, extrapolated to the time when this command acts."""
         target = self.sheet_target.message
         if target is None:
             return None

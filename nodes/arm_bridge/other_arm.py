@@ -14,15 +14,15 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_FUTURE_S = 0.02
-"""Largest accepted age below zero.  Measured clock offsets are smaller.  A state from the future
-would otherwise stay fresh until its time has come."""
+"""Maximum time of a state in the future.  Measured clock offsets are smaller.  Without this limit,
+a future state would count as fresh until its time."""
 
 
 @dataclass(frozen=True)
 class OtherArm:
-    """Hold the other arm's joints (6,) rad, its world poses (4, 4), its mode and its state's age.
+    """State of the other arm: joints (6,) rad, world poses (4, 4), mode, faults, and its age.
 
-    ready: it may move.  estop_engaged: its bridge holds an e-stop.
+    ready: whether it may move.  estop_engaged: whether its bridge has latched an e-stop.
     """
 
     joints_rad: Floats
@@ -56,7 +56,7 @@ class OtherArm:
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
             return "its flange is not a rigid pose"
         if self.age_s < -MAX_FUTURE_S:
-            return f"it is of {-self.age_s:.3g} s in the future"
+            return f"it is stamped {-self.age_s:.3g} s in the future"
         return None
 
     @property

@@ -16,14 +16,14 @@ from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 class ArmBridgeParameters(NodeParameters):
     """Parameters of `arm_bridge`."""
 
-    side: Side
+    side: Side = Field(description="arm of the scene that this bridge commands")
     host: DeviceHost = Field(default="127.0.0.1", description="address of the arm's controller")
-    port: DevicePort = 5020
+    port: DevicePort = Field(default=5020, description="port of the arm's controller")
     rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0, description="rate of commands")
     resting_rate_hz: float = Field(
         default=40.0, ge=20.0, le=1000.0, description="rate of commands to an idle arm"
     )
-    driver: Driver = "modbus"
+    driver: Driver = Field(default="modbus", description="protocol of the arm's controller")
     timeout_s: Positive | None = Field(
         default=None, description="longest wait for an answer; null: the driver's default"
     )
@@ -34,7 +34,8 @@ class ArmBridgeParameters(NodeParameters):
         default=None, description="period of the targets; null: the period of the scene's camera"
     )
     hold_after_s: Positive = Field(
-        default=0.02, description="lateness of a target or of the other arm after which it holds"
+        default=0.02,
+        description="lateness of a target or of the other arm after which it decelerates",
     )
     stop_after_s: Positive = Field(
         default=0.1, description="lateness of a target or of the other arm after which it stops"
@@ -47,6 +48,6 @@ class ArmBridgeParameters(NodeParameters):
     )
     arming: Literal["manual", "auto"] = Field(
         default="manual",
-        description="manual: a person arms it with `flexsheet arms enable`, at first and after "
+        description="manual: the operator arms it with `flexsheet arms enable`, at first and after "
         "each stop; auto: it arms itself, only for simulated arms",
     )

@@ -1,7 +1,7 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-Each bridge knows both arms' joints.  It simulates the sheet's motion, and checks at each position
-whether both arms hold it within their limits.  A check takes some milliseconds and therefore runs
+Each bridge receives both arms' joints.  It simulates the sheet's motion and checks at each pose
+whether both arms are within their limits.  A check takes some milliseconds and therefore runs
 outside the cycle that sends commands.
 """
 
@@ -28,12 +28,13 @@ from flexsheet.nodes.arm_bridge.reach import (
     solve_step,
 )
 from flexsheet.nodes.arm_bridge.standstill import edge_shift_m
+from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
-# From rest to the target, where a person may touch the sheet: a quarter of the tool speed.
+# From rest to the target, while the user may touch the sheet: a quarter of the tool speed.
 START_BOUNDS = SheetBounds(
     speed_m_per_s=0.06,
     acceleration_m_per_s2=0.3,
@@ -75,7 +76,7 @@ PEAK_TO_MEAN_SPEED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PathCheckRequest:
-    """Hold a path to check: the sheet's start and target, and both arms' joints (6,) rad."""
+    """Path to check: the sheet's start and target, and both arms' joints (6,) rad."""
 
     start: SheetMotion
     goal: SheetMotion
@@ -83,7 +84,7 @@ class PathCheckRequest:
     other_rad: Floats
 
     def begins_at(self, own_rad: Floats, other_rad: Floats) -> bool:
-        """Return whether both arms still stand where the path begins."""
+        """Return whether both arms are still at the start of the path."""
         moved_rad = max(
             float(np.abs(own_rad - self.own_rad).max()),
             float(np.abs(other_rad - self.other_rad).max()),
@@ -123,14 +124,14 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Move an arm straight in its joints from where it stands onto the sheet's path.
+    """Straight motion in joint space of an arm from its position onto the sheet's path.
 
-    Two arms that a fault has stopped may hold the sheet twisted, skewed or at the end of a joint's
-    range.  No pose of a flat sheet may exist there that both can hold.
+    After a fault, the arms may have stopped with a twisted or skewed sheet, or at the end of a
+    joint's range.  Both arms may then have no solution for any pose of a flat sheet.
 
-    sheet: the first pose on the path that both arms can hold.
+    sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joints (6,) at both ends.
-    duration_s: equal for both arms; 0: they stand there already.
+    duration_s: equal for both arms; 0: they are there already.
     """
 
     sheet: SheetMotion
@@ -141,14 +142,12 @@ class Alignment:
     def joints_at(self, time_s: float) -> Floats:
         """Return the joints (6,) rad at a time since the start."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
-        eased: Floats = self.from_rad + part * part * (3.0 - 2.0 * part) * (
-            self.to_rad - self.from_rad
-        )
-        return eased
+        joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
+        return joints
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return how this arm begins on the path, or why an arm cannot follow it.
+    """Return the alignment of this arm to the path, or why an arm cannot follow the path.
 
     The reason names the arm, the limit and the position.
     """
@@ -191,7 +190,7 @@ def _check_alignment(
 ) -> None:
     """Raise PathError unless both arms can move straight in their joints between two steps.
 
-    The limits of the sheet hold all along, except those that are exceeded at the beginning.
+    The limits of the sheet apply to the whole motion, relaxed where the start exceeds them.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -237,7 +236,7 @@ def _find_duration_s(begin: PathStep, there: PathStep) -> float:
 
 
 class PathChecker:
-    """Check one path after another in a thread, so that the cycles continue meanwhile."""
+    """Checker of one path after another in a thread, in parallel with the cycles."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -248,7 +247,7 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request with its result, or None; call in every cycle.
 
-        A request is started while none runs.
+        The given request starts if no other one runs.
         """
         if self._running is None:
             if request is not None:

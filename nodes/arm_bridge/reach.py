@@ -1,7 +1,7 @@
-"""Check whether the arms can hold the sheet: at many poses at once, and along a path.
+"""Check whether the arms can reach poses of the sheet: many at once, and along a path.
 
 Poses of the sheet are (n, 4, 4) in the world with stretch ratios (n,); joints are (n, 6) rad.  A
-limit's margin is positive where the limit holds.  Margins of speeds are fractions of the limit.
+limit's margin is positive within the limit.  Margins of speeds are fractions of the limit.
 Both edges follow from the sheet's pose and stretch, so they always agree.
 """
 
@@ -93,7 +93,7 @@ DETOURS_M = (
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
-    """Hold poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
+    """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
 
     twists: k motions (m/s, rad/s) of the sheet's centre that the arms must follow from each pose;
     k may be 0.
@@ -119,10 +119,10 @@ class SheetPoses:
 
 @dataclass(frozen=True, slots=True)
 class ArmReach:
-    """Hold how one arm reaches n poses of the sheet on one branch.
+    """Joints and margins of one arm for n poses of the sheet on one branch.
 
     joints_rad: (n, 6), NaN out of reach.
-    margins: (n,) for each of `LIMITS`; NaN where they need joints that do not exist.
+    margins: (n,) for each of `LIMITS`; NaN without joints where they depend on joints.
     """
 
     branch: Branch
@@ -139,18 +139,18 @@ class ArmReach:
 
     @property
     def reachable(self) -> Bools:
-        """Return whether the arm can hold its edge there, (n,), at rest."""
+        """Return whether the arm can reach each pose at rest, (n,)."""
         binding = self.binding
         return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
     def trackable(self) -> Bools:
-        """Return whether the arm can also follow the twists from there, (n,)."""
+        """Return whether the arm can also follow the twists from each pose, (n,)."""
         return np.asarray(self.binding < 0)
 
 
 def flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
-    """Return world_from_flange (n, 4, 4) of an arm that holds its edge of the sheet."""
+    """Return world_from_flange (n, 4, 4) of an arm for poses of the sheet."""
     width = geometry.sheet_limits.width_m
     outwards = -0.5 if geometry.left else 0.5
     edges = places.world_from_sheet.copy()
@@ -175,7 +175,7 @@ def compute_reach(
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
     """Return the reach on the branch with most reachable poses, then with the largest margins.
 
-    An arm cannot change its branch while it holds the sheet, so one branch serves all poses.
+    An arm cannot change its branch with the sheet clamped, so one branch serves all poses.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -184,8 +184,8 @@ def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPose
     def merit(branch: Branch) -> tuple[float, float]:
         reach = compute_reach(geometry, other, still, branch)
         ranges = np.stack([reach.margins[limit] for limit in RANGES])
-        room = np.where(np.isfinite(ranges), ranges, -np.pi).min(axis=0)
-        return float(reach.reachable.sum()), float(np.minimum(room, 0.2).sum())
+        margin = np.where(np.isfinite(ranges), ranges, -np.pi).min(axis=0)
+        return float(reach.reachable.sum()), float(np.minimum(margin, 0.2).sum())
 
     return compute_reach(geometry, other, places, max(BRANCHES, key=merit))
 
@@ -205,9 +205,9 @@ def _margins(
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     away = singularities(joints)
-    spot = flanges[:, :3, 3]
-    inside = np.minimum(spot - limits.workspace_min_m, limits.workspace_max_m - spot)
-    apart = np.linalg.norm(spot - others[:, :3, 3], axis=1)
+    position = flanges[:, :3, 3]
+    inside = np.minimum(position - limits.workspace_min_m, limits.workspace_max_m - position)
+    apart = np.linalg.norm(position - others[:, :3, 3], axis=1)
     force = np.array(
         [
             edge_force_n(
@@ -220,17 +220,17 @@ def _margins(
             for stretch in places.stretch_ratio.tolist()
         ]
     )
-    room = np.minimum(joints - joint_limits.min_rad, joint_limits.max_rad - joints)
+    margin = np.minimum(joints - joint_limits.min_rad, joint_limits.max_rad - joints)
     base_from_flange = geometry.base_from_world @ flanges
     wrist = base_from_flange[:, :3, 3] - FLANGE_M * base_from_flange[:, :3, 2]
     reach = MAX_WRIST_M - np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M], axis=1)
-    # Slightly beyond the reach joints exist still, with J3 out of its range.
+    # Slightly beyond the reach, joints still exist with J3 out of its range.
     reachable = np.isfinite(joints).all(axis=1)
     speeds, tool_speed = _speeds(geometry, branch, joints, flanges, places)
     spare = 1.0 - speeds / joint_limits.speed_rad_per_s
     return {
         "reach": np.where(reachable, np.maximum(reach, 0.0), np.minimum(-np.abs(reach), -1e-9)),
-        **{name: room[:, joint] for joint, name in enumerate(RANGES)},
+        **{name: margin[:, joint] for joint, name in enumerate(RANGES)},
         "shoulder singularity": away.shoulder_m - SHOULDER_NEAR_M,
         "elbow singularity": away.elbow_rad - ELBOW_NEAR_RAD,
         "wrist singularity": away.wrist_rad - WRIST_NEAR_RAD,
@@ -285,11 +285,11 @@ def _joint_rates(
     """Return joint speeds (n, 6) for a motion of the sheet, by central differences of the IK."""
     found = []
     for time_s in (-SPEED_STEP_S, SPEED_STEP_S):
-        turn = _small_rotations(angular * time_s)
+        rotation_step = _small_rotations(angular * time_s)
         moved = flanges.copy()
-        moved[:, :3, :3] = turn @ flanges[:, :3, :3]
+        moved[:, :3, :3] = rotation_step @ flanges[:, :3, :3]
         arm = flanges[:, :3, 3] - centre
-        moved[:, :3, 3] = centre + linear * time_s + np.einsum("nij,nj->ni", turn, arm)
+        moved[:, :3, 3] = centre + linear * time_s + np.einsum("nij,nj->ni", rotation_step, arm)
         found.append(joints_on_branch(geometry.base_from_world @ moved, branch, CENTRE_RAD))
     change = found[1] - found[0]
     return np.asarray((change - 2.0 * np.pi * np.rint(change / (2.0 * np.pi))) / (2 * SPEED_STEP_S))
@@ -305,7 +305,7 @@ def _small_rotations(vectors: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SheetPath:
-    """Hold a path of the sheet that both arms can follow: m poses from start to goal.
+    """Path of the sheet that both arms can follow: m poses from start to goal.
 
     left_rad, right_rad: joints (m, 6) of both arms, on one branch each.
     times_s: (m,) from 0, the shortest within the speed limits of joints and edges.
@@ -321,7 +321,7 @@ class SheetPath:
 
 @dataclass(frozen=True, slots=True)
 class PathStep:
-    """Hold a pose on a path, and the joints (6,) of both arms there."""
+    """Pose on a path with the joints (6,) of both arms."""
 
     sheet: SheetMotion
     left_rad: Floats
@@ -329,7 +329,7 @@ class PathStep:
 
 
 class PathError(FlexsheetError, ValueError):
-    """The arms cannot move the sheet along a path; names the arm, the limit and the position.
+    """A path that the arms cannot follow; the text names arm, limit and position.
 
     limit: of `LIMITS`, or "jump".  fraction: position on the straight path, 0..1.
     """
@@ -470,23 +470,23 @@ def _explain_jump(
 
 
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Return the joints (6,) with which an arm may begin: given ones, or of each branch in range.
+    """Return the possible joints (6,) at the start: the given ones, or one per branch in range.
 
     The branch with the largest distance to the ranges comes first.
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
     pose = arm.base_from_world @ flange_poses(arm, _make_poses([start]))[0]
-    turns = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
+    revolutions = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
     lowest, highest = arm.joint_limits.min_rad, arm.joint_limits.max_rad
     found: list[tuple[float, Floats]] = []
     for solution in branches(pose, CENTRE_RAD):
-        turned = np.array(solution)[:, None] + turns
-        room = np.minimum(turned - lowest[:, None], highest[:, None] - turned)
-        joints = turned[np.arange(6), room.argmax(axis=1)]
-        found.append((float(room.max(axis=1).min()), joints))
+        rotated = np.array(solution)[:, None] + revolutions
+        margin = np.minimum(rotated - lowest[:, None], highest[:, None] - rotated)
+        joints = rotated[np.arange(6), margin.argmax(axis=1)]
+        found.append((float(margin.max(axis=1).min()), joints))
     found.sort(key=lambda one: -one[0])
-    in_range = [joints for room, joints in found if room >= 0.0]
+    in_range = [joints for margin, joints in found if margin >= 0.0]
     return in_range or [_solve_joints(arm, start, CENTRE_RAD, fraction=0.0)]
 
 
@@ -546,8 +546,8 @@ def solve_step(
 def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
     """Return the resting sheet at a fraction of the straight path between two poses."""
     begin, end = start.world_from_sheet, goal.world_from_sheet
-    turn = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)
-    rotation = rotation_from_vector(fraction * turn) @ begin[:3, :3]
+    rotation_vector = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)
+    rotation = rotation_from_vector(fraction * rotation_vector) @ begin[:3, :3]
     position = begin[:3, 3] + fraction * (end[:3, 3] - begin[:3, 3])
     stretch = start.stretch_ratio + fraction * (goal.stretch_ratio - start.stretch_ratio)
     return SheetMotion(transform(rotation, position), np.zeros(6), stretch, 0.0)
@@ -567,9 +567,9 @@ def _check_limits(
     track: Sequence[PathStep],
     via: tuple[float, float, float] | None,
 ) -> SheetPath:
-    """Return the path if all its poses keep the limits of both arms; raises PathError otherwise.
+    """Return the path if all poses are within the limits of both arms; raises PathError otherwise.
 
-    A limit that is violated at the start must not be violated further.
+    A limit that is violated at the start must not be violated more.
     """
     places = _make_poses([step.sheet for step in track])
     joints = (

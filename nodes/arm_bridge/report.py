@@ -13,10 +13,10 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 
 @dataclass(slots=True)
 class LastExchange:
-    """Hold times of the newest exchange with the arm, in ns of this computer's clock; 0: never.
+    """Times of the newest exchange with the arm, ns on this computer's clock; 0: never.
 
     target, received_ns: header and arrival of the sheet target behind the command.
-    sent_ns, measured_ns: when the command was sent, and when an answer last arrived.
+    sent_ns, measured_ns: times of the last command and of the last answer.
     """
 
     target: Header | None = None
@@ -26,7 +26,7 @@ class LastExchange:
     duration_s: float = 0.0
 
     def on_answer(self, now_ns: int) -> None:
-        """Store when the answer has arrived."""
+        """Store the time of the answer."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
 
 

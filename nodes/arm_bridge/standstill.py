@@ -13,14 +13,14 @@ STANDSTILL_COUNT = 5
 """Number of fresh, unchanged measurements in a row that are a standstill."""
 
 SETTLED_COUNT = 100
-"""Number for an arm that does not stand at its last command.  A measurement that lags by 0.7 s has
-reached it by then."""
+"""The same number for an arm that is not at its last command.  Within this time, a measurement
+with a lag of 0.7 s has reached the arm's position."""
 
 STANDSTILL_RAD = 1e-3
 """Largest difference of unchanged measurements; encoder noise is 200 times smaller."""
 
 JOINT_LEVER_M = np.array([0.6, 0.6, 0.4, 0.2, 0.2, 0.15])
-"""Upper bound of the distance from each joint's axis to the edge that the arm holds."""
+"""Upper bound of the distance from each joint's axis to the arm's edge of the sheet."""
 
 MAX_RESTART_SHIFT_M = 0.005
 """Largest distance of the edge from its command at a restart from the measurement.  Joint servos
@@ -28,8 +28,8 @@ with a lag of 15 ms or more cover 5 mm with less than 0.25 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
 JUMP_SPEED_RAD_PER_S = 0.5
-"""Margin and speed by which measurements may change without a command.  A person may move the arm
-with its teach pendant."""
+"""Margin and speed by which measurements may change without a command.  The operator may move
+the arm with its teach pendant."""
 
 OVERSPEED = 1.5
 """Factor by which an arm may exceed its commanded speed while it catches up."""
@@ -47,7 +47,7 @@ def edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
 
 
 class StandstillMonitor:
-    """Count fresh, unchanged measurements since the last command that moved the arm.
+    """Counter of fresh, unchanged measurements since the last command that moved the arm.
 
     is_alive: some measurements differ in the last digits, as encoders do.  A frozen reading repeats
     itself exactly.
@@ -68,6 +68,7 @@ class StandstillMonitor:
 
     @property
     def is_alive(self) -> bool:
+        """Return whether the measurements show the noise of encoders."""
         return self._alive
 
     def restart(self) -> None:

@@ -27,7 +27,7 @@ class State(Enum):
     ARMED = "at rest, ready"
     ARMED_TAUT = "at rest, ready; the sheet may be taut"
     CHECKING = "at rest, ready; checks the path to the target"
-    CHECKING_TAUT = "as CHECKING; the sheet may be taut"
+    CHECKING_TAUT = "like CHECKING; the sheet may be taut"
     FOLLOW = "moves with the sheet's target, after an alignment"
     HOLD = "decelerates or rests because an input is late; stays ready"
     PAUSING = "decelerates; stays ready"
@@ -46,8 +46,8 @@ class Event(Enum):
     WATCHDOG_TRIPPED = "the arm's own watchdog has stopped it"
     SCENE_CHANGED = "a scene has arrived"
     RESET = "a reset clears e-stop and faults; accepted only at rest"
-    ARM = "a person, or `arming: auto`, lets the arm move"
-    INTERLOCK = "something forbids motion: no target, a fault of the other arm, a person"
+    ARM = "the operator, or `arming: auto`, arms the arm"
+    INTERLOCK = "no target, a fault of the other arm, or the operator forbids motion"
     ISOLATED = "the other arm is silent or e-stopped, or the clocks are not synchronized"
     FAULT = "a fault is latched"
     ESTOP = "an e-stop is latched"
@@ -74,7 +74,7 @@ RELAXING = frozenset({S.RELAX})
 
 CHECKING_STATES = frozenset({S.CHECKING, S.CHECKING_TAUT})
 READY_STATES = ARMED_AT_REST | TRACKING | PAUSING_STATES
-"""States in which a person, or `arming: auto`, lets the arm move."""
+"""States in which the arm is armed by the operator or by `arming: auto`."""
 MOTION_STATES = TRACKING | PAUSING_STATES | STOPPING_STATES | RELAXING
 """States in which commands may change the joints."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import chosen
+from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
@@ -178,7 +178,7 @@ class EyeViewRequester:
     @property
     def correction(self) -> Correction:
         """Return the correction chosen at the console, or that of the scene."""
-        return chosen(self.chosen_correction, self._by_scene, "two_pass")
+        return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
         """Return the duration of the current state, s."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.topics import Topic, topic_named
+from flexsheet.messages.topics import Topic, find_topic
 from flexsheet.messages.wire import WireError, decode
 
 M = TypeVar("M", bound=Message)
@@ -41,7 +41,7 @@ class LatestMessages:
         """Return the latest message; see `MessageSource`."""
         frames = self._frames.pop(name, None)
         if frames is not None:
-            topic = topic_named(name)
+            topic = find_topic(name)
             try:
                 self._opened[name] = decode(frames, topic)
             except WireError as error:

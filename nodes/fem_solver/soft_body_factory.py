@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from flexsheet.messages.methods import SoftBodyMethod, chosen
+from flexsheet.messages.methods import SoftBodyMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
@@ -32,7 +32,7 @@ def choose_method(
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
-    spacing_m = chosen(skin_spacing_m, by_scene_m, SKIN_SPACING_M)
+    spacing_m = resolve_method(skin_spacing_m, by_scene_m, SKIN_SPACING_M)
     if method == "auto" and choice is not None and choice.method == "linear":
         return "linear", spacing_m
     return method, spacing_m

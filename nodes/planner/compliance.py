@@ -7,7 +7,7 @@ remaining indentation i = d - r is the one at which the sheet's model gives the 
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-While the sheet lags behind, a growing offset takes energy from a finger that pushes, so it damps.
+While the sheet lags behind, a growing offset removes energy from a pushing finger, so it damps.
 An advance (r falls with d) adds energy.  With a lag t and a sheet stiffness k it acts as a damper
 of -k a t, where a is the advance per depth.  Therefore the advance is bounded.  The stretch is the
 least one that renders the curve without an advance, or else the one with the smallest advance.
@@ -47,12 +47,12 @@ USABLE_FRACTION = 0.85
 """Fraction of the maximum edge force and strain that is planned with.
 
 The bridges stop the arms where commanded or measured poses reach the limits.  Two moving arms are
-never exactly as far apart as planned, since each sees the other a cycle or two late.
+never exactly as far apart as planned, since each receives the other's state a cycle or two late.
 """
 
 FORCE_JND_FLOOR_N = 0.05
-"""Lower bound on the reference of relative force errors.  Smaller forces are known to a tenth at
-best: those of the first 2 mm in an object of 4 kPa."""
+"""Lower bound on the reference of relative force errors.  The relative error of smaller forces is
+at least a tenth, as in the first 2 mm of an object of 4 kPa."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
 """Up to the first force, of the object or the sheet, the sheet does not advance; from the second on
@@ -65,7 +65,7 @@ TARGET_ERROR_RATIO = 0.10
 """Relative error of the rendered force that is aimed for."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""Smallest relative difference of stiffness that people notice.  The first: with the deformation of
+"""Smallest relative difference of stiffness that users notice.  The first: with the deformation of
 the skin as a cue (Bergmann Tiest & Kappers 2009); the second: without work or terminal force as a
 cue (Tan et al. 1995)."""
 
@@ -81,7 +81,7 @@ STRETCH_CANDIDATES = 17
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
-    """Raised for force curves that are not finite, not ascending, or too short."""
+    """A force curve that is not finite, not ascending, or too short."""
 
     code = "force-curve"
     remedy = "Give force over depth from zero, rising, without repeated depths."
@@ -89,7 +89,7 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """Hold the object's force over depth: rows (n,) from (0, 0), ascending.
+    """Force of the object over depth: rows (n,) from (0, 0), ascending.
 
     Between the rows it is a monotone cubic, beyond the last a straight line with the last slope.
     """
@@ -137,7 +137,7 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """Hold the limits of the sheet and of the arms that stretch it."""
+    """Limits of the sheet and of the arms that stretch it."""
 
     min_stretch_ratio: float
     max_stretch_ratio: float
@@ -173,15 +173,15 @@ def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """Hold what a stretch renders at one position, a row per depth (n,).
+    """Forces that a stretch renders at one position, with a row per depth (n,).
 
-    edge_force_n: on each clamp.
+    edge_force_n: force on each clamp.
     advance_per_depth: maximum advance of the sheet towards the finger.
     force_limited: whether the limit of the edge force reduced the indentation.
     """
 
     depths_m: Floats
-    wanted_n: Floats
+    object_force_n: Floats
     force_n: Floats
     stiffness_n_per_m: Floats
     indentation_m: Floats
@@ -191,13 +191,16 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
+        """Distance of the sheet behind the object's tangent plane, (n,)."""
         return self.depths_m - self.indentation_m
 
     @property
     def error_ratio(self) -> Floats:
-        """Rendered over wanted force, minus one (n,); 0 where neither can be felt."""
-        felt = np.maximum(self.wanted_n, self.force_n) >= FORCE_JND_FLOOR_N
-        difference = (self.force_n - self.wanted_n) / np.maximum(self.wanted_n, FORCE_JND_FLOOR_N)
+        """Rendered over object's force, minus one (n,); 0 if neither can be felt."""
+        felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
+        difference = (self.force_n - self.object_force_n) / np.maximum(
+            self.object_force_n, FORCE_JND_FLOOR_N
+        )
         result: Floats = np.where(felt, difference, 0.0)
         return result
 
@@ -231,11 +234,11 @@ def render_force(
     the finger.  It grows by at most 1 + `limits.max_advance_per_depth` per depth.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
-    wanted = curve.force_n(depths)
+    desired = curve.force_n(depths)
     ideal = depth_for_force(
         model,
         stretch_ratio,
-        wanted,
+        desired,
         max_depth_m=(1.0 + limits.max_advance_per_depth) * max_depth_m,
         position_m=position_m,
         finger_radius_m=finger_radius_m,
@@ -243,7 +246,7 @@ def render_force(
     without_offset = model.evaluate(
         stretch_ratio, depths, position_m=position_m, finger_radius_m=finger_radius_m
     )
-    ideal = _apply_deadband(depths, ideal, np.maximum(wanted, without_offset.force_n))
+    ideal = _apply_deadband(depths, ideal, np.maximum(desired, without_offset.force_n))
     max_indentation = _indentation_for_edge_force(
         model,
         limits.edge_force_n,
@@ -261,7 +264,7 @@ def render_force(
     slopes = np.diff(indentation) / np.diff(depths)
     return RenderedForce(
         depths_m=depths,
-        wanted_n=wanted,
+        object_force_n=desired,
         force_n=rendered.force_n,
         stiffness_n_per_m=rendered.stiffness_n_per_m,
         indentation_m=indentation,
@@ -319,10 +322,10 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """Hold how one object is rendered with one stretch: the sheet's offset for each depth.
+    """Compliance of the sheet with one stretch: its offset for each depth in one object.
 
     stretch_ratio: constant over the push.
-    note: what the sheet cannot render and by how much; empty if nothing.
+    note: which forces the sheet cannot render, and the error; empty if none.
     centre: the whole push at the sheet's centre.
     """
 
@@ -490,12 +493,12 @@ def fit_at_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return what the sheet cannot render of a push, and by how much; empty if nothing."""
+    """Return which forces of a push the sheet cannot render, and the error; empty if none."""
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
     if off.any():
         # The largest difference in newtons is the first that a finger notices.
-        at = int(np.argmax(np.where(off, np.abs(rendered.force_n - rendered.wanted_n), 0.0)))
+        at = int(np.argmax(np.where(off, np.abs(rendered.force_n - rendered.object_force_n), 0.0)))
         cause = (
             "the edge force is at its limit"
             if rendered.force_limited
@@ -505,15 +508,15 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
         return (
             f"object is {kind} than the sheet can present: {100 * abs(error[at]):.0f} % {than} at "
             f"{1e3 * rendered.depths_m[at]:.0f} mm ({rendered.force_n[at]:.2f} of "
-            f"{rendered.wanted_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; {cause}; "
-            f"people notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
+            f"{rendered.object_force_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; "
+            f"{cause}; users notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
         )
     uncertainty = force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
             f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
             f"sheet's position is {100 * uncertainty:.0f} % of the force at "
-            f"{1e3 * rendered.depths_m[-1]:.0f} mm; people notice {100 * WEBER_RATIO:.0f} to "
+            f"{1e3 * rendered.depths_m[-1]:.0f} mm; users notice {100 * WEBER_RATIO:.0f} to "
             f"{100 * WEBER_RATIO_BARE:.0f} %"
         )
     return ""
@@ -522,12 +525,12 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
 def force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
     """Return the relative change of the force at maximum depth by an error of the position."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
-    return change / max(float(rendered.wanted_n[-1]), 1e-9)
+    return change / max(float(rendered.object_force_n[-1]), 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class StretchChoice:
-    """Hold a stretch that renders an object's stiffness; `note` reports where it cannot."""
+    """Stretch that renders an object's stiffness; `note` reports an unreachable stiffness."""
 
     stretch_ratio: float
     note: str
@@ -549,17 +552,17 @@ def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     """Return the stretch for an object of that stiffness (N/m, small pushes), without an offset.
 
-    It follows from the linear model, which knows neither the object's curve nor the fingertip.
+    It follows from the linear model, which ignores the object's curve and the fingertip.
     """
     least, largest = stretch_range(sheet)
-    wanted = stretch_for_edge_force(
+    desired = stretch_for_edge_force(
         edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
         young_modulus_pa=sheet.young_modulus_pa,
         width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    stretch = min(max(wanted, least), largest)
+    stretch = min(max(desired, least), largest)
     force = edge_force_n(
         stretch,
         young_modulus_pa=sheet.young_modulus_pa,
@@ -569,8 +572,8 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     )
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     note = ""
-    if wanted < least:
+    if desired < least:
         note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {rendered:.0f}"
-    elif wanted > largest:
+    elif desired > largest:
         note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {rendered:.0f}"
     return StretchChoice(stretch, note)

@@ -33,7 +33,7 @@ COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 
 
 class ComplianceController:
-    """Compute the sheet's stretch and normal offset for the object under the finger.
+    """Controller of the sheet's stretch and normal offset for the object under the finger.
 
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
         small pushes by the stretch alone, as the paper does.

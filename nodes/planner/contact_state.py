@@ -48,7 +48,7 @@ MIN_LIFT_M = 2e-4
 
 @dataclass(frozen=True, slots=True)
 class ContactLimits:
-    """Hold the limits of the sheet's motion, and the thresholds of contact.
+    """Limits of the sheet's motion, and thresholds of contact.
 
     front: unit normal (3,) of the side that faces the user.
     max_tilt_rad: maximum angle between the front and a normal.
@@ -70,9 +70,9 @@ class ContactLimits:
 
 @dataclass(frozen=True, slots=True)
 class ContactCommand:
-    """Hold what the sheet is to present: a contact, and the sheet's motion there.
+    """Contact for the sheet, and the sheet's motion there.
 
-    twist: (6,) of the sheet's centre in the object's frame.
+    twist: (6,) of the sheet's centre in the object's frame, m/s and rad/s.
     """
 
     phase: Phase
@@ -83,19 +83,19 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """Raised for an object that the sheet cannot present; the message names what to change."""
+    """An object that the sheet cannot present; the text names what to change."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
 
 
 class ContactStateMachine:
-    """Compute the contact command of one finger, step by step."""
+    """State machine of the contact of one finger: approach, contact and hold."""
 
     def __init__(self, shape: Shape, home: Floats, limits: ContactLimits) -> None:
-        """home: the sheet's axes (3, 3) while it waits; the third is close to `limits.front`.
+        """Start at the object's front; raises UnpresentableError if its normal exceeds the tilt.
 
-        Raises UnpresentableError for an object that turns no side to the front.
+        home: axes (3, 3) of the waiting sheet; the third is close to `limits.front`.
         """
         max_tilt_rad = min(limits.max_tilt_rad, MAX_TILT_RAD)
         self._shape, self._home = shape, home
@@ -155,8 +155,8 @@ class ContactStateMachine:
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
         """Return the contact on the sheet at its current pose.
 
-        A sheet on its way to the finger is met at its current point and rotation; from then on it
-        neither slips nor spins.
+        The finger touches a moving sheet at its current point and rotation; then the sheet neither
+        slips nor spins.
         """
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
@@ -164,7 +164,7 @@ class ContactStateMachine:
         return replace(contact, axes=axes, position_sheet_m=np.clip(point_sheet[:2], -limit, limit))
 
     def _roll(self, finger: Floats, velocity: Floats) -> ContactCommand:
-        """Roll the sheet to the finger, or hold it with the reason."""
+        """Roll the sheet to the finger, or stop it with the reason."""
         contact, limits = self.contact, self._limits
         depth = max(0.0, -contact.height_m(finger))
         moved, self._finger = finger - self._finger, finger

@@ -1,4 +1,4 @@
-"""Cache the table of a sheet's force, which takes a minute or two to compute."""
+"""Cache the table of a sheet's force, whose computation needs one to two minutes."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
 
 @dataclass(frozen=True, slots=True)
 class JerkBounds:
-    """Hold the maximum jerk of the sheet's centre, rotation and stretch ratio."""
+    """Maximum jerk of the sheet's centre, rotation and stretch ratio."""
 
     jerk_m_per_s3: float
     turn_jerk_rad_per_s3: float
@@ -41,7 +41,7 @@ class JerkBounds:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimitedState:
-    """Hold a sheet's motion and the state from which the next step continues.
+    """Motion of a sheet, and the state from which the next step continues.
 
     mean_velocity, acceleration: (7,) over the last step: linear, angular, stretch ratio.
     """
@@ -60,17 +60,17 @@ class JerkLimitedState:
 def limit_jerk(
     mean_velocity: Floats,
     acceleration: Floats,
-    wanted_velocity: Floats,
+    goal_velocity: Floats,
     *,
     max_acceleration: float,
     max_jerk: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return mean velocity and acceleration (n,) of the next step towards a wanted velocity (n,).
+    """Return mean velocity and acceleration (n,) of the next step towards a goal velocity (n,).
 
     The acceleration never exceeds its limit, and never changes by more than max_jerk step_s.
     """
-    change = wanted_velocity - mean_velocity
+    change = goal_velocity - mean_velocity
     size = float(np.linalg.norm(change))
     goal = np.zeros_like(change)
     if size > 0.0:
@@ -83,7 +83,7 @@ def limit_jerk(
     after = acceleration + step
     error = float(np.linalg.norm(after * step_s - change))
     reached = length <= max_length and error <= 1e-12 * size
-    return wanted_velocity.copy() if reached else mean_velocity + after * step_s, after
+    return goal_velocity.copy() if reached else mean_velocity + after * step_s, after
 
 
 def step_sheet(
@@ -99,7 +99,7 @@ def step_sheet(
 
     With the target None, the sheet is brought to rest.
     """
-    wanted = (
+    goals = (
         np.zeros(7)
         if target is None
         else _desired_velocities(now.sheet, target, bounds, edges, step_s)
@@ -114,7 +114,7 @@ def step_sheet(
         mean[part], acceleration[part] = limit_jerk(
             now.mean_velocity[part],
             now.acceleration[part],
-            wanted[part],
+            goals[part],
             max_acceleration=max_acceleration,
             max_jerk=max_jerk,
             step_s=step_s,

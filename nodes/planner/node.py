@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import SheetForceMethod, chosen
+from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import Fingertip, SheetTarget, SoftBody
@@ -60,7 +60,7 @@ class Planner(Node):
         self._trajectory = self._compliance = None
         self._trajectory = SheetTrajectoryPlanner(scene, self.parameters.trajectory_settings())
         if self._calibration is None:
-            method: SheetForceMethod = chosen(
+            method: SheetForceMethod = resolve_method(
                 self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
             )
             model, self._model_note = load_force_model(scene, method, self.parameters.cache_dir)
@@ -118,8 +118,8 @@ class Planner(Node):
             return 0.0
         before_s = self._horizon_s
         max_s = (len(fingertip.predicted_path_world_m) - 1) * fingertip.prediction_step_s
-        wanted_s = age_s + self.parameters.actuation_delay_s
-        self._horizon_s = next_horizon_s(before_s, wanted_s, max_s)
+        needed_s = age_s + self.parameters.actuation_delay_s
+        self._horizon_s = next_horizon_s(before_s, needed_s, max_s)
         return self._horizon_s - before_s
 
     def _publish(self, planned: PlannedStep, source_ns: int) -> None:

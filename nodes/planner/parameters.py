@@ -18,6 +18,8 @@ from flexsheet.nodes.planner.trajectory import TrajectorySettings
 
 
 class PlannerParameters(NodeParameters):
+    """Parameters of `planner`."""
+
     prediction_horizon_s: NonNegative | None = Field(
         default=None,
         description="time from the exposure for which the sheet is planned; null: the "
@@ -56,19 +58,25 @@ class PlannerParameters(NodeParameters):
     max_spin_rad: Positive = Field(
         default=0.35, description="maximum rotation of the sheet about its normal by rolling"
     )
-    speed_m_per_s: Positive = Field(default=0.18, description="maximum, of the sheet's centre")
-    acceleration_m_per_s2: Positive = Field(default=2.0, description="maximum, of the centre")
+    speed_m_per_s: Positive = Field(default=0.18, description="maximum speed of the sheet's centre")
+    acceleration_m_per_s2: Positive = Field(
+        default=2.0, description="maximum acceleration of the sheet's centre"
+    )
     turn_rad_per_s: Positive = Field(default=2.0, description="maximum angular speed")
     turn_acceleration_rad_per_s2: Positive = Field(
         default=12.0, description="maximum angular acceleration"
     )
-    stretch_rate_per_s: Positive = Field(default=0.03, description="maximum, of the stretch ratio")
-    stretch_acceleration_per_s2: Positive = Field(
-        default=0.3, description="maximum, of the stretch ratio"
+    stretch_rate_per_s: Positive = Field(
+        default=0.03, description="maximum rate of the stretch ratio"
     )
-    jerk_m_per_s3: Positive = Field(default=60.0, description="maximum, of the sheet's centre")
+    stretch_acceleration_per_s2: Positive = Field(
+        default=0.3, description="maximum acceleration of the stretch ratio"
+    )
+    jerk_m_per_s3: Positive = Field(default=60.0, description="maximum jerk of the sheet's centre")
     turn_jerk_rad_per_s3: Positive = Field(default=1000.0, description="maximum angular jerk")
-    stretch_jerk_per_s3: Positive = Field(default=9.0, description="maximum, of the stretch ratio")
+    stretch_jerk_per_s3: Positive = Field(
+        default=9.0, description="maximum jerk of the stretch ratio"
+    )
 
     def trajectory_settings(self) -> TrajectorySettings:
         """Return the limits of the planned trajectory."""

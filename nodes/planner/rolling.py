@@ -34,11 +34,11 @@ RIM_RADIUS_M = 0.03
 
 @dataclass(frozen=True, slots=True)
 class SheetContact:
-    """Hold where the sheet touches the object.
+    """Contact of the sheet with the object.
 
     point, normal: (3,) of the surface.
     shape_operator: (3, 3), 1/m.
-    axes: (3, 3), the sheet's as columns; the third is the normal.
+    axes: (3, 3), columns: axes of the sheet; the third is the normal.
     position_sheet_m: (x, y) of the contact on the sheet.
     lift_m: distance of the sheet's plane from the point, where the object is concave.
     """
@@ -52,7 +52,7 @@ class SheetContact:
 
     @property
     def nearest(self) -> Nearest:
-        """The surface point in the form that shapes return."""
+        """The contact's surface point as a result of `Shape.closest`."""
         no = np.zeros((), dtype=bool)
         return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, no, no)
 
@@ -68,14 +68,14 @@ class SheetContact:
 
 
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
-    """Rotate axes (3, 3) by the least rotation that takes their third to `normal`.
+    """Rotate axes (3, 3) by the smallest rotation that maps the third one to `normal`.
 
     That is parallel transport along the shorter arc between both normals; it is undefined for
     opposite ones.  The result is exactly orthogonal.
     """
     both = axes[:, 2] + normal
-    # Two reflections (Householder): one takes the negated third axis to the normal; the one across
-    # the plane of the first two axes leaves those unchanged.  Together: the least rotation.
+    # Two reflections (Householder): one maps the negated third axis to the normal; the one across
+    # the plane of the first two axes leaves those unchanged.  This is the smallest rotation.
     result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
     result[:, 2] = normal
     return result
@@ -104,7 +104,7 @@ def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
 
 
 def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> SheetContact:
-    """Return the contact of a sheet that waits at a surface point, for a finger that approaches.
+    """Return the contact of a sheet at a surface point, waiting for an approaching finger.
 
     Its axes are those of `home` (3, 3), transported to the normal.  The contact is on the sheet's
     horizontal centre line.  Along x the sheet's centre stays over the object's, within the sheet.
@@ -129,7 +129,7 @@ def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
 def tangent_twist(contact: SheetContact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
     """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
 
-    Its axes follow from `home` by the least rotation.  Besides n x dn, that rotates them about the
+    The smallest rotation from `home` gives its axes.  Besides n x dn, it rotates them about the
     normal n by -(h x n) dn / (1 + h n), where h is the third axis of home.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
@@ -166,8 +166,8 @@ def limit_tilt(
     Also return whether it is another point than `found`.
 
     start: the surface point from which the search starts, itself within the tilt.  The search
-        follows the straight line to `found` in growing steps and projects each onto the surface, so
-        that it stays on the sheet's side.  It begins with the finest step, which is enough for a
+        follows the straight line to `found` in growing steps and projects each onto the surface,
+        which keeps it on the sheet's side.  The first step is the smallest one; it suffices for a
         sheet that is at the limit already.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))

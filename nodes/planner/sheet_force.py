@@ -117,7 +117,7 @@ MakeTable = Callable[[Scene], TabulatedSheetModel]
 def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) -> Family:
     """Return the family: every model from slack to maximum stretch, over depths and positions.
 
-    make_table: loads or computes the table; None: leave out the models that take minutes.
+    make_table: loads or computes the table; None: omit the models that need minutes.
     """
     return Family(
         name="sheet-force",

@@ -13,10 +13,11 @@ AGE_WEIGHT = 0.05
 
 
 class MonotonicTimestampFilter:
-    """Pass fingertips in the order of their exposures.
+    """Filter that passes fingertips in the order of their exposures.
 
-    A late fingertip is dropped, because the sheet has been planned past it.  `RESTART_COUNT` late
-    ones in a row mean that the clock has stepped back; the filter then restarts with the last one.
+    A late fingertip is dropped, because the sheet is already planned for a later time.
+    `RESTART_COUNT` late ones in a row mean that the clock has stepped back; the filter then
+    restarts with the last one.
     """
 
     def __init__(self) -> None:
@@ -39,13 +40,13 @@ class MonotonicTimestampFilter:
         return first_step_s if last_ns is None else (source_ns - last_ns) * 1e-9
 
 
-def next_horizon_s(horizon_s: float, wanted_s: float, max_s: float) -> float:
+def next_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
     """Return the prediction horizon (s) of the next target.
 
     The horizon follows slowly, so that one late fingertip does not make the sheet's time jump.
 
     horizon_s: of the last target.
-    wanted_s: from the exposure until the sheet reaches the target.
+    needed_s: from the exposure until the sheet reaches the target.
     max_s: end of the fingertip's predicted path.
     """
-    return horizon_s + AGE_WEIGHT * (min(max(wanted_s, 0.0), max_s) - horizon_s)
+    return horizon_s + AGE_WEIGHT * (min(max(needed_s, 0.0), max_s) - horizon_s)

@@ -42,7 +42,7 @@ MAX_STEP_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
-    """Hold the result of one step, in the world frame.
+    """Result of one step, in the world frame.
 
     contact_sheet_m: (x, y) of the contact on the sheet.
     normal_offset_m: distance of the sheet behind the object's tangent plane.
@@ -58,7 +58,7 @@ class PlannedStep:
 
 @dataclass(frozen=True, slots=True)
 class TrajectorySettings:
-    """Hold the limits of the trajectory.
+    """Limits of the trajectory.
 
     contact_on_m, contact_off_m: distances from the sheet at which contact begins and ends.
     tilt_margin_rad: angle by which the sheet may exceed the scene's tilt.
@@ -74,10 +74,10 @@ class TrajectorySettings:
 
 
 class SheetTrajectoryPlanner:
-    """Plan the sheet's motion about one object."""
+    """Planner of the sheet's motion on one object."""
 
     def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
-        """Raise UnpresentableError for an object that turns no side to the front."""
+        """Start at the object's front; raises UnpresentableError if its normal exceeds the tilt."""
         pose, sheet = scene.object.world_from_object, scene.sheet
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._object_from_world = inverse(self._world_from_object)
@@ -158,11 +158,11 @@ class SheetTrajectoryPlanner:
 
     @property
     def in_contact(self) -> bool:
-        """Return whether the finger was in contact when it was last seen."""
+        """Return whether the last valid finger was in contact."""
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
-        """Return the sheet `step_s` later, while nothing is known of the finger: it stops."""
+        """Return the sheet `step_s` later, decelerated because the finger is unknown."""
         self._advance(None, step_s)
         phase: Phase = "wait" if self._command.phase == "wait" else "hold"
         return self._make_step(

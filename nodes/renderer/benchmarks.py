@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Cylinder, Scene, cylinder_of
+from flexsheet.messages.scene import Cylinder, Scene, require_cylinder
 from flexsheet.messages.types import Correction, Display, Pattern
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
@@ -104,7 +104,7 @@ def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | Non
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
-    radius = cylinder_of(scene).radius_m
+    radius = require_cylinder(scene).radius_m
     axis = pose_matrix(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m

@@ -6,7 +6,7 @@ import asyncio
 from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import chosen
+from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
@@ -76,7 +76,7 @@ class Renderer(Node):
         self._output.open((scene.projector.width_px, scene.projector.height_px))
         given = self.parameters
         if self.display.message is None:
-            correction = chosen(given.correction, scene.methods.correction, "two_pass")
+            correction = resolve_method(given.correction, scene.methods.correction, "two_pass")
             self._shown = self._shown.model_copy(update={"correction": correction})
         stage = SceneRenderer(
             scene,
@@ -84,7 +84,9 @@ class Renderer(Node):
             spacing_m=given.spacing_m,
             samples=given.samples,
             dents=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
-            sheet_shape=chosen(given.sheet_shape, scene.methods.sheet_shape, "reduced_order"),
+            sheet_shape=resolve_method(
+                given.sheet_shape, scene.methods.sheet_shape, "reduced_order"
+            ),
         )
         latency = DisplayLatencyEstimator(
             first_s=given.prediction_horizon_s,

@@ -9,7 +9,7 @@ import numpy as np
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
-from flexsheet.messages.methods import chosen
+from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
 from flexsheet.nodes.node import Input, Node, Output
@@ -54,9 +54,9 @@ class Triangulator(Node):
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
         self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
         self.reasons: Counter[FingertipReason] = Counter()
-        marker = chosen(p.marker, scene.methods.marker, "subpixel_fit")
-        triangulation = chosen(p.triangulation, scene.methods.triangulation, "dlt")
-        tracking = chosen(p.tracking, scene.methods.tracking, "singer_tremor")
+        marker = resolve_method(p.marker, scene.methods.marker, "subpixel_fit")
+        triangulation = resolve_method(p.triangulation, scene.methods.triangulation, "dlt")
+        tracking = resolve_method(p.tracking, scene.methods.tracking, "singer_tremor")
         self.methods = f"{marker}, {triangulation}, {tracking}"
         self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
         self.config = DetectorConfig(

@@ -268,7 +268,7 @@ class Session:
                     self.latencies[event] = Spread(self.grid)
                 self.latencies[event].add(index, (at_ns - exposure_ns) * 1e-9)
         if header.clock_id != self.clock_id:
-            message, header, _ = self._table.localised(message, header, log_ns)
+            message, header, _ = self._table.localize(message, header, log_ns)
         self.errors.add(message, header.source_ns)
         match message:
             case ArmState():
