@@ -144,7 +144,7 @@ def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_sai
             if count == 2:
                 lab.scheduler.kill()
 
-        with pytest.raises(LostWorkersError, match="table continues"):
+        with pytest.raises(LostWorkersError, match="continues from the finished"):
             solve_all([*jobs, job(0.002)], executor, parts, leave)
 
 

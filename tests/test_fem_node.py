@@ -373,7 +373,7 @@ async def test_a_late_method_is_left_for_a_quicker_one_and_that_is_said(
     clock = bench.node.clock
     assert isinstance(clock, VirtualClock)
     linear = bench.node._bodies["linear"]
-    bench.node._use([linear, replace(linear, method=Named(linear.method, "other"))])
+    bench.node._set_bodies([linear, replace(linear, method=Named(linear.method, "other"))])
     respond = SceneBody.respond
 
     def timed(body: SceneBody, *rest: Any) -> Any:

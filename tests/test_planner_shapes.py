@@ -568,7 +568,7 @@ def test_a_finger_that_is_none_is_held(
                 "triangles": np.zeros((0, 3), dtype=np.int64),
                 "smoothing_m": 0.003,
             },
-            "bounds no solid",
+            "cannot bound a solid",
         ),
     ],
 )

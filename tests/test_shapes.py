@@ -272,9 +272,9 @@ def test_bad_queries_are_refused_and_far_ones_answered(shape: Shape) -> None:
         with pytest.raises(ValueError, match="NaN, infinity or positions beyond"):
             shape.signed_distance(bad)
     for wrong in (1.0, [0.0, 0.0], np.zeros((2, 2, 3))):
-        with pytest.raises(ValueError, match="wanted"):
+        with pytest.raises(ValueError, match="expected shape"):
             shape.closest(wrong)
-    with pytest.raises(ValueError, match="previous of shape"):
+    with pytest.raises(ValueError, match="previous: expected shape"):
         shape.closest(np.zeros(3), previous=np.zeros((2, 3)))
     far = shape.closest(np.array([3e5, -4e5, 5e5]))
     assert np.isfinite(far.point).all()
@@ -292,7 +292,7 @@ def test_bad_queries_are_refused_and_far_ones_answered(shape: Shape) -> None:
     ],
 )
 def test_measures_that_make_no_solid_are_refused(measures: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"length|half the least size"):
+    with pytest.raises(ValueError, match=r"length|half the minimum"):
         make_shape(measures)
 
 

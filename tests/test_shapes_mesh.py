@@ -337,7 +337,7 @@ def test_a_mesh_that_is_convex_hardly_rises() -> None:
 
 def test_what_is_no_solids_surface_is_refused() -> None:
     vertices, triangles = cube()
-    with pytest.raises(MeshError, match="bounds no solid"):
+    with pytest.raises(MeshError, match="cannot bound a solid"):
         SmoothMeshShape(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), 0.01)
     with pytest.raises(MeshError, match="not closed: 3 edges"):
         check_mesh(vertices, triangles[1:])
@@ -351,7 +351,7 @@ def test_what_is_no_solids_surface_is_refused() -> None:
         check_mesh(vertices, np.concatenate([triangles, triangles]))
     with pytest.raises(MeshError, match="NaN"):
         check_mesh(np.where(vertices == vertices[0], np.nan, vertices), triangles)
-    with pytest.raises(MeshError, match="not among the 8"):
+    with pytest.raises(MeshError, match=r"outside 0\.\.7"):
         check_mesh(vertices, triangles + 1)
     collapsed = vertices.copy()
     collapsed[1] = collapsed[0]
@@ -359,7 +359,7 @@ def test_what_is_no_solids_surface_is_refused() -> None:
         check_mesh(collapsed, triangles)
     with pytest.raises(ValueError, match="smoothing_m"):
         SmoothMeshShape(vertices, triangles, 0.0)
-    with pytest.raises(MeshError, match="no mesh"):
+    with pytest.raises(MeshError, match="expected vertices"):
         check_mesh(np.zeros((4, 2)), triangles)
 
 
@@ -379,7 +379,7 @@ def test_a_fold_is_refused() -> None:
     # A thin blade whose two sides meet at two degrees.
     vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0.05, 0], [0.05, 0.05, 0.0005]])
     triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    with pytest.raises(MeshError, match="lie on one another"):
+    with pytest.raises(MeshError, match="are folded"):
         check_mesh(vertices, triangles)
 
 
@@ -403,7 +403,7 @@ def test_refinement_keeps_the_surface() -> None:
     assert volume_m3(fine_vertices, fine) == pytest.approx(0.04**3)
     assert np.isclose(np.abs(fine_vertices).max(axis=1), 0.02).all()
     assert np.isclose(np.degrees(dihedrals_rad(vertices, triangles)[1]).max(), 90.0)
-    with pytest.raises(MeshError, match="smooth over a longer"):
+    with pytest.raises(MeshError, match="increase the edge length"):
         refine_facets(vertices, triangles, 1e-5)
 
 

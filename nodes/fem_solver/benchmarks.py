@@ -1,9 +1,9 @@
 """Measure the soft body's methods for `flexsheet chart soft-body`: linear, table, Newton.
 
-Full Newton solutions of one push on meshes of their own are the references. At each depth the
-reference is the finest mesh that reaches the depth. Its distance to the next finer one is the
-reference uncertainty. Where no mesh reaches the depth, the chart shows only the time and how far
-the skin moves.
+The references are full Newton solutions of one push on separate meshes. At each depth the
+reference is the finest mesh whose solution converged there. Its difference from the second finest
+is the reference uncertainty. Where no solution converged, the chart shows only the time and the
+maximum skin displacement.
 """
 
 from __future__ import annotations
@@ -48,25 +48,25 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""Skin spacings of the references: on meshes that are fine about the finger, in finger radii; on
-evenly fine meshes, in metres. The order is: the first of each, then the second of each. The meshes
-have nothing but the push in common."""
+"""Skin spacings of the reference meshes, from the most to the least accurate. Focused meshes are
+fine only near the finger (finger radii); even meshes have one spacing everywhere (m)."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
 NEWTON_STEP_M = 1e-4
 SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
-"""Offset of the push from the point nearest to the user: at no node of any mesh, so that no method
-has an advantage."""
+"""Offset of the push from the point nearest to the user. The pushed point is not a node of any
+mesh, so no method has an advantage."""
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
-"""Errors count farther than this many finger radii from the push, where the image shows skin."""
+"""Errors are evaluated farther than this from the push, in finger radii: the finger hides the
+rest."""
 FORCE = "force_error_percent"
 MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """A method's answer to a push: skin displacement (s, 3), m, and force (3,), N."""
+    """Result of a method for one push: skin displacement (s, 3), m, and force (3,), N."""
 
     @property
     def displacement(self) -> Floats | Floats32: ...
@@ -77,7 +77,7 @@ class SkinSolution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyBenchmark:
-    """One push of a scene's object, and the methods that are measured on it.
+    """Benchmark of the soft-body methods for one push of a scene's object.
 
     linear_m, table_m: skin spacings by method name. newton_m: depths of the full Newton method.
     focused, even_m: skin spacings of the references, in finger radii and in metres.
@@ -93,7 +93,7 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body by its linear method, precomputed if it is not cached."""
+        """Return the body with its linear method and model, from the cache or computed."""
         spec = make_soft_body_spec(self.scene, spacing_m)
 
         def log_start(done: int, total: int, need: WorkBudget) -> None:
@@ -122,7 +122,7 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return names and jobs of the references, the best first."""
+        """Return names and jobs of the references, the most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         for focused, even in zip(self.focused, self.even_m, strict=True):
@@ -135,7 +135,7 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return tables around the push, for the methods whose full table is not cached."""
+        """Return a table of the skin near the push for each method without a cached full table."""
         found = {}
         for name, spacing in self.table_m.items():
             body, model = self.linear(spacing)
@@ -144,14 +144,14 @@ class SoftBodyBenchmark:
         return found
 
     def prepare(self, on_progress: Progress) -> None:
-        """Solve and cache all jobs of references and tables; takes minutes the first time."""
+        """Solve and cache all jobs of the references and tables; the first call takes minutes."""
         jobs = [job for _, job in self.reference_jobs()]
         for table in self.local_tables().values():
             jobs += table.jobs
         solve_cached_jobs(jobs, self.cache_dir, on_progress)
 
     def reference_set(self) -> ReferenceSet:
-        """Return the references, solved if they are not cached."""
+        """Return the reference solutions, from the cache or computed."""
         sample, named = self.sample(), self.reference_jobs()
         solved = solve_cached_jobs([job for _, job in named], self.cache_dir, _ignore_progress)
         references = [
@@ -161,9 +161,10 @@ class SoftBodyBenchmark:
         return ReferenceSet(references, sample, self.scene)
 
     def trials(self) -> Iterator[Trial]:
-        """Yield each method at each depth.
+        """Yield one trial per method and depth.
 
-        The error (mm) is the largest of a skin node off the finger; the force error is extra.
+        The error is the maximum displacement error of the skin nodes outside the contact, mm. The
+        force error is an extra metric.
         """
         sample, references = self.sample(), self.reference_set()
         bodies = {name: self.linear(spacing)[0] for name, spacing in self.linear_m.items()}
@@ -185,7 +186,7 @@ class SoftBodyBenchmark:
         yield from self._newton_trials(references)
 
     def _newton_trials(self, references: ReferenceSet) -> Iterator[Trial]:
-        """Yield one step of the full Newton method, from the solution at a smaller depth."""
+        """Yield trials of one full Newton load step, each from the solution at a smaller depth."""
         if not self.newton_m:
             return
         job = make_focused_job(
@@ -223,7 +224,7 @@ class SoftBodyBenchmark:
 
 
 class ReferenceSet:
-    """The reference solutions of one push, the best first."""
+    """Reference solutions of one push, the most accurate first."""
 
     def __init__(
         self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene
@@ -241,9 +242,10 @@ class ReferenceSet:
         *,
         in_range: bool,
     ) -> Trial:
-        """Return the trial of a method at a depth, for skin nodes at rest (s, 3).
+        """Return the trial of a method at one depth.
 
-        The error is NaN where no reference reaches the depth.
+        rest: skin nodes at rest (s, 3). run: computes the method's solution. The error is NaN where
+        no reference converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = select_references(self._references, depth_m)
@@ -284,7 +286,7 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Report nothing: all jobs are cached by now."""
+    """Ignore progress: all jobs are cached."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
@@ -303,12 +305,12 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
 
 
 def linear_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the part of the benchmark that a node has ready at once."""
+    """Return the benchmark of the linear methods only, which need no long precomputation."""
     return replace(make_benchmark(scene), table_m={}, newton_m=())
 
 
 def table_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the part of the benchmark whose methods take minutes to precompute."""
+    """Return the benchmark of the nonlinear tables only, which take minutes to precompute."""
     return replace(make_benchmark(scene), linear_m={}, newton_m=())
 
 

@@ -31,15 +31,15 @@ Floats = NDArray[np.float64]
 def make_soft_body_spec(
     scene: Scene, skin_spacing_m: float, *, sticking: bool = False
 ) -> SoftBodySpec:
-    """Return what has to be precomputed for this scene's object.
+    """Return the specification of the precomputation for this scene's object.
 
-    Raises ValueError as `mesh_spec`, and for a skin spacing above the fingertip's radius. Such a
-    skin resists too much: twice at 1.7 times the radius, seven times at 7 times the radius.
+    Raises ValueError as `mesh_spec`, and for a skin spacing above the fingertip's radius. A coarser
+    skin is too stiff: the force is doubled at 1.7 radii and seven times too large at 7 radii.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
             f"skin_spacing_m: {skin_spacing_m:g} is more than finger.radius_m "
-            f"({scene.finger.radius_m:g}), so that the force would be far too large; lower "
+            f"({scene.finger.radius_m:g}), which makes the force far too large; reduce "
             "skin_spacing_m to the radius or less"
         )
     mesh = mesh_spec(scene, skin_spacing_m)
@@ -47,12 +47,15 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return what the nonlinear table of this body depends on."""
+    """Return the specification of this body's nonlinear table."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
 def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """Return the surface point (3,) nearest to a distant user; rest (s, 3): skin nodes."""
+    """Return the surface point (3,) nearest to the user.
+
+    rest: skin nodes at rest (s, 3).
+    """
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
     away = 2.0 * float(np.ptp(rest, axis=0).max())
     return shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
@@ -60,12 +63,11 @@ def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SceneBody:
-    """The soft body of a scene, posed in the world.
+    """Soft body of a scene with its pose in the world.
 
-    front (3,): the surface point nearest to the user, mesh frame. rest (s, 3): skin nodes, mesh
-    frame. linear_depth_m: the end of the linear method's range, where the stiffness is evaluated.
-    friction_ratio: the tangential over the normal force above which the finger slips; 0: it slides
-    freely.
+    front (3,): surface point nearest to the user, mesh frame. rest (s, 3): skin nodes, mesh frame.
+    linear_depth_m: maximum depth of the linear method, at which the stiffness is evaluated.
+    friction_ratio: friction coefficient; 0 means that the finger slides without friction.
     """
 
     method: SoftBodyMethod
@@ -81,10 +83,9 @@ class SceneBody:
     def respond(
         self, point_world: Floats, anchor: ContactAnchor | None
     ) -> tuple[Response, ContactAnchor | None]:
-        """Return the response to a fingertip at `point_world` (3,), and its contact anchor.
+        """Return the response to a fingertip at `point_world` (3,) and the new contact anchor.
 
-        anchor: the one that the previous call returned. Raises ValueError for a point that is not
-        finite.
+        anchor: as returned by the previous call. Raises ValueError for a point that is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
@@ -98,15 +99,14 @@ class SceneBody:
         tangential_n = float(np.linalg.norm(response.force_n - normal_n * query.normal))
         limit_n = self.friction_ratio * max(normal_n, 0.0)
         if tangential_n > limit_n:
-            # The tangential force is proportional to the drag: keep the fraction that friction can
-            # hold.
+            # The tangential force is proportional to the drag: reduce both to the friction limit.
             fraction = limit_n / tangential_n
             new_anchor = slide_anchor(self.shape, new_anchor, query.drag_m, fraction)
             response = self.method.respond(replace(query, drag_m=fraction * query.drag_m))
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response of the untouched body, with the stiffness at its front."""
+        """Return the response without contact, with the stiffness at the front point."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -117,7 +117,10 @@ class SceneBody:
         )
 
     def message(self, response: Response, *, horizon_s: float = 0.0) -> SoftBody:
-        """Return the response as a message; horizon_s: from exposure to the predicted finger."""
+        """Return the response as a message.
+
+        horizon_s: time from the camera exposure to the predicted fingertip, s.
+        """
         rotation = self.world_from_mesh[:3, :3]
         rotated = response.displacement @ rotation.T.astype(np.float32)
         return SoftBody(
@@ -142,8 +145,11 @@ def build_scene_body(
     max_depth_m: float,
     friction_ratio: float = 0.0,
 ) -> SceneBody:
-    """Return the soft body of a scene from its precomputed model; raises ValueError as its
-    parts."""
+    """Build the soft body of a scene from its precomputed model.
+
+    Raises ValueError for invalid depths, see `LinearSoftBody`, and an invalid pose, see
+    `world_from_mesh`.
+    """
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
     rest = model.response.rest
@@ -178,7 +184,7 @@ def build_scene_body(
 
 
 def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table) -> SceneBody:
-    """Return the same body with its nonlinear table as the method."""
+    """Return a copy of the body that uses the nonlinear table as its method."""
     method = TableSoftBody(
         model.response,
         model.response.rest[model.bounds],
@@ -192,9 +198,9 @@ def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Tab
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
-    """Return a response `lost_s` after the finger was lost.
+    """Return the response `lost_s` seconds after the finger was lost.
 
-    It stays for `hold_s` and then decays with the time constant `relax_s`.
+    It is constant for `hold_s` and then decays exponentially with the time constant `relax_s`.
     """
     if lost_s <= hold_s:
         return response
@@ -208,7 +214,7 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
-    """Return the expected fingertip position (3,), m, world, `horizon_s` after its exposure."""
+    """Return the predicted fingertip position (3,), m, world, `horizon_s` after the exposure."""
     return interpolate_path(
         fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
     )[0]

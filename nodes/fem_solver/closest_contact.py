@@ -16,17 +16,17 @@ Floats = NDArray[np.float64]
 
 MIN_CURVATURE_MARGIN = 0.3
 """Minimum distance of the fingertip from the centre of curvature, over the radius of curvature.
-Closer to it the nearest point would move ever faster, and the anchor stays."""
+Below it the nearest point is ill-conditioned, and the anchor is not moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactQuery:
-    """The contact of a fingertip with the undeformed object.
+    """Contact of a fingertip with the undeformed object.
 
-    normal: outward, at the surface point that is pushed. depth_m: of the fingertip below that
-    point, along the normal; negative outside. beyond_m: distance of the fingertip past the end of
-    the surface. drag_m (3,): displacement of the fingertip along the surface since it stuck there;
-    None: it slides.
+    surface (3,), normal (3,): pushed surface point and its outward normal. depth_m: depth of the
+    fingertip below that point along the normal, negative outside. beyond_m: distance of the
+    fingertip past the end of the surface. drag_m (3,): displacement of the fingertip along the
+    surface since it stuck there; None for a sliding finger.
     """
 
     surface: Floats
@@ -38,7 +38,7 @@ class ContactQuery:
 
 @dataclass(frozen=True, slots=True)
 class ContactAnchor:
-    """The surface point (3,) that a finger pushes, and its normal (3,)."""
+    """Surface point (3,) that a finger pushes, and its normal (3,)."""
 
     point: Floats
     normal: Floats
@@ -47,15 +47,15 @@ class ContactAnchor:
 def locate(
     shape: Shape, point: Floats, anchor: ContactAnchor | None
 ) -> tuple[ContactQuery, ContactAnchor | None]:
-    """Return the contact of a fingertip at `point` (3,), and the anchor for the next call.
+    """Return the contact of a fingertip at `point` (3,) and the anchor for the next call.
 
-    The contact point is the nearest surface point, with two exceptions where the anchor stays. One
-    is near the centre of curvature. The other is a nearest point on the far side of the body. So a
-    finger that is pushed through a body does not come out on the other side. Raises ValueError for
-    a point that is not finite.
+    The contact point is the nearest surface point, except in two cases that use the anchor: near
+    the centre of curvature, and where the nearest point is on the far side of the body. A finger
+    pushed through a body therefore stays in contact with the side that it entered. Raises
+    ValueError for a point that is not finite.
     """
     if not np.isfinite(point).all():
-        raise ValueError(f"the fingertip position {point} is not finite")
+        raise ValueError(f"fingertip position {point} is not finite")
     found = shape.closest(point, previous=None if anchor is None else anchor.point)
     height = float(found.height_m)
     if height > 0.0:
@@ -80,7 +80,7 @@ def locate_sticking(
         return query, new_anchor
     depth = float((anchor.point - point) @ anchor.normal)
     if depth <= 0.0:
-        # It has left its anchor, and touches another point.
+        # The finger left its anchor and touches another point.
         return query, new_anchor
     drag = point - anchor.point + depth * anchor.normal
     return ContactQuery(anchor.point, anchor.normal, depth, query.beyond_m, drag), anchor
@@ -89,7 +89,7 @@ def locate_sticking(
 def slide_anchor(
     shape: Shape, anchor: ContactAnchor, drag: Floats, fraction: float
 ) -> ContactAnchor:
-    """Return the anchor after the finger slid until `fraction` of its drag (3,) is left."""
+    """Return the anchor after the finger slid until `fraction` of its drag (3,) remains."""
     found = shape.closest(anchor.point + (1.0 - fraction) * drag, previous=anchor.point)
     return ContactAnchor(found.point, found.normal)
 
@@ -97,7 +97,7 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip above or below the tangent plane at a surface point."""
+    """Return the contact of a fingertip with the tangent plane at a surface point."""
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal
     return ContactQuery(

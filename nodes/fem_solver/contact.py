@@ -1,15 +1,14 @@
 """Solve the contact of a fingertip sphere with a linear soft body, without friction.
 
-The solution is smooth and independent of the path. The skin is sampled at fixed contact points,
-finer than the mesh. At a point that remains inside the finger, a penalty pressure acts in
-proportion to the remaining penetration. The nodal forces f then minimise the strictly convex energy
+The skin is sampled at fixed contact points, finer than the mesh. At each point a penalty pressure
+is proportional to the remaining penetration. The nodal forces f minimise the strictly convex energy
 
     1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2
 
-C is the compliance of the nodes and W holds the shape functions at the points. t_q is the
-penetration of the rigid finger at point q; d_q is the penalty stiffness times the area. So the
-solution is unique (no path dependence), and Lipschitz continuous in the finger's position (no
-popping). A semismooth Newton iteration (Qi & Sun 1993) finds it in a few small dense solves.
+C is the nodal compliance and W contains the shape functions at the contact points. t_q is the
+penetration of the rigid finger at point q; d_q is the penalty stiffness times the area. The
+solution is unique, independent of the path and Lipschitz continuous in the finger's position. A
+semismooth Newton iteration (Qi & Sun 1993) finds it in a few small dense solves.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ PENALTY_RATIO = 40.0
 POINT_SPACING_RATIO = 0.4
 """Maximum spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
-"""Beyond this fraction of the radius the fingertip continues as a cone, tangent to the sphere."""
+"""Beyond this fraction of its radius the sphere is extended by its tangent cone."""
 FACING = (0.2, 0.6)
-"""Cosines between the skin's normal and the push at which none and all of the penetration
-counts."""
+"""Cosines between skin normal and push direction between which the penetration's weight rises from
+0 to 1."""
 PAD_RATIO = 1.1
 """Half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
@@ -49,9 +48,9 @@ CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class SkinResponse:
-    """The response of a linear body to unit forces on its skin, for a Young's modulus of 1 Pa.
+    """Response of a linear body to unit forces on its skin, for a Young's modulus of 1 Pa.
 
-    rest (s, 3): skin nodes, metres, mesh frame. contact_nodes (m,): indices into the skin of the
+    rest (s, 3): skin nodes, m, mesh frame. contact_nodes (m,): indices into the skin of the
     nodes that can be loaded. normals (m, 3): outward. faces (f, 6): six-node triangles, indices
     into `contact_nodes`. compliance (m, m): inward displacement of node i under 1 N inward on node
     j; symmetric. influence (m, 3 s) float32: displacement of the whole skin under 1 N inward on
@@ -68,7 +67,7 @@ class SkinResponse:
 
 @dataclass(frozen=True, slots=True)
 class DragResponse:
-    """The response of the same body to unit forces along its skin, for 1 Pa.
+    """Response of a linear body to unit tangential forces on its skin, for 1 Pa.
 
     tangents (m, 2, 3): two directions along the skin at each contact node. compliance (2m, 2m):
     displacement along direction i under 1 N along direction j. influence (2m, 3 s) float32:
@@ -82,7 +81,7 @@ class DragResponse:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The response of a soft body to one finger position, mesh frame; see `messages.SoftBody`."""
+    """Response of a soft body to one finger position, mesh frame; see `messages.SoftBody`."""
 
     displacement: Floats32
     force_n: Floats
@@ -93,9 +92,9 @@ class Response:
 
 
 class SoftBodyMethod(Protocol):
-    """The interface of every soft body method.
+    """Interface of every soft body method.
 
-    name: as in the message. at_rest: displacement (n, 3) of the untouched skin.
+    name: as in the message. at_rest: displacement (n, 3) of the skin without contact, zero.
     """
 
     @property
@@ -105,13 +104,13 @@ class SoftBodyMethod(Protocol):
     def at_rest(self) -> Floats32: ...
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the stiffness (N/m) at the touchable point nearest to a surface point (3,), m."""
+        """Return the stiffness (N/m) at the touchable skin nearest to a surface point (3,)."""
         ...
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return force over depth at the touchable point nearest to a surface point (3,), m.
+        """Return the force curve at the touchable skin nearest to a surface point (3,).
 
-        (n, 2): depth (m) and force (N), both start at 0 and never fall.
+        Rows (n, 2) are depth (m) and force (N). Both start at 0 and never decrease.
         """
         ...
 
@@ -122,11 +121,11 @@ class SoftBodyMethod(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NormalContact:
-    """The solution of a normal contact.
+    """Solution of a frictionless contact.
 
-    Inward forces (k,) in N on the contact nodes `nodes` (k,); their sum (3,) on the finger. weights
-    (q, k), normals (q, 3), pressed_n (q,): shape functions, normals and normal forces of the points
-    in contact.
+    forces (k,): inward forces on the contact nodes `nodes` (k,), N. force_n (3,): total force on
+    the finger. weights (q, k), normals (q, 3), pressed_n (q,): shape functions, normals and normal
+    forces of the points in contact.
     """
 
     nodes: Ints
@@ -139,8 +138,11 @@ class NormalContact:
 
 @dataclass(frozen=True, slots=True)
 class Drag:
-    """Forces (k, 2) in N along the tangents of the nodes `nodes` (k,); their sum (3,) on the
-    finger."""
+    """Tangential contact forces.
+
+    forces (k, 2): along the tangents of the nodes `nodes` (k,), N. force_n (3,): total force on the
+    finger.
+    """
 
     nodes: Ints
     forces: Floats
@@ -148,8 +150,10 @@ class Drag:
 
 
 def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
-    """Return a depth that equals `depth_m` up to `linear_m` and then approaches `largest_m`
-    (C1)."""
+    """Return the depth limited smoothly (C1) to `largest_m`.
+
+    Up to `linear_m` it equals `depth_m`; beyond, it approaches `largest_m` exponentially.
+    """
     if depth_m <= linear_m:
         return depth_m
     span = largest_m - linear_m
@@ -157,8 +161,8 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 
 
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
-    """Return the depths of a force curve: dense where the contact grows, then up to the deepest
-    push."""
+    """Return the depths (m) of a force curve: dense up to `linear_m`, then geometric up to the
+    maximum push."""
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
         linear_m, max_push_m, max(2, round(4 * np.log2(max_push_m / linear_m)) // 2 + 1)
@@ -167,10 +171,9 @@ def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Flo
 
 
 def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
-    """Return contact points of a six-node triangle: shape functions (p, 6), local coordinates (p,
-    2).
+    """Return shape functions (p, 6) and local coordinates (p, 2) of contact points in a triangle.
 
-    The points are the centroids of divisions^2 equal parts.
+    The points are the centroids of divisions^2 equal parts of a six-node triangle.
     """
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(divisions) for j in range(divisions - i)]
     inverted = [(i + 2 / 3, j + 2 / 3) for i in range(divisions) for j in range(divisions - i - 1)]
@@ -179,7 +182,7 @@ def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
 
 
 class SphereContact:
-    """The contact problem of one body and one fingertip; holds no state between solves."""
+    """Stateless solver of the contact between one body and one spherical fingertip."""
 
     def __init__(
         self,
@@ -190,9 +193,10 @@ class SphereContact:
         finger_radius_m: float,
         penalty_ratio: float = PENALTY_RATIO,
     ) -> None:
-        """Set the smooth surface for contact queries.
+        """Sample the contact points of the skin.
 
-        shape: the smooth surface that the response's triangles approximate, in its own frame.
+        shape: the smooth surface that the response's triangles approximate, in the mesh frame.
+        penalty_ratio: see `PENALTY_RATIO`.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -201,7 +205,7 @@ class SphereContact:
         max_edge_m = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max())
         divisions = max(2, int(np.ceil(max_edge_m / (POINT_SPACING_RATIO * finger_radius_m))))
         self._shape, _ = sample_triangle(divisions)
-        # The finger is tracked above the smooth surface: contact is with that, not with the faces.
+        # Finger positions are relative to the smooth surface, so contact points are moved onto it.
         found = shape.closest((self._shape @ corners).reshape(-1, 3))
         self._points = found.point.reshape(len(corners), -1, 3)
         self._normals = found.normal.reshape(len(corners), -1, 3)
@@ -215,13 +219,12 @@ class SphereContact:
     def penetration(
         self, points: Floats, normals: Floats, centre: Floats, direction: Floats
     ) -> Floats:
-        """Return the depth of each point (q,), m, inside the rigid finger with its sphere at
-        `centre`.
+        """Return the penetration depth (q,), m, of points into the rigid finger.
 
-        points, normals (q, 3). direction (3,): outward normal that the finger came in against. Skin
-        on another side of the body, which faces across that direction, is not penetrated. Beyond
-        `FLANK_RATIO` of the radius the tangent cone continues the sphere, so that every point has a
-        finite, C1 value. The value is negative where the finger is clear of the skin.
+        points, normals (q, 3): skin points and outward normals. centre (3,): of the sphere.
+        direction (3,): outward surface normal at the contact; skin that faces another direction is
+        excluded (`FACING`). Beyond `FLANK_RATIO` of the radius the tangent cone extends the sphere,
+        so every point has a finite, C1 value. The value is negative outside the finger.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -235,8 +238,7 @@ class SphereContact:
         return result
 
     def solve(self, query: ContactQuery, depth_m: float) -> NormalContact | None:
-        """Return the contact at `depth_m` below `query.surface`; None where the finger does not
-        touch."""
+        """Return the contact at `depth_m` below `query.surface`; None without contact."""
         centre = query.surface + (self._radius - depth_m) * query.normal
         limit = FLANK_RATIO * self._radius
         widest = limit + max(depth_m, 0.0)
@@ -254,8 +256,7 @@ class SphereContact:
         reached = np.flatnonzero(depths > 0.0)
         if not len(reached):
             return None
-        # Points that the undeformed skin keeps clear of the finger are omitted: skin sinks around a
-        # push.
+        # Points outside the finger at rest are omitted: skin around a push moves inwards.
         face, point = near[reached // count], reached % count
         nodes, local = np.unique(self._response.faces[face], return_inverse=True)
         weights = np.zeros((len(reached), len(nodes)))
@@ -275,11 +276,11 @@ class SphereContact:
 
 
 class DragContact:
-    """The tangential load of a finger that sticks to the skin.
+    """Tangential contact of a finger that sticks to the skin.
 
-    Springs along the skin connect points in contact to the finger. Their stiffness is proportional
-    to the normal force at the point, so that contact begins and ends without a jump. The normal
-    push leaves tangential displacement free, and dragging does not change the normal forces.
+    Tangential springs connect the points in contact to the finger. Their stiffness is proportional
+    to the normal force at the point, so that contact starts and ends continuously. Normal and
+    tangential contact are not coupled.
     """
 
     def __init__(
@@ -287,11 +288,10 @@ class DragContact:
     ) -> None:
         self._response = response
         self._compliance = response.compliance / young_modulus_pa
-        self._give = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
+        self._full_load_slip_m = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
 
     def solve(self, contact: NormalContact, drag: Floats) -> Drag:
-        """Return the load of a finger that moved along the skin by `drag` (3,), m, since it
-        stuck."""
+        """Return the tangential forces after a displacement `drag` (3,), m, since sticking."""
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
         across = self._response.tangents[nodes]
@@ -299,23 +299,23 @@ class DragContact:
         # Tangential displacement at the points (3 q) due to the nodes' directions (2 k).
         moved = np.einsum("qk,kai,qij->qjka", contact.weights, across, along, optimize=True)
         moved = moved.reshape(-1, 2 * count)
-        ties = np.repeat(contact.pressed_n / self._give, 3)
+        springs = np.repeat(contact.pressed_n / self._full_load_slip_m, 3)
         target_drag = (along @ drag).ravel()
-        pulled = moved.T * ties
-        system = np.eye(2 * count) + pulled @ moved @ self._compliance[np.ix_(rows, rows)]
-        forces = np.linalg.solve(system, pulled @ target_drag).reshape(-1, 2)
+        loads = moved.T * springs
+        system = np.eye(2 * count) + loads @ moved @ self._compliance[np.ix_(rows, rows)]
+        forces = np.linalg.solve(system, loads @ target_drag).reshape(-1, 2)
         return Drag(nodes, forces, -np.einsum("ka,kai->i", forces, across))
 
 
 def solve_penalty_contact(
     weights: Floats, compliance: Floats, penalty: Floats, depths: Floats
 ) -> Floats:
-    """Return the nodal forces (k,) at the minimum of the module's energy.
+    """Return the nodal forces (k,) that minimise the contact energy (see the module docstring).
 
     weights W (q, k), compliance C (k, k), penalty d (q,), depths t (q,). Newton's method starts
-    from Hertz's estimate that half of the overlap is contact. Its full steps converge in two to
-    five iterations. Otherwise later steps are halved until the energy falls. Raises ArithmeticError
-    if even that does not converge.
+    from Hertz's estimate that half of the overlap is in contact. It usually converges in two to
+    five full steps; after `FULL_STEPS` a line search damps it. Raises ArithmeticError without
+    convergence.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))
@@ -356,10 +356,10 @@ def _search_step(
 
 
 class LinearSoftBody:
-    """The precomputed linear method: one contact solve, one product with the skin's table.
+    """Precomputed linear method: one contact solve and one product with the influence matrix.
 
-    Good to `linear_depth_m`.  Deeper pushes bend the skin no further than `max_depth_m`, are
-    flagged, and their force goes on growing in proportion to the depth.
+    The method is valid up to `linear_depth_m`. Deeper pushes are reported as out of range: the
+    deflection is limited to `max_depth_m`, and the force grows in proportion to the depth.
     """
 
     name = "linear"
@@ -377,11 +377,12 @@ class LinearSoftBody:
         push_depth_m: float | None = None,
         drag: DragResponse | None = None,
     ) -> None:
-        """bounds (b, 3): skin nodes that cannot be touched; pushes next to them are out of range.
-        push_depth_m: end of the force curve; None: `max_depth_m`. drag: for a finger that sticks;
-        None: pushes are answered without friction.
+        """Precompute the force curves of all touchable mesh corners.
 
-        Raises ValueError unless 0 < linear_depth_m < max_depth_m.
+        bounds (b, 3): skin nodes that cannot be touched; pushes next to them are out of range.
+        push_depth_m: end of the force curve; None for `max_depth_m`. drag: tangential response for
+        a sticking finger; None for no friction. Raises ValueError unless
+        0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
@@ -417,7 +418,7 @@ class LinearSoftBody:
         self._smoothing2 = max(float(max_edge_m), finger_radius_m) ** 2
 
     def respond(self, query: ContactQuery) -> Response:
-        """Return the response; every finite contact has one."""
+        """Return the response to a contact."""
         depth = saturate_depth(query.depth_m, self._linear, self._largest)
         contact = self.contact.solve(query, depth)
         curve = self.force_curve(query.surface)
@@ -444,38 +445,32 @@ class LinearSoftBody:
         )
 
     def _clears_bounds(self, surface: Floats) -> bool:
-        """Return whether a contact patch there lies fully on touchable skin."""
+        """Return whether the contact patch at a surface point contains touchable skin only."""
         if not len(self._bounds):
             return True
         return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force over depth at the end of the linear range, at the touchable point near
-        `surface`.
+        """Return force over depth (N/m) at the end of the linear range, near `surface` (3,).
 
-        It does not depend on the present push, and so exists before the finger touches.
+        The value does not depend on the current push, so it is available before contact.
         """
         forces = self._weights(surface) @ self._place_forces
         return float(forces[len(CURVE_FRACTIONS)]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return force over depth near `surface` as `SoftBodyMethod`; past the linear range as
-        `respond`.
-
-        It is a weighted mean over the nodes around, which needs no contact solve.
-        """
+        """Return the force curve near `surface` as a weighted mean of the nodes' curves."""
         return np.column_stack([self._depths, self._weights(surface) @ self._place_forces])
 
     def _weights(self, surface: Floats) -> Floats:
-        """Return Gaussian weights of the mesh's corners around a point: a mean with them is
-        smooth."""
+        """Return Gaussian weights of the mesh corners around a point; their sum is 1."""
         squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
         return result
 
     def _forces(self, point: Floats, normal: Floats) -> Floats:
-        """Return the force along the normal (n,) at the depths of the curve, never falling."""
+        """Return the non-decreasing normal force (n,), N, at the depths of the curve."""
         shallow = self._depths[: len(CURVE_FRACTIONS) + 1]
         solved = np.append(shallow, [0.5 * (self._linear + self._largest), self._largest])
         forces = np.zeros(len(solved))
@@ -491,11 +486,11 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
-        """Return the skin displacement (3 s,) under forces (k,), N, of some rows (k,) of a
+        """Return the skin displacement (3 s,) under forces (k,), N, for some rows (k,) of a
         table."""
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
-        # Nodes are numbered along the mesh: runs of neighbours are read in place, without a copy.
+        # Slices of consecutive rows avoid the copy that fancy indexing would make.
         breaks = np.flatnonzero(np.diff(rows) != 1) + 1
         for start, stop in zip([0, *breaks], [*breaks, len(scaled)], strict=True):
             first = rows[start]
@@ -506,7 +501,7 @@ class LinearSoftBody:
 def unit_linear_body(
     response: SkinResponse, shape: Shape, bounds: Floats, finger_radius_m: float
 ) -> LinearSoftBody:
-    """Return the linear method for 1 Pa, linear at all depths of a table; bounds (b, 3)."""
+    """Return the linear method for 1 Pa, linear up to one finger radius; bounds (b, 3)."""
     return LinearSoftBody(
         response,
         shape,

@@ -1,7 +1,7 @@
 """Run functions on the workers of a `dask.distributed` scheduler, as an executor.
 
-A worker needs the same version of this project and nothing else: each job carries its own data.
-This module is imported late, because `distributed` takes half a second.
+A worker needs only the same version of this project: each job contains its input data. Import this
+module where it is used, because importing `distributed` takes half a second.
 """
 
 from __future__ import annotations
@@ -18,30 +18,29 @@ import distributed
 from flexsheet.nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
-"""`distributed` without types: its arguments and results are not annotated."""
+"""`distributed` as an untyped module, because it has no annotations."""
 
 CONNECT_S = 10.0
-"""Time in which a scheduler must answer and have a worker."""
+"""Timeout for the connection to a scheduler and for its first worker, s."""
 TRIES = 3
-"""Number of times that a job of a lost worker is given to other workers."""
+"""Number of retries of a job whose worker was lost."""
 
 
 class SchedulerError(precompute_table.WorkersError):
-    """The scheduler's workers cannot be used; the text names the parameter, its value and a
-    remedy."""
+    """Raised when the workers of a scheduler cannot be used."""
 
     code = "scheduler"
     remedy = "Check the scheduler's address, and that its workers run the same version."
 
     def __init__(self, address: str, what: str, remedy: str) -> None:
         super().__init__(
-            f'scheduler "{address}": {what}; {remedy}, or set scheduler to null, for the '
+            f'scheduler "{address}": {what}; {remedy}, or set scheduler to null to use the '
             "processors of this machine"
         )
 
 
 class DaskExecutor(Executor):
-    """Submit functions to a scheduler's workers, which can be asked to stop them."""
+    """Executor on a scheduler's workers whose running functions can be stopped."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client
@@ -50,12 +49,12 @@ class DaskExecutor(Executor):
         self._executor = untyped.Client.get_executor(client, pure=False, retries=TRIES)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = self._executor.submit(_until_told, self._name, fn, args, kwargs)
+        future: Future[Any] = self._executor.submit(_run_stoppable, self._name, fn, args, kwargs)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut down as `Executor.shutdown`; cancel_futures: running functions end soon, too."""
-        # A lost scheduler has no workers left to notify.
+        """Shut down as `Executor.shutdown`; cancel_futures also stops running functions."""
+        # Workers of a lost scheduler cannot be notified.
         if cancel_futures and self._client.status == "running":
             self._stop.set()
         self._executor.shutdown(wait=wait and not cancel_futures)
@@ -63,13 +62,13 @@ class DaskExecutor(Executor):
 
 @contextmanager
 def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
-    """Yield the workers of the scheduler at an address such as tcp://host:8786.
+    """Connect to a scheduler and yield an executor on its workers.
 
-    Leaving the context stops what they are running. Raises SchedulerError if the scheduler does not
-    answer, has no worker, or has one of another version.
+    address: such as tcp://host:8786. Leaving the context stops the running jobs. Raises
+    SchedulerError if the scheduler does not answer, has no worker, or a worker has another version.
     """
     try:
-        # A client that cannot connect takes long to close: test the connection first.
+        # Closing a client that failed to connect is slow, so test the connection first.
         with socket.create_connection(
             untyped.comm.get_address_host_port(address), timeout=connect_s
         ):
@@ -95,7 +94,7 @@ def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[E
 
 
 def _require_same_code(client: distributed.Client, address: str) -> None:
-    """Raise SchedulerError if a worker cannot import this project, or has another version of it."""
+    """Raise SchedulerError if a worker lacks this project or has another version of it."""
     remedy = "install the same flexsheet version there and restart its workers"
     try:
         found = client.run(precompute_table.code_version)
@@ -109,8 +108,8 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
             raise SchedulerError(address, problem, remedy)
 
 
-def _until_told(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a worker, and stop it once the event of this name is set."""
+def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+    """Run a function in a worker; `stop_requested` is true once the event `name` is set."""
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)
     try:

@@ -1,21 +1,25 @@
-"""Choose among several methods: the best one that meets the deadline."""
+"""Select the best of several methods that meets a deadline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 LATE_STEPS = 5
-"""Number of consecutive late responses that change the method."""
+"""Number of consecutive late responses after which the method changes."""
 RETRY_STEPS = 600
-"""Number of responses of a fallback after which the best method is tried again."""
+"""Number of responses of a fallback method after which the best method is tried again."""
 SMOOTHING = 0.1
+"""Weight of the newest duration in the mean (exponential smoothing)."""
 
 
 class DeadlineFallback:
-    """Track how long responses take, and name the method to use."""
+    """Selects a method by the durations of recent responses."""
 
     def __init__(self, names: Sequence[str], budget_s: float) -> None:
-        """names: best first; budget_s: the maximum duration of a response."""
+        """Select the first method.
+
+        names: methods, the best first. budget_s: maximum duration of a response, s.
+        """
         self._names, self._budget = tuple(names), budget_s
         self._mean: dict[str, float] = {}
         self._late, self._since = 0, 0
@@ -23,18 +27,18 @@ class DeadlineFallback:
 
     @property
     def is_fallback(self) -> bool:
-        """Return whether another method replaces the best one, because that was late."""
+        """Return whether the current method is not the best one."""
         return self.name != self._names[0]
 
     def record(self, seconds: float) -> bool:
-        """Record the duration of a response; return whether the method changes."""
+        """Record the duration of a response, s, and return whether the method changed."""
         mean = self._mean.get(self.name, seconds)
         self._mean[self.name] = mean + SMOOTHING * (seconds - mean)
         self._late = self._late + 1 if seconds > self._budget else 0
         self._since += 1
         chosen = self.name
         if self._late >= LATE_STEPS:
-            # A method that was never tried may be quick.
+            # An untried method counts as the fastest, so that it is measured.
             chosen = min(self._names, key=lambda name: self._mean.get(name, 0.0))
         elif self.is_fallback and self._since >= RETRY_STEPS:
             chosen = self._names[0]

@@ -29,31 +29,33 @@ rounding."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
-    """A mesh that cannot be computed: inverted elements, or a body without sufficient support."""
+    """Raised for a mesh with inverted elements or a body without sufficient support."""
 
     code = "solid-mesh"
     remedy = "Increase skin_spacing_m, or fix more of the object; see docs/meshing.md."
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
-    """Return (lambda, mu) in Pa. Raises ValueError outside E > 0, -1 < nu <= 0.4999."""
+    """Return Lame's constants (lambda, mu), Pa.
+
+    Raises ValueError outside E > 0, -1 < nu <= 0.4999.
+    """
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
         raise ValueError(f"young_modulus_pa: {young_modulus_pa!r} must be a positive number")
     if not -1.0 < poisson_ratio <= MAX_POISSON_RATIO:
         raise ValueError(
             f"poisson_ratio: {poisson_ratio!r} must be above -1 and at most "
-            f"{MAX_POISSON_RATIO}; an incompressible body needs a mixed formulation, use 0.499"
+            f"{MAX_POISSON_RATIO}; use 0.499 for a nearly incompressible body"
         )
     mu = 0.5 * young_modulus_pa / (1.0 + poisson_ratio)
     return 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio), mu
 
 
 def quadrature() -> tuple[Floats, Floats]:
-    """Return points (8, 3) and weights (8,) on the unit tetrahedron, exact to degree 3, all
-    positive.
+    """Return quadrature points (8, 3) and positive weights (8,) on the unit tetrahedron.
 
-    Conical product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
-    The patch test needs degree 3 on curved elements and degree 2 on straight ones.
+    The rule is exact to degree 3, as the patch test on curved elements requires. It is a conical
+    product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
     """
     from scipy.special import roots_jacobi
 
@@ -69,8 +71,7 @@ def quadrature() -> tuple[Floats, Floats]:
 
 
 def shape_gradients(points: Floats) -> Floats:
-    """Return gradients (q, 10, 3) of the shape functions at points (q, 3) of the unit
-    tetrahedron."""
+    """Return the shape functions' gradients (q, 10, 3) at points (q, 3) of the unit tetrahedron."""
     barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
     slopes = np.vstack([-np.ones(3), np.eye(3)])
     corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
@@ -91,8 +92,8 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     invalid = ~np.isfinite(corners).all(axis=(1, 2))
     if invalid.any():
         raise SolidMeshError(
-            f"nodes of {int(invalid.sum())} of {len(elements)} elements are not finite, the first "
-            f"is element number {int(np.argmax(invalid))}"
+            f"{int(invalid.sum())} of {len(elements)} elements have nodes that are not finite; the "
+            f"first is element number {int(np.argmax(invalid))}"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -100,8 +101,8 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     bad = determinant.min(axis=1) <= MIN_VOLUME_RATIO * size**3
     if bad.any():
         raise SolidMeshError(
-            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat, the first is "
-            f"number {int(np.argmax(bad))} (smallest Jacobian {determinant.min():.3g} m^3)"
+            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first is "
+            f"element number {int(np.argmax(bad))} (minimum Jacobian {determinant.min():.3g} m^3)"
         )
     return jacobian, determinant
 
@@ -109,7 +110,7 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
 def element_stiffness(
     nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
 ) -> Floats:
-    """Return stiffness matrices (e, 30, 30) in N/m.
+    """Return the element stiffness matrices (e, 30, 30), N/m.
 
     Raises SolidMeshError as `jacobians`, ValueError as `lame_constants`.
     """
@@ -132,7 +133,7 @@ def element_stiffness(
 def stiffness_matrix(
     nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
 ) -> csc_matrix:
-    """Return the assembled stiffness (3n, 3n) in N/m; errors as `element_stiffness`."""
+    """Return the assembled stiffness matrix (3n, 3n), N/m; errors as `element_stiffness`."""
     from scipy.sparse import csc_matrix
 
     size = 3 * len(nodes)
@@ -149,7 +150,7 @@ def stiffness_matrix(
 
 
 def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
-    """Raise SolidMeshError unless at least three fixed nodes, not on one line, hold the body."""
+    """Raise SolidMeshError unless three fixed nodes (n,) are not collinear."""
     fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
     if (
@@ -160,13 +161,13 @@ def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
         < 2
     ):
         raise SolidMeshError(
-            f"the body is free to move: {len(fixed_nodes)} fixed nodes, at least three not on one "
-            "line are needed (object.support_angle_rad too small for skin_spacing_m?)"
+            f"the body is free to move: it has {len(fixed_nodes)} fixed nodes, and at least three "
+            "that are not collinear are required; enlarge object.support or reduce skin_spacing_m"
         )
 
 
 def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
-    """Return the three degrees of freedom of each node, (3k,)."""
+    """Return the numbers (3k,) of the nodes' degrees of freedom."""
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
@@ -177,10 +178,10 @@ def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
 
 
 def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats) -> Floats:
-    """Return displacements (3n,) with the degrees of freedom `fixed_dofs` at `values`, and `loads`
-    (3n,) elsewhere.
+    """Solve for the displacements (3n,) by one sparse factorisation.
 
-    It takes one sparse factorisation. Raises SolidMeshError if the body can still move freely.
+    fixed_dofs (k,), values (k,): prescribed degrees of freedom and their displacements. loads
+    (3n,): nodal forces. Raises SolidMeshError if the body is free to move.
     """
     from scipy.sparse.linalg import splu
 
@@ -189,8 +190,7 @@ def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats
     result[fixed_dofs] = values
     inner = stiffness[free][:, free].tocsc()
     try:
-        # The matrix is positive definite: the diagonal serves as pivots, which keeps the factor
-        # sparse.
+        # The matrix is positive definite, so diagonal pivots suffice and keep the factor sparse.
         factor = splu(
             inner,
             permc_spec="MMD_AT_PLUS_A",

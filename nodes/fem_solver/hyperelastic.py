@@ -1,5 +1,4 @@
-"""Compute energy, forces and consistent tangent of a compressible neo-Hookean solid (10-node
-tetrahedra).
+"""Compute energy, forces and tangent of a compressible neo-Hookean solid of 10-node tetrahedra.
 
 Energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
 Analysis", 2nd ed., sec. 6.4.3), with Lame's constants, F the deformation gradient and J its
@@ -7,8 +6,8 @@ determinant:
 
     psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2
 
-First Piola stress P = mu F + (lambda ln J - mu) F^-T. It equals Hooke's law for small strains. The
-energy grows without bound as J -> 0: no element inverts at finite energy.
+The first Piola stress is P = mu F + (lambda ln J - mu) F^-T, which is Hooke's law for small
+strains. The energy grows without bound as J -> 0, so no element inverts at finite energy.
 """
 
 from __future__ import annotations
@@ -32,24 +31,27 @@ Ints = NDArray[np.int64]
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
 NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
-"""The ten nodes (10, 3) on the unit tetrahedron."""
+"""Coordinates (10, 3) of the element's nodes on the unit tetrahedron."""
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
-    """A displacement that inverts an element: it has no energy."""
+    """Raised for a displacement that inverts an element."""
 
     code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."
 
 
 class NeoHookeanSolid:
-    """A mesh of neo-Hookean material; displacements are (n, 3), m."""
+    """Mesh of neo-Hookean material; displacements are (n, 3), m."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
-        """nodes (n, 3), elements (e, 10). Raises SolidMeshError as `jacobians`, ValueError as
-        `lame_constants`."""
+        """Precompute gradients and volumes of the elements.
+
+        nodes (n, 3), elements (e, 10). Raises SolidMeshError as `jacobians`, ValueError as
+        `lame_constants`.
+        """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
         points, weights = quadrature()
@@ -68,7 +70,7 @@ class NeoHookeanSolid:
         return float(self._volumes.sum())
 
     def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
-        """Return F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
+        """Return deformation gradients F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
         moved = displacement[self.elements].transpose(0, 2, 1)
         gradient = moved[:, None] @ self._gradients
         gradient[..., 0, 0] += 1.0
@@ -87,7 +89,7 @@ class NeoHookeanSolid:
         return float((self._volumes * density).sum())
 
     def forces(self, displacement: Floats) -> Floats:
-        """Return the nodal forces (n, 3) of the deformed material: the gradient of the energy, N.
+        """Return the nodal forces (n, 3), N: the gradient of the energy.
 
         Raises InvertedElementError where an element is inverted.
         """
@@ -99,7 +101,7 @@ class NeoHookeanSolid:
         return scatter_add(self._rows, per_node.ravel(), 3 * len(self.nodes)).reshape(-1, 3)
 
     def tangents(self, displacement: Floats) -> Floats:
-        """Return element stiffness matrices (e, 30, 30): the energy's second derivative, N/m.
+        """Return the element tangents (e, 30, 30), N/m: the energy's second derivative.
 
         With h = F^-T times a shape function's gradient, the block of nodes a and b is mu (g_a .
         g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T, summed over the points. Raises
@@ -120,17 +122,16 @@ class NeoHookeanSolid:
         return first
 
     def stiffen(self, matrices: Floats, weight: float) -> None:
-        """Add `weight` times mu times the Laplacian, which is positive definite, to tangents."""
+        """Add `weight` times mu times the positive definite Laplacian to tangents, in place."""
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += weight * self._laplacian
 
     def min_volume_ratio(self, displacement: Floats) -> float:
-        """Return the minimum J at all quadrature points and nodes: 1 at rest, 0 or less where
-        inverted.
+        """Return the minimum J over all quadrature points and nodes: 1 at rest, <= 0 if inverted.
 
-        A quadratic element's corner can invert unnoticed by its quadrature points, and so by its
-        energy.
+        Nodes are included because a corner of a quadratic element can invert while J is positive
+        at all quadrature points.
         """
         local = shape_gradients(NODE_COORDINATES)
         rest, moved = (
@@ -150,8 +151,7 @@ class NeoHookeanSolid:
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Return determinants (...) of matrices (..., 3, 3), written out: faster than the general
-    one."""
+    """Return determinants (...) of matrices (..., 3, 3), faster than `numpy.linalg.det`."""
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     result: Floats = (
         a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])

@@ -1,4 +1,4 @@
-"""Long computations in a thread, given up as soon as their result is not wanted any more."""
+"""Run long computations in a thread and abandon them when their result is no longer needed."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run `compute` in a thread and return its result; Interrupted once it is superseded.
+    """Run `compute` in a thread and return its result.
 
-    The thread is not waited for then: meshing alone takes up to 8 s of a processor.  It is given
-    `progress` with an event before all other arguments, by which it is asked to stop; what it
-    raises is dropped.
+    compute: receives `progress` with a stop event as its first argument. Raises Interrupted once
+    `is_superseded` returns true. The thread is then abandoned, because meshing takes up to 8 s, and
+    its errors are ignored.
     """
     stop = threading.Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

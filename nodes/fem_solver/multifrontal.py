@@ -1,10 +1,10 @@
-"""Factor a stiffness that is given element by element: multifrontal Cholesky.
+"""Factor an element-by-element stiffness by the multifrontal Cholesky method.
 
-Nested dissection bisects the elements recursively across their longest sides (George 1973). The
-degrees of freedom that two halves have in common are eliminated after both. Each half leaves a
-dense matrix on its boundary, which is added into its parent's (Duff & Reid 1983). Nearly all work
-is in dense matrices and so runs at the processor's speed. The order is found once and serves every
-stiffness on the same mesh, as a Newton iteration needs.
+Nested dissection bisects the elements recursively (George 1973). The degrees of freedom that two
+halves share are eliminated after both. Each half leaves a dense Schur complement on its boundary,
+which is added to its parent's matrix (Duff & Reid 1983). Nearly all work is dense linear algebra.
+The elimination order is computed once per mesh and reused for every stiffness of a Newton
+iteration.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """The stiffness is not positive definite."""
+    """Raised for a stiffness that is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
@@ -36,12 +36,12 @@ class IndefiniteError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """One node of the elimination tree.
+    """Node of the elimination tree.
 
-    pivots, boundary: degrees of freedom eliminated here, and those left to the parent. elements: of
-    a leaf. scatter: indices of the leaf's element matrices in its dense matrix; one past its end
-    for fixed nodes. children: numbers of earlier fronts, with the positions of their boundaries in
-    this front.
+    pivots, boundary: degrees of freedom eliminated here, and those left to the parent. elements:
+    numbers of a leaf's elements. scatter: indices of the element matrices' entries in the leaf's
+    dense matrix; one past its end for fixed nodes. children: numbers of earlier fronts, with the
+    positions of their boundaries in this front.
     """
 
     pivots: Ints
@@ -53,14 +53,14 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """K = L L^T, in the precision of its stiffness; solves for one or many right-hand sides."""
+    """Cholesky factors K = L L^T in the precision of the stiffness."""
 
     fronts: list[Front]
     diagonal: list[Floats]
     off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Return displacements under loads (3n,) or (3n, k); zero at fixed nodes."""
+        """Return the displacements under loads (3n,) or (3n, k); zero at fixed nodes."""
         (trsm,) = get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
         work = loads.reshape(len(loads), -1).astype(self.diagonal[0].dtype)
         for front, diagonal_block, off_block in zip(
@@ -83,8 +83,11 @@ class Factors:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A part of the mesh: the nodes eliminated with it, those on its boundary, its halves if
-    any."""
+    """Part of the mesh.
+
+    pivots: nodes eliminated with it. boundary: nodes left to its parent. members: elements of a
+    leaf. halves: numbers of its two parts, empty for a leaf.
+    """
 
     pivots: Ints
     boundary: Ints
@@ -93,18 +96,21 @@ class _Part:
 
 
 class NestedDissection:
-    """The order of elimination for one mesh and its supports."""
+    """Elimination order for one mesh and its supports."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: NDArray[np.bool_]) -> None:
-        """nodes (n, 3), elements (e, k), fixed (n,): nodes that cannot move."""
+        """Compute the elimination order.
+
+        nodes (n, 3), elements (e, k). fixed (n,): nodes that cannot move.
+        """
         self._elements, self._fixed = elements, fixed
         self._centres = nodes[elements].mean(axis=1)
         self._uses = np.bincount(elements.ravel(), minlength=len(nodes))
         self._parts: list[_Part] = []
         self._split(np.arange(len(elements)))
-        # Boundaries are sorted by elimination order. A part's boundary then has the same order in
-        # its parent, and lower halves of matrices are added into lower halves. Within a part, the
-        # nodes of one leaf are adjacent, so that they are added in long runs.
+        # Boundaries are sorted by elimination order, so that a part's boundary has the same order
+        # in its parent and only lower triangles are added. Nodes of one leaf are adjacent, so that
+        # blocks are added in long runs.
         self._rank = np.empty(len(nodes), dtype=np.int64)
         leaf = np.zeros(len(nodes), dtype=np.int64)
         for number, part in enumerate(self._parts):
@@ -121,8 +127,8 @@ class NestedDissection:
     def factor(self, matrices: Floats) -> Factors:
         """Factor the sum of element matrices (e, 3k, 3k), symmetric, float64 or float32.
 
-        float32 takes half the time and memory, and gives about four digits. Raises IndefiniteError
-        unless the sum is positive definite.
+        float32 takes half the time and memory and gives about four digits. Raises IndefiniteError
+        for a sum that is not positive definite.
         """
         dtype = matrices.dtype
         trsm, syrk = get_blas_funcs(("trsm", "syrk"), dtype=dtype)
@@ -156,9 +162,10 @@ class NestedDissection:
         return Factors(self.fronts, diagonal, off_diagonal)
 
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
-        """Add the parts of some elements, halves first.
+        """Append the parts of some elements, halves first.
 
-        Returns the number of the whole, its free nodes, and in how many of its elements each is.
+        Returns the number of the last part, its free nodes (k,), and the number of its elements
+        that use each node (k,).
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)
@@ -178,8 +185,7 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Return two halves of some elements, cut across the axis that gives the fewest common
-        nodes."""
+        """Return two halves of some elements, cut across the axis with the fewest shared nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]
@@ -216,9 +222,9 @@ class NestedDissection:
 
 
 def _add_block(dense: Floats, part: Floats, positions: Ints) -> None:
-    """Add the lower half of `part` into that of `dense` at `positions`, which increase.
+    """Add the lower triangle of `part` to that of `dense` at increasing `positions`.
 
-    Entries above the diagonals are never read.
+    Entries above the diagonal are undefined and never read.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(positions) != 1) + 1, [len(positions)]])
     if len(starts) > MAX_RUNS:

@@ -1,15 +1,13 @@
-"""Solve the contact of a fingertip sphere with a neo-Hookean body by full Newton: the reference
-method.
+"""Solve the contact of a fingertip sphere with a neo-Hookean body by Newton's method.
 
-The finger is a rigid sphere. Contact points on the skin's faces carry a penalty pressure. It grows
-first with the square of the penetration, so that forces are C1 in the finger's position, and then
-in proportion. The penalty limits the penetration to a hundredth of the radius under a pressure
-equal to Young's modulus. The solution is the minimum of one energy, which a Newton iteration
-descends. An inverted element has infinite energy and is never accepted.
+This is the reference method. The finger is a rigid sphere. Contact points on the skin's faces
+carry a penalty pressure. It first grows with the square of the penetration, which makes forces C1,
+and then linearly. The penetration is about a hundredth of the radius under a pressure equal to
+Young's modulus. Newton's method with a line search minimises one energy. An inverted element has
+infinite energy and is never accepted.
 
-Without friction the solution depends only on the finger's position. A sticking finger holds each
-point at its first contact, by tangential springs with the penalty stiffness. Then the solution
-depends on the path.
+Without friction the solution depends only on the finger's position. With a sticking finger,
+tangential springs connect each point to its first contact, so the solution depends on the path.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ POINTS_PER_EDGE = 4
 MAX_STEP_RATIO = 0.35
 """Maximum displacement of the finger per load step, in finger radii."""
 MIN_STEP_FRACTION = 1.0 / 16.0
-"""Load steps that do not converge are halved down to this fraction; then the path ends there."""
+"""Minimum fraction of a load step. Steps are halved until they converge or reach this fraction."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
 """Attempts to make a tangent definite: weight of the contact's geometric stiffness, then added
@@ -50,7 +48,7 @@ TOLERANCE = 1e-8
 
 
 class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
-    """A load step did not converge."""
+    """Raised for a load step that does not converge."""
 
     code = "newton"
     remedy = "Reduce the push, refine the mesh, or choose the linear method."
@@ -58,10 +56,11 @@ class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class EquilibriumState:
-    """The body in equilibrium with the finger.
+    """Equilibrium of the body with the finger.
 
-    displacement (n, 3); force_n (3,) of the body on the finger. centre (3,): the finger's position,
-    short of its target if `reached` is false.
+    displacement (n, 3), m. force_n (3,): force of the body on the finger. centre (3,): position of
+    the sphere. reached: whether the target position converged; otherwise `centre` is the last
+    converged position.
     """
 
     displacement: Floats
@@ -74,8 +73,8 @@ class EquilibriumState:
 
 @dataclass(frozen=True, slots=True)
 class _StickState:
-    """Contact points (k,) that a sticking finger holds: offsets from its centre (k, 3), skin
-    normals (k, 3)."""
+    """Sticking contact points (k,), their offsets from the sphere's centre and the skin normals,
+    both (k, 3)."""
 
     points: Ints
     offsets: Floats
@@ -86,16 +85,19 @@ NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((
 
 
 class SphereObstacle:
-    """The penalty contact that keeps the skin out of the finger."""
+    """Penalty contact between the skin and the finger."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
     ) -> None:
-        """faces (f, 6): the six-node triangles that a finger can touch."""
+        """Sample the contact points.
+
+        faces (f, 6): six-node triangles that a finger can touch.
+        """
         self.radius_m = radius_m
         self._count, self._faces = len(nodes), faces
         corners = nodes[faces[:, :3]]
-        # No finger, however small, fits between the points.
+        # The points are close enough that no finger fits between them.
         max_step_m = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
         divisions = int(np.ceil(max_step_m / (POINT_SPACING_RATIO * radius_m)))
         self._shape, _ = sample_triangle(max(POINTS_PER_EDGE, divisions))
@@ -107,15 +109,15 @@ class SphereObstacle:
         self.parents, self._local = _find_parents(elements, faces)
 
     def points(self, positions: Floats) -> Floats:
-        """Return contact points (q, 3) of the deformed skin, from node positions (n, 3)."""
+        """Return the contact points (q, 3) of the deformed skin for node positions (n, 3)."""
         result: Floats = (self._shape @ positions[self._faces]).reshape(-1, 3)
         return result
 
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
-        """Return the points within the sphere.
+        """Return the contact points inside the sphere.
 
-        Their numbers (k,), penetration (k,), normals (k, 3) out of the sphere, distance from its
-        centre (k,).
+        Returns their numbers (k,), penetrations (k,), outward sphere normals (k, 3) and distances
+        from the centre (k,).
         """
         offset = self.points(positions) - centre
         distance = np.linalg.norm(offset, axis=1)
@@ -136,7 +138,7 @@ class SphereObstacle:
         return total
 
     def forces(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
-        """Return the energy's gradient by node (n, 3): the force of the skin on the finger, N."""
+        """Return the energy's gradient (n, 3), N: the force of each node on the finger."""
         inner, depth, normals, _ = self.inside(positions, centre)
         per_point = np.zeros((len(self._penalty), 3))
         per_point[inner] = -(self._penalty[inner] * self._pressure(depth))[:, None] * normals
@@ -186,14 +188,14 @@ class SphereObstacle:
         np.add.at(matrices, (target[:, None, None], rows[:, :, None], rows[:, None, :]), summed)
 
     def update_stick(self, positions: Floats, centre: Floats, stick: _StickState) -> _StickState:
-        """Return the points that a sticking finger holds at equilibrium.
+        """Return the sticking points at equilibrium.
 
-        Points under pressure stay held where they were first touched; others are released.
+        Points under pressure stick where they were first touched; other points are released.
         """
         inner, _, normals, _ = self.inside(positions, centre)
         offsets = self.points(positions)[inner] - centre
-        still_held = np.isin(inner, stick.points)
-        offsets[still_held] = stick.offsets[np.searchsorted(stick.points, inner[still_held])]
+        sticking = np.isin(inner, stick.points)
+        offsets[sticking] = stick.offsets[np.searchsorted(stick.points, inner[sticking])]
         return _StickState(inner, offsets, normals)
 
     def _pressure(self, depth: Floats) -> Floats:
@@ -208,7 +210,7 @@ class SphereObstacle:
 
 
 class NeoHookeanBody:
-    """A body with its mesh and supports, to be pushed by a finger."""
+    """Neo-Hookean body with fixed nodes, pushed by a finger."""
 
     def __init__(
         self,
@@ -225,12 +227,11 @@ class NeoHookeanBody:
         min_step_fraction: float = MIN_STEP_FRACTION,
         factor_dtype: type[np.floating[Any]] = np.float64,
     ) -> None:
-        """faces (f, 6): touchable six-node triangles, node indices, outward. tolerance,
-        min_step_fraction: as `TOLERANCE` and `MIN_STEP_FRACTION`. factor_dtype: precision of the
-        tangents' factors, which only give the search direction. Forces and energies always have
-        double precision.
+        """Prepare the solver; errors as `NeoHookeanSolid`.
 
-        Errors as `NeoHookeanSolid`.
+        faces (f, 6): touchable six-node triangles, outward. tolerance, min_step_fraction: see
+        `TOLERANCE` and `MIN_STEP_FRACTION`. factor_dtype: precision of the tangent's factors, which
+        affects only the search direction.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -247,20 +248,19 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Yield the equilibrium at each position (3,) of the sphere's centre, along straight lines.
+        """Yield the equilibrium at each of the sphere's centres (3,), connected by straight paths.
 
-        start: a displacement, and the centre that it is in equilibrium with, without friction.
-        None: the first centre, which must not touch the body. Where a step does not converge, this
-        state and all later ones are the last equilibrium, with `reached` false. Inverted elements
-        and a finger that penetrated the skin count as not converged. Raises ValueError for a centre
-        that is not finite.
+        start: displacement and centre of a frictionless equilibrium; None: the first centre must
+        not touch the body. After a step that does not converge, the last equilibrium is yielded
+        with `reached` false for all remaining centres. Inverted elements and a sphere inside the
+        body count as not converged. Raises ValueError for a centre that is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
         stick, failed = NO_STICK, False
         for centre in centres:
             if not np.isfinite(centre).all():
-                raise ValueError(f"the finger's centre {centre} is not finite")
+                raise ValueError(f"finger centre {centre} is not finite")
             iterations = 0
             if position is None:
                 position = centre
@@ -302,11 +302,10 @@ class NeoHookeanBody:
     def solve_equilibrium(
         self, displacement: Floats, centre: Floats, stick: _StickState, *, guess: Floats
     ) -> tuple[Floats, int, Factors | None]:
-        """Return the equilibrium (n, 3) with the sphere at `centre`, iterations, and the last
-        factors.
+        """Return the equilibrium (n, 3), the number of iterations and the last factors.
 
-        Starts at `guess` if that has less energy than `displacement`. Raises
-        NewtonNotConvergedError without convergence.
+        centre (3,): of the sphere. The iteration starts at `guess` if that has less energy than
+        `displacement`. Raises NewtonNotConvergedError.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre, stick) < self._energy(displacement, centre, stick):
@@ -336,10 +335,9 @@ class NeoHookeanBody:
         raise NewtonNotConvergedError(f"not converged after {MAX_ITERATIONS} iterations")
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
-        """Raise NewtonNotConvergedError where an element is inverted, or the finger's centre is
-        inside.
+        """Raise NewtonNotConvergedError for inverted elements or a sphere centre inside the body.
 
-        Where there is no skin, no penalty acts: the finger has passed through.
+        No penalty acts on a finger that passed through the skin completely.
         """
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
@@ -362,8 +360,7 @@ class NeoHookeanBody:
         stick: _StickState,
         factors: Factors | None,
     ) -> Floats:
-        """Return the displacement, to first order, when the finger moves from `position` to
-        `target`."""
+        """Return the first-order displacement for a finger that moves to `target`."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
@@ -373,9 +370,9 @@ class NeoHookeanBody:
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
     def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
-        """Return the factors of the tangent, stiffened where it is indefinite.
+        """Return the factors of the tangent, regularized if it is indefinite.
 
-        Raises NewtonNotConvergedError if that does not help.
+        Raises NewtonNotConvergedError if no regularization suffices.
         """
         positions = self.solid.nodes + displacement
         elastic = self.solid.tangents(displacement)
@@ -397,11 +394,10 @@ class NeoHookeanBody:
 
 
 def winding_number(triangles: Floats) -> float:
-    """Return the winding number of a closed outward surface of triangles (t, 3, 3) about the
-    origin.
+    """Return the winding number of closed outward triangles (t, 3, 3) about the origin: 1 inside.
 
-    1: the origin is inside. The sum of solid angles over a full one (van Oosterom & Strackee, IEEE
-    Trans. Biomed. Eng. 30, 1983).
+    It is the sum of solid angles over 4 pi (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
+    1983).
     """
     a, b, c = triangles.transpose(1, 0, 2)
     x, y, z = np.linalg.norm(triangles, axis=2).T
@@ -411,7 +407,7 @@ def winding_number(triangles: Floats) -> float:
 
 
 def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
-    """Return the element of each face (f, 6), (f,), and the face's nodes in that element (f, 6)."""
+    """Return the element (f,) of each face (f, 6) and the local numbers (f, 6) of its nodes."""
     sides = elements[:, FACES]
     keys = np.sort(sides[..., :3], axis=2).reshape(-1, 3)
     base = int(elements.max()) + 1

@@ -1,4 +1,4 @@
-"""Deform the scene's object where the finger pushes it: the soft body's node."""
+"""Node that computes the deformation of the scene's object under the finger."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from flexsheet.nodes.node import Input, Node, Output
 
 
 class FemSolver(Node):
-    """Publish the skin at rest once it is precomputed, then its displacement for each fingertip."""
+    """Node that publishes the skin at rest and its displacement for each fingertip message."""
 
     parameters: FemSolverParameters
     scene: Input[Scene]
@@ -38,89 +38,92 @@ class FemSolver(Node):
     async def setup(self) -> None:
         self._stop = Event()
         folder = self.parameters.cache_dir or cache.default_cache_dir()
-        self._maker = SoftBodyFactory(
+        self._factory = SoftBodyFactory(
             SKIN_SPACING_M, folder, **self.parameters.model_dump(include=FACTORY_PARAMETERS)
         )
-        self._making: asyncio.Task[None] | None = None
-        self._remaining = EtaEstimator()
-        self._use([])
-        self._forget()
+        self._table_task: asyncio.Task[None] | None = None
+        self._eta = EtaEstimator()
+        self._set_bodies([])
+        self._reset_contact()
         self.note = "waiting for a scene"
 
-    def _forget(self) -> None:
+    def _reset_contact(self) -> None:
         self._last: Response | None = None
         self._last_ns = 0
-        self._entry: ContactAnchor | None = None
+        self._anchor: ContactAnchor | None = None
 
-    def _use(self, bodies: list[body.SceneBody]) -> None:
-        """Answer with these bodies from now on, the best first; with none before a scene."""
+    def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
+        """Set the bodies that compute responses, the best first; empty before a scene."""
         self._bodies = {one.method.name: one for one in bodies}
         if bodies:
-            self._pace = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
+            self._fallback = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
             nodes = len(bodies[0].skin.vertices_world_m)
-            self.note = f"soft body ready, {self._pace.name}, {nodes} skin nodes"
+            self.note = f"soft body ready, {self._fallback.name}, {nodes} skin nodes"
 
     async def close(self) -> None:
         self._stop.set()
-        await self._end_making()
+        await self._stop_table_task()
 
-    async def _end_making(self) -> None:
-        if self._making is not None:
+    async def _stop_table_task(self) -> None:
+        if self._table_task is not None:
             self._stop.set()
-            await self._making
-            self._making, self._stop = None, Event()
+            await self._table_task
+            self._table_task, self._stop = None, Event()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
-        self._use([])
-        self._forget()
-        await self._end_making()
-        p, maker = self.parameters, self._maker
-        method, maker.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
+        self._set_bodies([])
+        self._reset_contact()
+        await self._stop_table_task()
+        p, factory = self.parameters, self._factory
+        method, factory.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
         try:
-            make, newer = partial(maker.bodies, scene, method), partial(self.is_superseded, "scene")
-            bodies = await run_unless_superseded(make, self._progress, newer)
+            bodies = await run_unless_superseded(
+                partial(factory.bodies, scene, method),
+                self._progress,
+                partial(self.is_superseded, "scene"),
+            )
         except precompute.Interrupted:
             self.note = "precomputation interrupted"
             return
         except Exception as error:
             self.note = f"no soft body: {error}"
             raise
-        self._use(bodies)
-        self.note += maker.pending_note(scene, method, bodies)
+        self._set_bodies(bodies)
+        self.note += factory.pending_note(scene, method, bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
         if method == "nonlinear_table" and not p.friction_ratio and len(bodies) == 1:
-            self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
+            self._table_task = asyncio.create_task(self._build_table(scene, bodies[0]))
 
-    async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:
-        """Compute the nonlinear table while the linear method answers."""
+    async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
+        """Compute the nonlinear table while the linear method computes the responses."""
         try:
             progress = partial(self._progress, self._stop)
-            best = await asyncio.to_thread(self._maker.build_table, scene, linear, progress)
+            best = await asyncio.to_thread(self._factory.build_table, scene, linear, progress)
         except precompute.Interrupted:
             self.note = "nonlinear table interrupted; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
-            self._use([best, linear])
+            self._set_bodies([best, linear])
 
     def _progress(self, stop: Event, done: int, total: int, need: precompute.WorkBudget) -> None:
         if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
-        far = self._remaining.text(done, total, self.clock.now_ns() * 1e-9)
-        self.note = f"precomputing the soft body: {far} ({need.text()})"
+        eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
+        self.note = f"precomputing the soft body: {eta} ({need.text()})"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:
             return
-        current = self._bodies[self._pace.name]
+        current = self._bodies[self._fallback.name]
         if fingertip.valid:
-            begun_ns = self.clock.now_ns()
+            start_ns = self.clock.now_ns()
             point = body.predict_position(fingertip, self.parameters.prediction_horizon_s)
-            response, self._entry = current.respond(point, self._entry)
+            response, self._anchor = current.respond(point, self._anchor)
             self._last, self._last_ns = response, header.source_ns
-            if self._pace.record((self.clock.now_ns() - begun_ns) * 1e-9):
-                late = f", {current.method.name} was late" if self._pace.is_fallback else ""
-                self.note = f"soft body by {self._pace.name}{late}"
+            if self._fallback.record((self.clock.now_ns() - start_ns) * 1e-9):
+                late = f", {current.method.name} was late" if self._fallback.is_fallback else ""
+                self.note = f"soft body by {self._fallback.name}{late}"
         elif self._last is None:
             response = current.at_rest()
         else:
@@ -130,5 +133,5 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        answer = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
-        self.soft_body.publish(answer, source_ns=header.source_ns)
+        message = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
+        self.soft_body.publish(message, source_ns=header.source_ns)

@@ -16,12 +16,12 @@ class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
         description="Method of the soft body. auto: the scene's, else the nonlinear table if it is "
-        "cached, else linear. nonlinear_table: computed in the background, in minutes, if it is "
-        "not cached.",
+        "cached, else linear. nonlinear_table: computed in the background if it is not cached, "
+        "which takes minutes.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Distance of skin nodes where fingers touch. auto: the scene's, else 0.003.",
+        description="Distance between touchable skin nodes. auto: the scene's, else 0.003.",
     )
     linear_depth_m: Positive = Field(
         default=0.006,
@@ -29,19 +29,19 @@ class FemSolverParameters(NodeParameters):
     )
     max_depth_m: Positive = Field(
         default=0.010,
-        description="Depth that the skin approaches in deeper pushes with the linear method.",
+        description="Limit of the deflection with the linear method.",
     )
     friction_ratio: NonNegative = Field(
         default=0.0,
-        description="Friction coefficient above which a sticking finger slips. 0: it slides "
-        "without friction. Above 0 the linear method is used.",
+        description="Friction coefficient between finger and object. Above 0 the linear method is "
+        "used.",
     )
     step_budget_s: Positive = Field(
         default=0.004,
-        description="Maximum duration of a step; five consecutive longer ones change the method.",
+        description="Maximum duration of a step; five consecutive late steps change the method.",
     )
     workers: int = Field(
-        default=0, ge=0, description="Number of processes that compute a table. 0: one per core."
+        default=0, ge=0, description="Number of worker processes for a table. 0: one per core."
     )
     scheduler: str | None = Field(
         default=None,
@@ -49,13 +49,13 @@ class FemSolverParameters(NodeParameters):
         "workers compute the table. null: this machine's cores.",
     )
     prediction_horizon_s: NonNegative = Field(
-        default=0.0, description="Time by which the fingertip is predicted ahead."
+        default=0.0, description="Prediction time of the fingertip after its exposure."
     )
     hold_s: NonNegative = Field(
-        default=0.1, description="Time for which the indentation of a lost finger remains."
+        default=0.1, description="Time for which the deformation remains after the finger is lost."
     )
     relax_s: Positive = Field(
-        default=0.15, description="Time constant of the skin's recovery after that."
+        default=0.15, description="Time constant of the deformation's decay after `hold_s`."
     )
     cache_dir: Path | None = Field(
         default=None, description="Folder of precomputed results. null: the user's cache."

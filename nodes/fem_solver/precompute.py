@@ -1,7 +1,7 @@
-"""Compute and cache the skin's response to every load that a finger can apply.
+"""Compute and cache the skin's response to a unit load on every touchable node.
 
-The digest of all that the response depends on names its file. Young's modulus is not among that:
-the response scales with 1/E, and is stored for 1 Pa.
+The file is named by a digest of the specification. Young's modulus is not part of it, because the
+response is proportional to 1/E and is stored for 1 Pa.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ Ints = NDArray[np.int64]
 Part = dict[str, NDArray[Any]]
 
 VERSION = 3
-"""Increase whenever the same specification gives other numbers."""
+"""Version of the computation. Increase it when results for the same specification change."""
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
-"""Progress steps of meshing and factoring, in loads."""
+"""Number of loads that take as long as meshing and as factoring, for the progress."""
 
 Progress = Callable[[int, int, "WorkBudget"], None]
-"""Called with (done, total) steps and the resources needed, first before the work starts. It may
-raise `Interrupted` to stop the work."""
+"""Callback with (done, total) steps and the required resources, first called before the work
+starts. It may raise `Interrupted` to stop the work."""
 
 
 class WorkBudget(Protocol):
-    """The resources that a computation needs, known before it starts."""
+    """Interface of the resources that a computation needs."""
 
     def text(self) -> str: ...
 
 
 class Interrupted(Exception):
-    """The computation was asked to stop; its checkpoints remain."""
+    """Raised when a computation is stopped on request; its checkpoints remain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
-    """All that a precomputation depends on; equal where the keys are.
+    """Inputs of a precomputation.
 
-    sticking: whether to compute the response to tangential forces too, for three times the memory.
+    sticking: also compute the response to tangential forces, which takes three times the memory.
     """
 
     mesh: MeshSpec
@@ -65,7 +65,7 @@ class SoftBodySpec:
         return 3 if self.sticking else 1
 
     def depends_on(self) -> list[object]:
-        """Return the JSON value that determines the result."""
+        """Return all inputs of the result as a JSON value."""
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
@@ -75,10 +75,10 @@ class SoftBodySpec:
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
-    """Precomputed elastic response of a soft body, together with its skin mesh.
+    """Precomputed elastic response of a soft body and its skin mesh.
 
-    triangles (t, 3), outward. bounds (s,): nodes that are not touchable, except those past an end
-    of the touchable skin. drag: the tangential response, if specified.
+    triangles (t, 3), outward. bounds (s,): whether a node is not touchable; false also past an end
+    of the touchable surface. drag: the tangential response, if specified.
     """
 
     response: SkinResponse
@@ -89,7 +89,7 @@ class SoftBodyModel:
 
 @dataclass(frozen=True, slots=True)
 class ResponseBudget:
-    """The resources that a precomputation needs, known before it starts."""
+    """Resources of a precomputation."""
 
     skin_nodes: int
     loads: int
@@ -106,8 +106,7 @@ class ResponseBudget:
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
 ) -> ResponseBudget:
-    """Return the memory that `compute` takes on this mesh: stiffness, factors, some loads, the
-    result."""
+    """Return the resources that `compute` needs for this mesh and elimination order."""
     factors = sum(len(f.pivots) * (len(f.pivots) + len(f.boundary)) for f in order.fronts) * 8
     stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
     chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
@@ -117,13 +116,12 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate what `compute` takes, within a factor of two, before a mesh exists.
+    """Estimate the resources of `compute` without a mesh, within a factor of two.
 
     Raises UnfitMeshError as `mesh_budget`.
     """
     nodes = mesh_budget(spec.mesh)
-    # Fractions of skin nodes among all nodes, and of touchable ones among those, as meshes had
-    # them.
+    # Empirical fractions of skin nodes among all nodes, and of touchable among skin nodes.
     skin = int(6.0 * nodes.nodes ** (2.0 / 3.0))
     loads, geometry = skin // 2, spec.mesh.geometry
     if isinstance(geometry, Plane):
@@ -137,11 +135,11 @@ def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
 def compute(
     spec: SoftBodySpec, progress: Progress, checkpoints: CheckpointStore | None = None
 ) -> SoftBodyModel:
-    """Mesh, factor, and solve for one unit load per touchable skin node.
+    """Mesh the object, factor its stiffness and solve for one unit load per touchable node.
 
-    checkpoints: where finished parts are stored and looked up. Raises SolidMeshError for a body
-    without sufficient support, and ValueError for a material or size out of bounds. Raises
-    MemoryError, before anything is allocated, if the machine has too little memory.
+    checkpoints: store of finished parts. Raises SolidMeshError for a body without sufficient
+    support, ValueError for an invalid material or size, and MemoryError before any allocation if
+    the machine has too little memory.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -175,31 +173,31 @@ def compute(
         done += count
         progress(done, total, need)
 
-    def stored(name: str) -> Callable[[int, Callable[[], Part]], Part]:
+    def make_part_getter(name: str) -> Callable[[int, Callable[[], Part]], Part]:
         if checkpoints is None:
             return lambda number, solve: solve()
         return lambda number, solve: checkpoints.get(f"{name}-{number:06d}", solve)
 
-    influence, compliance = _unit_loads(
-        mesh, factors, -mesh.contact_normals[:, None], stored("loads"), advance
+    influence, compliance = _solve_unit_loads(
+        mesh, factors, -mesh.contact_normals[:, None], make_part_getter("loads"), advance
     )
     drag = None
     if spec.sticking:
         tangents = make_tangents(mesh.contact_normals)
-        drag_influence, drag_compliance = _unit_loads(
-            mesh, factors, tangents, stored("drags"), advance
+        drag_influence, drag_compliance = _solve_unit_loads(
+            mesh, factors, tangents, make_part_getter("drags"), advance
         )
         drag = DragResponse(tangents, drag_compliance, drag_influence)
-    touched = np.searchsorted(mesh.skin, mesh.contact_nodes)
+    contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes)
     skin = mesh.nodes[mesh.skin]
     found = make_shape(dict(spec.mesh.geometry)).closest(skin)
-    # Nodes off the smooth surface lie on its ends: caps, the sides of a slab.
+    # Nodes off the smooth surface are on its ends: end caps, or the sides of a slab.
     off_surface = np.linalg.norm(found.point - skin, axis=1) > 0.5 * spec.mesh.skin_spacing_m
     bounds = ~(off_surface | found.on_edge)
-    bounds[touched] = False
+    bounds[contact_nodes] = False
     response = SkinResponse(
         rest=skin,
-        contact_nodes=touched,
+        contact_nodes=contact_nodes,
         normals=mesh.contact_normals,
         faces=mesh.contact_faces,
         compliance=compliance,
@@ -208,7 +206,7 @@ def compute(
     return SoftBodyModel(response, mesh.skin_triangles, bounds, drag)
 
 
-def _unit_loads(
+def _solve_unit_loads(
     mesh: SolidMesh,
     factors: Factors,
     directions: Floats,
@@ -217,8 +215,8 @@ def _unit_loads(
 ) -> tuple[Floats32, Floats]:
     """Return influence (m p, 3 s) and compliance (m p, m p) of the m contact nodes.
 
-    They are for unit forces along p directions (m, p, 3) at each node. get_part: returns a stored
-    part by its number, or computes and stores it.
+    directions (m, p, 3): of the p unit forces at each node. get_part: loads a stored part by its
+    number, or computes and stores it.
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -228,7 +226,7 @@ def _unit_loads(
         numbers = np.arange(start, min(start + CHUNK_LOADS, loads))
         node, which, count = numbers // each, numbers % each, len(numbers)
 
-        def solved(node: Ints = node, which: Ints = which, count: int = count) -> Part:
+        def solve_part(node: Ints = node, which: Ints = which, count: int = count) -> Part:
             right = np.zeros((3 * len(mesh.nodes), count))
             for axis in range(3):
                 right[3 * mesh.contact_nodes[node] + axis, np.arange(count)] = directions[
@@ -241,14 +239,14 @@ def _unit_loads(
                 "compliance": along.reshape(count, loads),
             }
 
-        part = get_part(start, solved)
+        part = get_part(start, solve_part)
         influence[numbers], compliance[numbers] = part["table"], part["compliance"]
         advance(count)
     return influence, 0.5 * (compliance + compliance.T)
 
 
 def make_tangents(normals: Floats) -> Floats:
-    """Return two directions (m, 2, 3) at right angles to unit normals (m, 3) and to one another."""
+    """Return two unit tangents (m, 2, 3), perpendicular to each other, for normals (m, 3)."""
     smallest_axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, smallest_axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -256,25 +254,25 @@ def make_tangents(normals: Floats) -> Floats:
 
 
 def require_memory(need: ResponseBudget, spec: SoftBodySpec) -> None:
-    """Raise MemoryError if the machine has less free memory than the computation takes."""
+    """Raise MemoryError if the machine has less free memory than the computation needs."""
     import psutil
 
     free = psutil.virtual_memory().available
     required_bytes = need.working_bytes + need.table_bytes
     if required_bytes > free:
         raise MemoryError(
-            f"precomputing {need.loads} loads on {need.skin_nodes} skin nodes takes "
-            f"{required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; raise "
+            f"precomputing {need.loads} loads on {need.skin_nodes} skin nodes needs "
+            f"{required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; increase "
             f"skin_spacing_m above {spec.mesh.skin_spacing_m:g}"
         )
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""Names in the cache file of fields that have other names there."""
+"""Field names that differ in the cache file: field name to stored name."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Describe the cache file of a soft body's linear response."""
+    """Return the cache specification of a soft body's linear response."""
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
         content = {"triangles": model.triangles, "bounds": model.bounds}
@@ -298,6 +296,6 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 
 
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
-    """Return the cached model, or compute and store it; errors as `compute` and `cached`."""
+    """Load the cached model, or compute and store it; errors as `compute` and `cached`."""
     entry = response_cache(spec)
     return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))

@@ -1,8 +1,8 @@
-"""Compute the nonlinear table of a scene's body from snapshots that many processes solve.
+"""Compute the nonlinear table of a scene's body from snapshots solved in parallel.
 
-Snapshots are independent of one another and take most of the time. An executor of
-`concurrent.futures` solves them: processes of this machine, or a laboratory's workers
-(`dask_executor`). Each is stored as soon as it is solved.
+Snapshots are independent and take most of the time. An executor of `concurrent.futures` solves
+them, either processes of this machine or the workers of a cluster (`dask_executor`). Each snapshot
+is stored as soon as it is solved.
 """
 
 from __future__ import annotations
@@ -40,34 +40,34 @@ from flexsheet.nodes.fem_solver.table import Table, fill_table, table_bytes
 from flexsheet.nodes.models.shapes import make_shape
 
 VERSION = 3
-"""Increase whenever the same specification gives other numbers."""
+"""Version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""Progress steps of a snapshot, and of a node of the table."""
+"""Progress steps of a snapshot and of a node of the table."""
 POLL_S = 0.2
-"""Period at which progress is reported, and may be stopped, while snapshots are solved."""
+"""Period of progress reports and stop checks while snapshots are solved."""
 SNAPSHOT_BYTES = 600_000_000
-"""Approximate memory that solving one snapshot takes."""
+"""Approximate memory for solving one snapshot."""
 
 Progress = Callable[[int, int, "TableBudget"], None]
-"""Called with (done, total) steps and the resources needed, first before the work starts. It may
-raise `precompute.Interrupted` to stop the work."""
+"""Callback with (done, total) steps and the required resources, first called before the work
+starts. It may raise `precompute.Interrupted` to stop the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """All inputs that determine the content of a precomputed table."""
+    """Inputs of a nonlinear table."""
 
     body: SoftBodySpec
     finger_radius_m: float
 
     def depends_on(self) -> list[object]:
-        """Return the JSON value that determines the table."""
+        """Return all inputs of the table as a JSON value."""
         return [VERSION, self.body.key(), self.finger_radius_m]
 
 
 @dataclass(frozen=True, slots=True)
 class TableBudget:
-    """The resources that a table needs, known before it is computed."""
+    """Resources of a table's computation."""
 
     snapshots: int
     nodes: int
@@ -79,10 +79,10 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """Yield an executor with `count` processes of this machine; an exception ends them at once."""
+    """Yield an executor with `count` local processes; an exception kills them immediately."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
-    executor = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(stop,))
+    executor = ProcessPoolExecutor(count, context, initializer=_init_worker, initargs=(stop,))
     try:
         yield executor
     except BaseException:
@@ -93,18 +93,19 @@ def local_processes(count: int) -> Iterator[Executor]:
 
 
 stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
-"""In a worker: whether the present job must end."""
+"""Function that returns, in a worker, whether the current job must stop."""
 
 
-def _begin(stop: Event) -> None:
+def _init_worker(stop: Event) -> None:
     enter_background()
     threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
 
 
 def _exit_on(stop: Event) -> None:
-    """Exit the worker as soon as it is asked to: one depth of a snapshot takes up to a minute.
+    """Exit the worker process when `stop` is set.
 
-    The process that asked for the results stores them, so none is lost.
+    A job cannot be stopped sooner than after one depth, up to a minute. Finished results are not
+    lost, because the parent process stores them.
     """
     stop.wait()
     os._exit(0)
@@ -115,26 +116,26 @@ def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
 
 
 class WorkersError(FlexsheetError, RuntimeError):
-    """The workers that were to solve snapshots cannot be used."""
+    """Raised when the workers for snapshots cannot be used."""
 
     code = "workers"
     remedy = "Follow the remedy in the text."
 
 
 class LostWorkersError(WorkersError):
-    """The workers are gone; finished snapshots are stored."""
+    """Raised when the workers were lost; finished snapshots are stored."""
 
     code = "lost-workers"
     remedy = "Start the workers again and repeat the command. Finished results are stored."
 
 
 def code_version() -> str:
-    """Return the version of all code that determines a snapshot."""
+    """Return the combined version of the code that computes a snapshot."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
 def table_cache(spec: TableSpec) -> Specification[Table]:
-    """Describe the cache file of a nonlinear table."""
+    """Return the cache specification of a nonlinear table."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
     )
@@ -149,11 +150,11 @@ def compute_table(
     *,
     workers: int = 1,
 ) -> Table:
-    """Return the cached table, or solve its snapshots, fill it and store it.
+    """Load the cached table, or compute and store it.
 
-    model: of the same body. workers: how many of the executor's are on this machine. Raises
-    MemoryError, before anything is solved, if the machine has too little memory for so many
-    workers. Other errors as `cached` and `solve_all`.
+    model: linear response of the same body. workers: number of the executor's workers on this
+    machine. Raises MemoryError, before any snapshot is solved, if the machine has too little memory
+    for these workers; other errors as `cached` and `solve_all`.
     """
     entry = table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -222,11 +223,10 @@ def solve_all(
     checkpoints: CheckpointStore,
     on_progress: Callable[[int], None],
 ) -> list[snapshots.Snapshot]:
-    """Return the jobs' snapshots; those of earlier checkpoints are not solved again.
+    """Return the jobs' snapshots, loaded from checkpoints or solved.
 
-    on_progress: called with the number of finished snapshots. It may raise to stop: jobs that have
-    not begun are then cancelled. Raises LostWorkersError if the executor loses its workers, and the
-    errors of the jobs.
+    on_progress: called with the number of finished snapshots; may raise to cancel the pending jobs.
+    Raises LostWorkersError if the executor loses its workers, and the errors of the jobs.
     """
     solved: dict[int, snapshots.Snapshot] = {}
     for number in range(len(jobs)):
@@ -248,8 +248,8 @@ def solve_all(
                     snapshot = future.result()
                 except CancelledError as error:
                     raise LostWorkersError(
-                        "the workers that solve the snapshots are gone; restart them, and the "
-                        "table continues from the snapshots that they finished"
+                        "the workers that solve the snapshots were lost; restart them and repeat "
+                        "the command, which continues from the finished snapshots"
                     ) from error
                 checkpoints.save(f"push-{number:04d}", encode_fields(snapshot))
                 solved[number] = snapshot
@@ -261,13 +261,13 @@ def solve_all(
 
 
 def _require_memory(need: TableBudget, spec: TableSpec) -> None:
-    """Raise MemoryError if the machine has less free memory than computing the table takes."""
+    """Raise MemoryError if the machine has less free memory than the table needs."""
     import psutil
 
     free = psutil.virtual_memory().available
     if need.bytes > free:
         raise MemoryError(
-            f"the soft body's table takes {need.bytes / 2**30:.1f} GiB ({need.text()}), "
-            f"{free / 2**30:.1f} GiB are free; raise skin_spacing_m above "
-            f'{spec.body.mesh.skin_spacing_m:g}, or choose method "linear"'
+            f"the soft body's table needs {need.bytes / 2**30:.1f} GiB ({need.text()}), "
+            f"{free / 2**30:.1f} GiB are free; increase skin_spacing_m above "
+            f'{spec.body.mesh.skin_spacing_m:g}, or set method to "linear"'
         )

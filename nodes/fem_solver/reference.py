@@ -1,7 +1,7 @@
-"""Solve the references of the soft body's chart, and tables that are filled only around one point.
+"""Solve the reference solutions of the soft-body benchmark, and tables around a single point.
 
-All of it comes from Newton solutions at one point and around it. Worker processes solve them, as
-for a table, and the cache stores them.
+Both consist of Newton solutions at and near one surface point. Worker processes solve them, and the
+cache stores them.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSolution:
-    """A push solved on one mesh, with a locator on its surface; name: for the reader."""
+    """Solution of a push on one mesh, with a locator on its surface; name: description."""
 
     name: str
     sample: SamplePoint
@@ -54,12 +54,12 @@ class ReferenceSolution:
     locator: SurfaceLocator
 
     def reaches(self, depth_m: float) -> bool:
-        """Return whether the solution exists at a depth."""
+        """Return whether the solution converged at a depth."""
         depths = self.snapshot.depths_m[: self.snapshot.reached]
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3) of skin points (q, 3), and the normal force for 1 Pa."""
+        """Return the displacement (q, 3) of skin points (q, 3) and the normal force for 1 Pa."""
         level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
         nodes, weights = self.locator.weights(points)
         displacement: Floats = np.einsum("qa,qai->qi", weights, self.snapshot.moved[level][nodes])
@@ -69,9 +69,9 @@ class ReferenceSolution:
 def select_references(
     references: Sequence[ReferenceSolution], depth_m: float
 ) -> list[ReferenceSolution]:
-    """Return the references that reach a depth, the best first.
+    """Return the references that converged at a depth, the most accurate first.
 
-    Errors are measured against the first; the second gives the uncertainty of the first.
+    Errors are relative to the first; its difference from the second is its uncertainty.
     """
     return [reference for reference in references if reference.reaches(depth_m)]
 
@@ -79,9 +79,9 @@ def select_references(
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return a push on a mesh with `ratio` finger radii between skin nodes.
+    """Return the job of a push on a mesh with a skin spacing of `ratio` finger radii.
 
-    Where the shape has such meshes, only the skin about the finger is that fine.
+    Only the skin near the finger has this spacing if the shape supports focused meshes.
     """
     spacing = ratio * scene.finger.radius_m
     spec = replace(body.spec.mesh, skin_spacing_m=spacing)
@@ -99,14 +99,11 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the same push on a mesh that is equally fine on all touchable skin."""
+    """Return the job of a push on a mesh with the same spacing on all touchable skin."""
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
-    return SnapshotJob(
-        nodes=mesh.nodes,
-        elements=mesh.elements,
-        fixed=mesh.fixed,
-        faces=mesh.contact_nodes[mesh.contact_faces],
-        sample=sample,
+    return snapshots.make_job_on_mesh(
+        mesh,
+        sample,
         poisson_ratio=body.spec.poisson_ratio,
         finger_radius_m=scene.finger.radius_m,
         depths_m=tuple(depths_m),
@@ -116,7 +113,7 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Return the jobs' snapshots; the cache holds each under a digest of its job."""
+    """Return the jobs' snapshots, from the cache or solved; the cache key is the job's digest."""
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]
     missing = [number for number, name in enumerate(names) if cache.load(name) is None]
@@ -138,7 +135,7 @@ def solve_cached_jobs(
 def _load_snapshot(path: Path) -> Snapshot:
     content = load_arrays(path)
     if content is None:
-        raise OSError(f"{path}: was written and cannot be read; check the disk")
+        raise OSError(f"{path}: the file was written but cannot be read; check the disk")
     return snapshots.decode_snapshot(content)
 
 
@@ -154,9 +151,9 @@ def _digest(*jobs: SnapshotJob) -> str:
 
 
 class LocalTable:
-    """The nonlinear table of a body, filled only near one point.
+    """Nonlinear table of a body that is filled only near one point.
 
-    It has the same numbers there as the full table, from the few snapshots that contribute.
+    Its values there equal those of the full table; `jobs` are the few snapshots that they need.
     """
 
     def __init__(
@@ -171,7 +168,7 @@ class LocalTable:
         distance = np.linalg.norm(touchable[response.faces].mean(axis=1) - sample.point, axis=1)
         self._near = np.unique(response.faces[np.argsort(distance)[:CANDIDATE_FACES]])
         points = np.array([one.point * signs for one in samples for signs in self._mirrors])
-        # A sample on a plane of symmetry is its own image: it counts once.
+        # Remove duplicates: a sample on a plane of symmetry is its own mirror image.
         _, first = np.unique(np.round(points, 7), axis=0, return_index=True)
         distances = np.linalg.norm(touchable[self._near][:, None] - points[None, first], axis=2)
         closest = np.argsort(distances, axis=1)[:, : NEIGHBOURS + 1]
@@ -188,7 +185,7 @@ class LocalTable:
         ]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
-        """Return the body with this table, from the snapshots of `jobs`."""
+        """Return the body with the table built from the snapshots of `jobs`."""
         response, radius = self._model.response, self._scene.finger.radius_m
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius
@@ -220,11 +217,11 @@ class LocalTable:
 def load_full_table(
     body: SceneBody, scene: Scene, model: SoftBodyModel, cache_dir: Path
 ) -> SceneBody | None:
-    """Return the body with its full table; None if the table is not cached."""
+    """Return the body with its full table, or None if that is not cached."""
     table = load_cached(table_cache(make_table_spec(scene, body.spec)), cache_dir)
     return None if table is None else attach_table(body, scene, model, table)
 
 
 def has_focused_meshes(body: SceneBody) -> bool:
-    """Return whether the shape has meshes that are fine about the finger only."""
+    """Return whether the shape supports meshes that are fine only near the finger."""
     return isinstance(body.spec.mesh.geometry, Cylinder)

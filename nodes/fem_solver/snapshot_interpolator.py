@@ -1,8 +1,8 @@
-"""Interpolate snapshots between their sample points: this fills a table.
+"""Interpolate snapshots between their sample points, in order to fill a table.
 
-Near the finger the skin moves as at the solved sample, seen in that sample's frame: the field is
-transported with the point and its normal. Far from the finger the field belongs to the body and is
-not transported. So ends and supports, which do not move with the finger, keep their effect.
+Near the finger, the displacement field of a snapshot is transported: shifted and rotated from the
+solved sample point to the new one. Far from the finger it is not transported, because the body's
+ends and supports do not move with the finger.
 """
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, triangle_shape_functions
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_snapshot
+from flexsheet.nodes.models.interpolation import smoothstep
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 TRANSPORTED_RATIO, FIXED_RATIO = 2.5, 6.5
-"""The field is fully transported within the first distance from the point, in finger radii, and not
-at all beyond the second."""
+"""Distances from the sample point, in finger radii, between which the weight of the transported
+field falls from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""Penalty of a slope against the spread of the neighbours, where these do not determine it."""
-
-
-CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
-"""Local coordinates of the six nodes."""
+"""Relative ridge penalty on the slopes of the local fit, which may be underdetermined."""
+FACE_COORDINATES = np.array(
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
+)
+"""Local coordinates (6, 2) of the six-node triangle's nodes."""
 
 
 class SurfaceLocator:
-    """The skin of a mesh, with a search for points on it."""
+    """Search for the skin points of a mesh nearest to given points."""
 
     def __init__(self, rest: Floats, faces: Ints) -> None:
-        """rest (s, 3) nodes, faces (f, 6)."""
+        """Build the search tree for skin nodes `rest` (s, 3) and six-node faces (f, 6)."""
         from scipy.spatial import cKDTree
 
         self._faces = faces
@@ -50,7 +51,7 @@ class SurfaceLocator:
         self._sides, self._inverse = sides, gram @ sides
 
     def weights(self, points: Floats) -> tuple[Ints, Floats]:
-        """Return nodes (q, 6) and shape functions (q, 6) at the skin points nearest to `points` (q,
+        """Return nodes and shape functions, both (q, 6), at the skin points nearest to points (q,
         3)."""
         _, near = self._tree.query(points, k=CANDIDATES)
         offset = points[:, None] - self._origin[near]
@@ -61,14 +62,13 @@ class SurfaceLocator:
         best = np.square(residual).sum(axis=2).argmin(axis=1)
         rows = np.arange(len(points))
         triangle, local = near[rows, best], local[rows, best]
-        part = CORNERS[SUBTRIANGLES[triangle % len(SUBTRIANGLES)]]
+        part = FACE_COORDINATES[SUBTRIANGLES[triangle % len(SUBTRIANGLES)]]
         inner = part[:, 0] + np.einsum("qi,qij->qj", local, part[:, 1:] - part[:, :1])
         return self._faces[triangle // len(SUBTRIANGLES)], triangle_shape_functions(inner)
 
 
 def minimal_rotation(start: Floats, end: Floats) -> Floats:
-    """Return the smallest rotation (3, 3) from one unit vector (3,) to another that is not
-    opposite."""
+    """Return the rotation (3, 3) of minimum angle between unit vectors (3,), not opposite."""
     axis = np.cross(start, end)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + start @ end))
@@ -76,7 +76,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """A snapshot, its sample point and a locator on its mesh."""
+    """Snapshot with its sample point and a locator on its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot
@@ -84,22 +84,25 @@ class PlacedSnapshot:
 
 
 class SnapshotInterpolator:
-    """Interpolate snapshots at any point from the solved ones around it."""
+    """Interpolator of snapshots between sample points (transported moving least squares)."""
 
     def __init__(
         self, solved: Sequence[PlacedSnapshot], towards_user: Floats, radius_m: float
     ) -> None:
-        """solved: all at the same depths. towards_user (3,): a direction less than 180 degrees from
-        all normals. radius_m: the finger's."""
+        """Store the solved snapshots, all with the same depths.
+
+        towards_user (3,): a direction less than 180 degrees from all normals. radius_m: radius of
+        the finger.
+        """
         self._solved, self._user, self._radius = solved, towards_user, radius_m
         self._points = np.array([one.sample.point for one in solved])
         self.depths_m = solved[0].snapshot.depths_m
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Floats32, Floats, float]:
-        """Return skin displacement, force and reached depths of a push at a sample point.
+        """Return the interpolated snapshot at a sample point.
 
-        rest (s, 3): skin nodes. Displacement (k, s, 3); force (k, 3) for 1 Pa; the mean number of
-        the k depths that the neighbours reached.
+        rest (s, 3): skin nodes. Returns the displacement (k, s, 3), the force (k, 3) for 1 Pa, and
+        the weighted mean of the neighbours' numbers of converged depths.
         """
         weights = self.neighbour_weights(sample)
         moved: Floats32 | None = None
@@ -116,10 +119,10 @@ class SnapshotInterpolator:
         return moved, force, reached
 
     def neighbour_weights(self, sample: SamplePoint) -> list[tuple[int, float]]:
-        """Return solved snapshots around a point with weights, which sum to one.
+        """Return the numbers of the solved snapshots near a point and their weights; the sum is 1.
 
-        The weights are those of a local fit, linear over the surface: moving least squares
-        (Lancaster & Salkauskas 1981).
+        The weights are those of linear moving least squares over the surface (Lancaster &
+        Salkauskas 1981).
         """
         offset = self._points - sample.point
         distances = np.linalg.norm(offset, axis=1)
@@ -149,7 +152,7 @@ class SnapshotInterpolator:
         )
         distances = np.linalg.norm(rest - sample.point, axis=1) / self._radius
         weight = np.clip((FIXED_RATIO - distances) / (FIXED_RATIO - TRANSPORTED_RATIO), 0.0, 1.0)
-        weight = (weight * weight * (3.0 - 2.0 * weight))[:, None]
+        weight = smoothstep(weight)[:, None]
         there = solved.sample.point + (rest - sample.point) @ rotation.T
         nodes, weights = solved.locator.weights(weight * there + (1.0 - weight) * rest)
         moved = np.einsum(
@@ -161,14 +164,14 @@ class SnapshotInterpolator:
 
 
 def _tangents(towards_user: Floats) -> list[int]:
-    """Return the two coordinate axes most nearly perpendicular to the direction to the user."""
+    """Return the two coordinate axes most perpendicular to the direction to the user."""
     return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
 
 
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots with their mirror images; a sample on a mirror plane counts once."""
+    """Return the snapshots and their mirror images, without duplicates on mirror planes."""
     placed: dict[tuple[int, ...], PlacedSnapshot] = {}
     for sample, snapshot in zip(samples, solved, strict=True):
         for signs in mirrors:

@@ -1,7 +1,7 @@
-"""Define and solve the neo-Hookean snapshots of a table: sample points, depths, meshes, solutions.
+"""Define and solve the neo-Hookean snapshots of a table.
 
-Young's modulus only scales the forces: all is solved for 1 Pa. A snapshot is one job, arrays in and
-arrays out, so that another process or machine can solve it.
+Snapshots are solved for a Young's modulus of 1 Pa, because the modulus only scales the forces. A
+job contains all its inputs as arrays, so that another process or machine can solve it.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ Bools = NDArray[np.bool_]
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
 SPACING_RATIO = 0.35
-"""Skin spacing of the mesh at the push, in finger radii: 2.5 mm for the usual finger."""
+"""Skin spacing of the mesh at the push, in finger radii."""
 NEAR_RATIO = 1.5
-"""The mesh has this spacing within this many finger radii."""
+"""Distance from the push within which the mesh has this spacing, in finger radii."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
-"""Positions of pushes on a cylinder along its axis, over half its length."""
+"""Positions of the sample points along a cylinder's axis, over half its length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
-"""Angles between pushes around a cylinder, and of the last one from the edge of the touchable
-part."""
+"""Angle between sample points around a cylinder, and angle of the last one from the edge of the
+touchable skin."""
 APART_RATIO, RIM_RATIO = 2.2, 0.9
-"""Pushes on other shapes: their distance, and that from untouchable skin, in finger radii."""
+"""Other shapes: distances between sample points, and from untouchable skin, in finger radii."""
 TOLERANCE, MIN_STEP_FRACTION = 1e-5, 0.25
-"""Solver tolerance and minimum step, looser than the reference: a table needs no more."""
+"""Solver tolerance and minimum step, looser than for a reference solution."""
 SAME_RATIO = 1e-6
 
 
 class SnapshotCancelledError(Exception):
-    """The solution of a snapshot was asked to end."""
+    """Raised when the solution of a snapshot is cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
 class SamplePoint:
-    """A surface point (3,) and its outward normal (3,), mesh frame."""
+    """Surface point (3,) and its outward normal (3,), mesh frame."""
 
     point: Floats
     normal: Floats
@@ -59,9 +59,9 @@ class SamplePoint:
 
 @dataclass(frozen=True, slots=True)
 class SnapshotJob:
-    """The input of a snapshot: a finger pushed in at one point, depth by depth.
+    """Input of a snapshot: pushes at one sample point to several depths.
 
-    nodes (n, 3), elements (e, 10), fixed (n,); faces (f, 6) that the finger can touch.
+    nodes (n, 3), elements (e, 10), fixed (n,). faces (f, 6): faces that the finger can touch.
     """
 
     nodes: Floats
@@ -76,11 +76,11 @@ class SnapshotJob:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The solution of a job.
+    """Solution of a job.
 
-    rest (s, 3), six-node faces (f, 6). moved (k, s, 3): skin displacement at depths (k,). force (k,
-    3) on the finger for 1 Pa. reached: number of depths that converged; the last solution stands
-    for the others.
+    rest (s, 3): skin nodes. faces (f, 6): six-node triangles. moved (k, s, 3): skin displacement at
+    the depths (k,). force_n (k, 3): force on the finger for 1 Pa. reached: number of converged
+    depths; deeper entries repeat the last converged solution.
     """
 
     rest: Floats
@@ -94,9 +94,9 @@ class Snapshot:
 def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
     """Solve a job.
 
-    Raises SnapshotCancelledError once `stopped` returns true; other errors as `NeoHookeanBody`.
+    Raises SnapshotCancelledError when `stopped` returns true; other errors as `NeoHookeanBody`.
     """
-    from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late, as all that needs scipy
+    from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late: scipy is slow to import
 
     body = NeoHookeanBody(
         job.nodes,
@@ -132,13 +132,13 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
 
 def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
-    """Return the reflections (3,) of signs that map the body and its support to themselves.
+    """Return the sign vectors (3,) of the body's mirror symmetries across x and y.
 
-    The identity is first. Only reflections across x and y are considered.
+    The identity is first. Both the body and its support must be symmetric.
     """
     from scipy.spatial import cKDTree
 
-    # Other nodes need not be symmetric: they do not determine whether the body is.
+    # Inner nodes of a symmetric body need not be symmetric, so only these nodes are compared.
     some = np.union1d(mesh.contact_nodes, np.flatnonzero(mesh.fixed))
     points, is_fixed = mesh.nodes[some], mesh.fixed[some]
     tree, same = cKDTree(points), SAME_RATIO * float(np.ptp(points, axis=0).max())
@@ -155,13 +155,12 @@ def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
 def choose_sample_points(
     spec: MeshSpec, mesh: SolidMesh, mirrors: list[Floats], radius_m: float
 ) -> list[SamplePoint]:
-    """Return the points that have to be pushed so that, with mirror images, all touchable skin is
-    near.
+    """Return sample points that, with their mirror images, cover the touchable skin.
 
-    radius_m: the finger's.
+    radius_m: radius of the finger.
     """
     if isinstance(spec.geometry, Cylinder):
-        return _cylinder_sites(spec.geometry, spec.touch_angle_rad, mirrors)
+        return _choose_cylinder_points(spec.geometry, spec.touch_angle_rad, mirrors)
     points, normals = mesh.nodes[mesh.contact_nodes], mesh.contact_normals
     chosen = np.ones(len(points), dtype=bool)
     for axis in (0, 1):
@@ -175,7 +174,7 @@ def choose_sample_points(
         inner = chosen & (rim > RIM_RATIO * radius_m)
         chosen = inner if inner.any() else chosen
     points, normals = points[chosen], normals[chosen]
-    # Farthest first: each next point is the farthest from all before.
+    # Farthest point sampling.
     numbers = [int((points @ np.array(spec.towards_user)).argmax())]
     distances = np.linalg.norm(points - points[numbers[0]], axis=1)
     while distances.max() > APART_RATIO * radius_m:
@@ -184,7 +183,7 @@ def choose_sample_points(
     return [SamplePoint(points[number], normals[number]) for number in numbers]
 
 
-def _cylinder_sites(
+def _choose_cylinder_points(
     cylinder: Cylinder, touch_rad: float, mirrors: list[Floats]
 ) -> list[SamplePoint]:
     last = max(touch_rad - RIM_RAD, 0.5 * touch_rad)
@@ -210,10 +209,10 @@ def make_snapshot_job(
     finger_radius_m: float,
     spacing_m: float | None = None,
 ) -> SnapshotJob:
-    """Return the job of a push.
+    """Return the job of pushes at a sample point to the depths of a table.
 
-    Its mesh is fine only at the push where the shape has such meshes; otherwise it is `mesh`.
-    spacing_m: of skin nodes at the push; None: that of a table.
+    The mesh is focused on the push if the shape supports that; otherwise it is `mesh`. spacing_m:
+    skin spacing of a focused mesh; None for that of a table.
     """
     geometry, support = spec.geometry, spec.support
     if isinstance(geometry, Cylinder) and isinstance(support, StripSupport):
@@ -230,6 +229,20 @@ def make_snapshot_job(
             skin_spacing_m=spacing_m or min(SPACING_RATIO * finger_radius_m, spec.skin_spacing_m),
             focus=focus,
         )
+    return make_job_on_mesh(
+        mesh, sample, poisson_ratio=poisson_ratio, finger_radius_m=finger_radius_m
+    )
+
+
+def make_job_on_mesh(
+    mesh: SolidMesh,
+    sample: SamplePoint,
+    *,
+    poisson_ratio: float,
+    finger_radius_m: float,
+    depths_m: tuple[float, ...] = DEPTHS_M,
+) -> SnapshotJob:
+    """Return the job of pushes at a sample point on the given mesh."""
     return SnapshotJob(
         nodes=mesh.nodes,
         elements=mesh.elements,
@@ -238,27 +251,27 @@ def make_snapshot_job(
         sample=sample,
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
-        depths_m=DEPTHS_M,
+        depths_m=depths_m,
     )
 
 
 def reflect_snapshot(
-    answer: Snapshot, sample: SamplePoint, signs: Floats
+    snapshot: Snapshot, sample: SamplePoint, signs: Floats
 ) -> tuple[Snapshot, SamplePoint]:
-    """Return the same snapshot on the body's mirror image."""
-    faces = answer.faces
+    """Return the mirror image of a snapshot and of its sample point; signs (3,)."""
+    faces = snapshot.faces
     if signs.prod() < 0.0:
         faces = faces[:, [0, 2, 1, 5, 4, 3]]
     image = replace(
-        answer,
-        rest=answer.rest * signs,
+        snapshot,
+        rest=snapshot.rest * signs,
         faces=faces,
-        moved=answer.moved * signs.astype(np.float32),
-        force_n=answer.force_n * signs,
+        moved=snapshot.moved * signs.astype(np.float32),
+        force_n=snapshot.force_n * signs,
     )
     return image, SamplePoint(sample.point * signs, sample.normal * signs)
 
 
 def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
-    """Return the snapshot that `flexsheet.nodes.cache.encode_fields` stored."""
+    """Return the snapshot from arrays that `flexsheet.nodes.cache.encode_fields` made."""
     return Snapshot(reached=int(content.pop("reached")), **content)

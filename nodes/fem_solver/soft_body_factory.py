@@ -1,4 +1,4 @@
-"""Build a scene's soft body from the cache or by computation: first linear, later the table."""
+"""Build a scene's soft body, with the linear method or the nonlinear table, cached or computed."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""`auto`: the nonlinear table if it is cached, else linear."""
+"""Method, or `auto`: the nonlinear table if it is cached, else linear."""
 
 SKIN_SPACING_M = 0.003
-"""Default where neither a parameter nor the scene gives another."""
+"""Default skin spacing without a parameter and a scene setting."""
 
 
 def choose_method(
     scene: Scene, method: MethodChoice, skin_spacing_m: float | Literal["auto"]
 ) -> tuple[MethodChoice, float]:
-    """Return method and skin spacing (m) for a scene, from a node's parameters.
+    """Return method and skin spacing (m) for a scene and a node's parameters.
 
-    A scene that chose the linear method gets it, even where a table is cached. A scene that chose
-    the table gets it where it is cached: only a parameter starts minutes of computation.
+    With `auto`, the scene's choice of the linear method applies even if a table is cached. The
+    scene's choice of the table never starts its computation, which takes minutes; only the
+    parameter does.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -40,11 +41,11 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """Build soft bodies, and store the last model, which several scenes may share.
+    """Factory of soft bodies that caches the last model in memory.
 
-    workers: processes that compute a table, 0: one per core. scheduler: address of a dask scheduler
-    whose workers compute the table instead. Every method takes seconds to minutes when the cache is
-    empty.
+    workers: number of processes for a table, 0: one per core. scheduler: address of a dask
+    scheduler whose workers compute the table instead. All methods take seconds to minutes when the
+    cache is empty.
     """
 
     skin_spacing_m: float
@@ -59,14 +60,14 @@ class SoftBodyFactory:
     def bodies(
         self, scene: Scene, method: MethodChoice, progress: precompute.Progress
     ) -> list[body.SceneBody]:
-        """Return the soft body by each method that is available, the best first.
+        """Return the soft body with each available method, the best first.
 
         Errors as `load_or_compute` and `build_scene_body`.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
         )
-        model = self._model_for(spec, progress)
+        model = self._load_model(spec, progress)
         linear = body.build_scene_body(
             scene,
             spec,
@@ -85,12 +86,12 @@ class SoftBodyFactory:
             return [linear]
         return [body.attach_table(linear, scene, model, table), linear]
 
-    def _model_for(
+    def _load_model(
         self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:
         """Return the last model if it is of this body, else load or compute it.
 
-        An abandoned thread may do the same for another body at any moment.
+        An abandoned thread may concurrently replace the last model, so it is read only once.
         """
         last, key = self._model, spec.key()
         if last is None or last[0] != key:
@@ -100,10 +101,7 @@ class SoftBodyFactory:
     def pending_note(
         self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]
     ) -> str:
-        """Return the end of a note where the scene's table is not computed yet, else an empty text.
-
-        With friction there is no table to wait for.
-        """
+        """Return a note that the scene's nonlinear table is not computed yet, or an empty text."""
         choice = scene.methods.soft_body
         waits_for_table = (
             choice is not None and choice.method == "nonlinear_table" and method == "auto"
@@ -118,11 +116,11 @@ class SoftBodyFactory:
     def build_table(
         self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress
     ) -> body.SceneBody:
-        """Return the body with its nonlinear table, which is computed and cached.
+        """Compute and cache the nonlinear table and return the body with it.
 
         Errors as `compute_table` and `connect_workers`.
         """
-        model = self._model_for(linear.spec, progress)
+        model = self._load_model(linear.spec, progress)
         with self._executor() as (executor, workers):
             table = precompute_table.compute_table(
                 body.make_table_spec(scene, linear.spec),
@@ -136,7 +134,7 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor of the snapshots, and how many of its workers run on this machine."""
+        """Yield the executor for snapshots and the number of its workers on this machine."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # late: it is slow to import
@@ -154,4 +152,4 @@ FACTORY_PARAMETERS = {one.name for one in fields(SoftBodyFactory) if one.init} -
     "cache_dir",
     "skin_spacing_m",
 }
-"""Parameters of the node that the factory takes under the same name."""
+"""Node parameters that are passed to the factory unchanged."""

@@ -1,17 +1,14 @@
 """Compute the response to pushes from a precomputed nonlinear table.
 
-The table stores neo-Hookean solutions (snapshots) for each touchable node at several depths.
+The table contains the displacement of the whole skin and the force for a push at every touchable
+node, at several depths. The mesh's shape functions interpolate between nodes, and cubics with a
+continuous slope between depths. The response is therefore a continuous function of the finger's
+position. It reads 24 rows: six nodes at four depths. (A proper orthogonal decomposition over depth
+needs nine of thirteen modes for an error of 0.1 mm, because the contact area grows with depth. That
+would read more.)
 
-A table holds the displacement of all the skin and the force, at some depths, for a push at every
-node of the touchable skin. Between nodes the mesh's own shape functions interpolate; between depths
-cubics with a continuous slope do. So the response is continuous in the finger's position and
-depends on that alone. It costs the reading of 24 rows: six nodes, four depths. (Modes over depth,
-by proper orthogonal decomposition, were tried. As the contact spreads with depth, nine of thirteen
-were needed for an error of a tenth of a millimetre, which is more to read.)
-
-The table is filled with full Newton solutions at some tens of sample points, transported to the
-nodes between them (`snapshot_interpolator`). At the smallest depths, where these add nothing, the
-linear method's contact fills it.
+The table is filled with Newton solutions (snapshots) at some tens of sample points, interpolated to
+the nodes between them (`snapshot_interpolator`). At small depths the linear method fills it.
 """
 
 from __future__ import annotations
@@ -38,32 +35,35 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint
+from flexsheet.nodes.models.interpolation import smoothstep
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 LINEAR_DEPTHS_M = (0.0007,)
-"""Depths of the table beside those of the snapshots."""
+"""Depths of the table in addition to those of the snapshots."""
 BLEND_M = (0.0007, 0.0015)
-"""Up to the first depth the linear method's response counts, from the second on the snapshots'."""
+"""Depths between which the table changes from the linear response to the snapshots."""
 MIN_COSINE = -0.25
-"""Minimum cosine between the normal of a displayed skin triangle and its normal at rest."""
+"""Minimum cosine between the normals of a skin triangle when deformed and at rest."""
 END_SPAN_M = 0.00125
-"""The range ends this far before the deepest solution; deeper pushes approach that."""
+"""Distance between the end of the method's range and the deepest solution; deeper pushes are
+saturated to the deepest solution."""
 FADE_RATIO = 2.0
-"""Past the end of the touchable skin the indentation fades over this many finger radii."""
+"""Distance past the end of the touchable skin over which the deflection fades to zero, in finger
+radii."""
 CANDIDATE_FACES = 4
 Progress = Callable[[int, int], None]
-"""Called with (done, total) nodes."""
+"""Callback with (done, total) nodes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The responses to pushes at the m contact nodes, at L depths, for 1 Pa.
+    """Responses to pushes at the m contact nodes, at L depths, for 1 Pa.
 
-    depths_m (L,), from 0. fields (m, L - 1, 3 s) float32: skin displacement at all depths but 0.
-    force_n (m, L, 3). reach_m (m,): the depth up to which solutions exist at each node.
+    depths_m (L,): the first is 0. fields (m, L - 1, 3 s) float32: skin displacement at all depths
+    except 0. force_n (m, L, 3). reach_m (m,): maximum depth with a valid solution at each node.
     """
 
     depths_m: Floats
@@ -73,7 +73,7 @@ class Table:
 
 
 def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
-    """Return the memory of a table whose snapshots have this number of depths."""
+    """Return the memory of a table, bytes; depths: number of depths of a snapshot."""
     return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
@@ -86,8 +86,8 @@ def fill_table(
 ) -> Table:
     """Return the table of a body.
 
-    triangles (t, 3) of its skin. linear: of the same response, for 1 Pa, and linear at any depth.
-    on_progress: called with (done, total) nodes; may raise to stop.
+    triangles (t, 3): of its skin. linear: method of the same response for 1 Pa, linear at all
+    depths of the table. on_progress: called with (done, total) nodes; may raise to stop.
     """
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
     points, normals = response.rest[response.contact_nodes], response.normals
@@ -114,8 +114,7 @@ def _fill_levels(
     interpolator: SnapshotInterpolator,
     depths: Floats,
 ) -> tuple[Floats32, Floats, float]:
-    """Return skin displacement (L, 3 s) and force (L, 3) of a push at the depths, and the
-    reach, m."""
+    """Return displacement (L, 3 s) and force (L, 3) at the depths, and the maximum depth, m."""
     moved = np.zeros((len(depths), response.rest.size), dtype=np.float32)
     force = np.zeros((len(depths), 3))
     solved, pushed, reached = interpolator.interpolate(sample, response.rest)
@@ -126,22 +125,21 @@ def _fill_levels(
             moved[level] = np.float32(weight) * solved[level - first].ravel()
             force[level] = weight * pushed[level - first]
         if depth > 0.0 and weight < 1.0:
-            answer = linear.respond(ContactQuery(sample.point, sample.normal, float(depth)))
-            moved[level] += np.float32(1.0 - weight) * answer.displacement.ravel()
-            force[level] += (1.0 - weight) * answer.force_n
+            response_here = linear.respond(ContactQuery(sample.point, sample.normal, float(depth)))
+            moved[level] += np.float32(1.0 - weight) * response_here.displacement.ravel()
+            force[level] += (1.0 - weight) * response_here.force_n
     reach = float(np.interp(reached, np.arange(1, len(solved) + 1), depths[first:]))
     return moved, force, reach
 
 
 class CubicInterpolator:
-    """Interpolate over increasing depths by cubics with a continuous slope.
+    """C1 cubic interpolator over increasing depths.
 
-    The slope at a depth is that of the parabola through it and its neighbours. Each cubic lies
-    between two depths and uses one more on each side.
+    The slope at a depth is that of the parabola through it and its two neighbours.
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """depths_m (L,), four or more."""
+        """Precompute the cubics for depths (L,), L >= 4."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)
@@ -157,18 +155,17 @@ class CubicInterpolator:
             self._powers.append(np.array(rows)[:, first : first + 4])
 
     def weights_at(self, depth_m: float) -> tuple[int, Floats]:
-        """Return the first of the four depths that count at a depth within the range, and their
-        weights."""
+        """Return the index of the first of four depths and their weights (4,) at a depth."""
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
         return self._first[level], np.array([1.0, t, t * t, t * t * t]) @ self._powers[level]
 
 
 def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int32]) -> int:
-    """Return how many of the first levels of a moving skin (L, s, 3) are valid.
+    """Return the number of leading depth levels of a skin displacement (L, s, 3) that are valid.
 
-    A level is valid if no triangle is rotated farther than `MIN_COSINE` permits. Where a finger is
-    transported past a rim, triangles may be.
+    A level is valid if no triangle is rotated farther than `MIN_COSINE`. Transport past an edge of
+    the skin can rotate triangles farther.
     """
 
     def normals(points: Floats) -> Floats:
@@ -186,10 +183,9 @@ def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int3
 
 
 def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
-    """Return the distance (m) of a point (3,) from a triangle's (3, 3) edges, and the nearest point
-    there.
+    """Return the distance (m) of a point (3,) from a triangle's edges, and the nearest edge point.
 
-    The nearest point is given in local coordinates (2,).
+    corners (3, 3). The nearest point is in local coordinates (2,).
     """
     starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
     along = np.clip(
@@ -204,7 +200,7 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 
 
 class TableSoftBody:
-    """The nonlinear table as a `SoftBodyMethod`."""
+    """`SoftBodyMethod` that interpolates a nonlinear table."""
 
     name = "nonlinear_table"
 
@@ -219,8 +215,10 @@ class TableSoftBody:
         push_depth_m: float,
         linear_depth_m: float,
     ) -> None:
-        """bounds as `LinearSoftBody`; linear_depth_m: the depth at which the stiffness is
-        evaluated."""
+        """Precompute the force curves of all contact nodes.
+
+        bounds: as in `LinearSoftBody`. linear_depth_m: depth at which the stiffness is evaluated.
+        """
         from scipy.linalg.blas import sgemv
         from scipy.spatial import cKDTree
 
@@ -240,7 +238,7 @@ class TableSoftBody:
         self._sag = float(np.linalg.norm(self._corners[:, 3:] - middles, axis=2).max())
         sides = self._corners[:, 1:3] - self._corners[:, :1]
         self._inverse = np.linalg.inv(sides @ sides.transpose(0, 2, 1)) @ sides
-        # Local coordinates of a point on each flat face: one product for all.
+        # One matrix product gives the local coordinates of a point on all flat faces.
         self._across = self._inverse.reshape(-1, 3)
         self._offset = (self._inverse @ self._corners[:, 0, :, None]).reshape(-1, 2)
         self._depths = curve_depths(linear_depth_m, max_depth_m - END_SPAN_M, push_depth_m)
@@ -248,30 +246,30 @@ class TableSoftBody:
         self._curves = np.array(
             [self._curve(number, normal) for number, normal in enumerate(response.normals)]
         )
-        room = np.full(len(response.contact_nodes), np.inf)
+        bound_distance = np.full(len(response.contact_nodes), np.inf)
         if len(bounds):
-            room, _ = cKDTree(bounds).query(response.rest[response.contact_nodes])
-        self._reach_and_room = np.column_stack([self.reach_m, np.minimum(room, 1.0)])
+            bound_distance, _ = cKDTree(bounds).query(response.rest[response.contact_nodes])
+        self._reach_and_bound = np.column_stack([self.reach_m, np.minimum(bound_distance, 1.0)])
 
     def respond(self, query: ContactQuery) -> Response:
-        """Return the response; every finite contact has one."""
+        """Return the response to a contact."""
         nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
         if query.depth_m <= 0.0:
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, True)
-        reach, room = (weights @ self._reach_and_room[nodes]).tolist()
+        reach, bound_distance = (weights @ self._reach_and_bound[nodes]).tolist()
         depth = saturate_depth(query.depth_m, reach - END_SPAN_M, reach)
         past = min(max(off, query.beyond_m) / (FADE_RATIO * self._radius), 1.0)
-        fade = 1.0 - past * past * (3.0 - 2.0 * past)
+        fade = 1.0 - smoothstep(past)
         first, over = self._cubics.weights_at(depth)
-        # At depth 0 nothing moves: it has no row.
+        # Depth 0 has no row, because its displacement is zero.
         skipped = 1 if first == 0 else 0
         rows, fractions = slice(first + skipped - 1, first + 3), over[skipped:].astype(np.float32)
         total = np.zeros(self._fields.shape[2], dtype=np.float32)
         add, fields = self._add, self._fields
         for node, weight in zip(nodes.tolist(), (fade * weights).tolist(), strict=True):
-            # Added in place: the cost is reading the table.
+            # BLAS adds in place, without temporary arrays.
             add(weight, fields[node, rows].T, fractions, 1.0, total, 0, 1, 0, 1, 0, 1)
         return Response(
             displacement=total.reshape(-1, 3),
@@ -281,23 +279,24 @@ class TableSoftBody:
             stiffness_n_per_m=stiffness,
             force_curve=curve,
             push_depth_m=max(0.0, query.depth_m - query.beyond_m),
-            in_range=query.depth_m <= reach - END_SPAN_M and past == 0.0 and room >= self._radius,
+            in_range=query.depth_m <= reach - END_SPAN_M
+            and past == 0.0
+            and bound_distance >= self._radius,
         )
 
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
-        """Return the touchable nodes (6,) around a surface point (3,), shape functions, and a
-        distance.
+        """Return the face nodes (6,) and shape functions (6,) at the nearest touchable point.
 
-        The distance (m) is that of the point from the touchable skin.
+        Also returns the distance (m) of the surface point (3,) from the touchable skin.
         """
-        # Squared distances, without the term that all have in common.
+        # Squared distances without the common term.
         squared = self._centre_squares - self._centres @ (2.0 * surface)
         tried = squared.argpartition(CANDIDATE_FACES)[:CANDIDATE_FACES].tolist()
         every = (self._across @ surface).reshape(-1, 2) - self._offset
         local = [(face, *every[face].tolist()) for face in tried]
         best, a, b = max(local, key=lambda one: min(one[1], one[2], 1.0 - one[1] - one[2]))
         if min(a, b, 1.0 - a - b) < 0.0:
-            # The point is off the skin, or over an edge that two flat faces leave between them.
+            # The point is off the skin, or in a gap between the projections of two flat faces.
             nearest = [project_to_edges(surface, self._corners[face, :3]) for face in tried]
             number = int(np.argmin([distances for distances, _ in nearest]))
             off, inner = nearest[number]
@@ -306,20 +305,18 @@ class TableSoftBody:
                 triangle_shape_functions(inner),
                 max(0.0, off - self._sag),
             )
-        # Faces are curved: from the flat one's coordinates one step leads to theirs.
+        # One Newton step from the flat face's coordinates to those of the curved face.
         left = surface - np.array(triangle_shape_functions_at(a, b)) @ self._corners[best]
         a_left, b_left = (self._inverse[best] @ left).tolist()
         weights = np.array(triangle_shape_functions_at(a + a_left, b + b_left))
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force over depth at `linear_depth_m`, at the touchable point nearest to
-        `surface`."""
+        """Return force over depth (N/m) at `linear_depth_m`, near `surface` (3,)."""
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return force over depth near `surface` as `SoftBodyMethod`; past the range as
-        `respond`."""
+        """Return the force curve near `surface` (3,), as `SoftBodyMethod`."""
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 
@@ -329,7 +326,7 @@ class TableSoftBody:
         return result
 
     def _curve(self, number: int, normal: Floats) -> Floats:
-        """Return the force along the normal at the depths of the curve, never falling."""
+        """Return the non-decreasing normal force of a contact node at the depths of the curve."""
         reach = float(self.reach_m[number])
         bent = np.array([saturate_depth(float(d), reach - END_SPAN_M, reach) for d in self._depths])
         along = self._force[number] @ normal

@@ -1,6 +1,6 @@
-"""Project and undistort by pinhole cameras with Brown's distortion.
+"""Project and undistort points with a pinhole camera and Brown's distortion.
 
-A camera frame has x to the right, y down and z along the view.  Points are (..., 3) in metres.
+The camera frame has x to the right, y down and z along the optical axis. Points are (..., 3), m.
 Pixels are (..., 2) with the origin at the centre of the top left pixel, as in OpenCV.
 """
 
@@ -38,9 +38,8 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
 def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) -> Floats:
     """Invert `distort` by fixed-point iteration; normalized coordinates (..., 2).
 
-    It stops when no coordinate changes by more than 1e-13, or after `iterations`.  The iteration
-    contracts while the distortion's slope is well below one, which holds inside the image of any
-    lens that is fit for measurement.
+    The iteration stops when no coordinate changes by more than 1e-13, or after `iterations`. It
+    converges where the distortion's slope is well below one, as inside the image of usual lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
@@ -59,7 +58,7 @@ def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) ->
 
 
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return pixels (..., 2) of points (..., 3) in the camera's frame, in front of it (z > 0)."""
+    """Return the pixels (..., 2) of points (..., 3) in the camera frame with z > 0."""
     normalized = distort(points_camera[..., :2] / points_camera[..., 2:], distortion)
     return normalized @ matrix[:2, :2].T + matrix[:2, 2]
 

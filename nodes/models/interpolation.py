@@ -1,9 +1,11 @@
-"""Interpolate: a smooth step between two values, and predicted paths between their points.
+"""Interpolate between two values, and between the points of predicted paths.
 
-A predictor reports positions at 0, step, 2 step, ... seconds; a consumer asks for its own time.
+A predicted path has positions at 0, step, 2 step, ... seconds after its start.
 """
 
 from __future__ import annotations
+
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +13,23 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def smoothstep(t: Floats) -> Floats:
-    """Return 3 t^2 - 2 t^3 for t in 0..1: from 0 to 1 with zero slope at both ends (C1)."""
-    return np.asarray(t * t * (3.0 - 2.0 * t))
+Real = TypeVar("Real", float, Floats)
+
+
+def smoothstep(t: Real) -> Real:
+    """Return 3 t^2 - 2 t^3 for t in 0..1, which rises from 0 to 1 with zero slope at both ends."""
+    return t * t * (3.0 - 2.0 * t)
 
 
 def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats, Floats]:
     """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `time_s` after its start.
 
-    Between the points runs a cubic with central differences as slopes (Catmull and Rom 1974).  An
-    oscillation of 10 Hz sampled every 10 ms is reproduced to a hundredth of its amplitude.  The
-    path is extrapolated linearly at both ends.
-
-    Raises ValueError for a path of fewer than two points.
+    The interpolation is cubic with central differences as slopes (Catmull and Rom 1974), and linear
+    beyond both ends. Raises ValueError for a path of fewer than two points.
     """
     count = len(path)
     if count < 2:
-        raise ValueError(f"predicted path: {count} points; two or more are needed")
+        raise ValueError(f"predicted path: {count} points; at least two are required")
     steps = time_s / step_s
     i = min(max(int(np.floor(steps)), 0), count - 2)
     t = steps - i
@@ -54,7 +56,7 @@ def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats
 
 
 def _slope(path: Floats, i: int) -> Floats:
-    """Return the slope (3,) per step at a point of a path, of second order at its ends too."""
+    """Return the second-order slope (3,) per step at point `i` of a path."""
     last = len(path) - 1
     if last == 1:
         return np.asarray(path[1] - path[0])

@@ -1,8 +1,7 @@
-"""Bound motion: follow a moving target without lag and without jumps.
+"""Follow a moving target with bounded speed and acceleration.
 
-On the target the follower stays on it, since the target's velocity is fed forward.  Off the target
-it approaches with bounded speed and acceleration, and without overshoot if the target moves at
-constant velocity.
+The target's velocity is fed forward, so there is no lag on the target. Off the target, the follower
+approaches it without overshoot if the target's velocity is constant.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from flexsheet.nodes.models.rigid import (
 Floats = NDArray[np.float64]
 
 BRAKE_FRACTION = 1.0 / 3.0
-"""Fraction of the acceleration for braking onto the target; the rest follows the target."""
+"""Fraction of the acceleration for braking onto the target; the rest is for following it."""
 
 
 def closing_speed(distance: Floats, deceleration: Floats | float, step_s: float) -> Floats:
-    """Return the largest speeds at which a point can still stop within these distances (>= 0).
+    """Return the maximum speeds at which a point can still stop within distances (n,) >= 0.
 
-    In discrete time it moves by speed * step_s per step and slows by deceleration * step_s after
-    each. It arrives exactly, from w^2/(2 a) + w dt/2 = distance; the last distance takes one step.
+    In discrete time the point moves by speed * step_s per step, and the speed then decreases by
+    deceleration * step_s. So w^2/(2 a) + w dt/2 = distance; the last distance takes one step.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -47,15 +46,13 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Step a vector (n,) towards a target that moves with `target_velocity`.
+    """Return the displacement (n,) over a step towards a moving target, and the velocity after it.
 
-    error: target at the end of the step minus the current point.
-
-    Returns the displacement over the step and the velocity after it.  Neither the mean speed of the
-    step nor the velocity changes faster than `max_acceleration`.
+    error: target at the end of the step minus the current point. The change of the mean velocity is
+    bounded by `max_acceleration`.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
-    wanted = desired_velocity(
+    desired = desired_velocity(
         error,
         target_velocity,
         max_speed=max_speed,
@@ -64,7 +61,7 @@ def follow(
     )
     distance = _length(error - target_velocity * step_s)
     reach = (1.0 - BRAKE_FRACTION) * max_acceleration * step_s
-    mean = velocity + _clamp_length(wanted - velocity, reach)
+    mean = velocity + _clamp_length(desired - velocity, reach)
     landed = _length(error - mean * step_s) <= 1e-12 + 1e-9 * distance
     settles = _length(target_velocity - mean) <= BRAKE_FRACTION * max_acceleration * (
         step_s * (1.0 + 1e-9)
@@ -80,7 +77,7 @@ def desired_velocity(
     max_acceleration: float,
     step_s: float,
 ) -> Floats:
-    """Return the velocity (n,) that approaches the target as fast as it can still stop there."""
+    """Return the fastest velocity (n,) towards the target that still allows a stop there."""
     offset = error - target_velocity * step_s
     distance = _length(offset)
     if distance == 0.0:
@@ -91,19 +88,19 @@ def desired_velocity(
 
 
 def _length(vector: Floats) -> float:
-    """Return the norm of a short vector, in a fifth of NumPy's time."""
+    """Return the norm of a short vector, five times as fast as `numpy.linalg.norm`."""
     return sqrt(float(vector @ vector))
 
 
 def _clamp_length(vector: Floats, longest: float) -> Floats:
-    """Shorten a vector to the length `longest`, unless it is shorter."""
+    """Limit the length of a vector to `longest`."""
     length = _length(vector)
     return vector if length <= longest else vector * (longest / length)
 
 
 @dataclass(frozen=True, slots=True)
 class SheetMotion:
-    """Hold the sheet's pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
+    """Motion state of the sheet: pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
 
     world_from_sheet: Floats
     twist_world: Floats
@@ -113,7 +110,7 @@ class SheetMotion:
 
 @dataclass(frozen=True, slots=True)
 class SheetBounds:
-    """Hold the limits of the motion of the sheet's centre, orientation and stretch."""
+    """Limits of the motion of the sheet's centre, orientation and stretch."""
 
     speed_m_per_s: float
     acceleration_m_per_s2: float
@@ -125,18 +122,18 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """Hold the maximum speed of any point of a clamped edge, and the edge's half length.
+    """Limit of the speed of all points of the clamped edges.
 
-    Both translation and rotation of the sheet are scaled alike.  If an arm limited its edge alone,
-    joint by joint, it would leave the sheet's path and move away from the other arm.
+    reach_m: maximum distance of an edge point from the sheet's centre. Translation and rotation are
+    scaled by the same factor. If each arm limited its edge separately, the edges would leave the
+    sheet's path and their distance would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0..1) on linear and angular speed that keeps the edges within the
-        limit."""
+        """Return the factor (0..1) on linear and angular speed that meets the edges' limit."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -144,8 +141,7 @@ class EdgeBound:
 def follow_sheet(
     now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
-    """Return the sheet `step_s` (> 0) later, moved towards `target`, which holds at the step's
-    end."""
+    """Return the sheet after a step towards `target`, which applies at the end of the step."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
@@ -208,7 +204,7 @@ def follow_sheet(
 
 
 def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
-    """Return the sheet `step_s` later while it stops as fast as the bounds allow."""
+    """Return the sheet after a step of the fastest deceleration within the bounds."""
     linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
     angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
     rate = _decelerate(
@@ -224,7 +220,7 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
 
 
 def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
-    """Extrapolate the motion with its twist and rate by `duration_s` (of either sign)."""
+    """Extrapolate the motion by `duration_s`, positive or negative, with constant velocity."""
     return replace(
         motion,
         world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
@@ -238,7 +234,7 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Remove the rotation's rounding error (Gram-Schmidt on x, then y)."""
+    """Return the pose with its rotation made orthonormal (Gram-Schmidt on x, then y)."""
     x_axis = pose[:3, 0] / _length(pose[:3, 0])
     y_axis = pose[:3, 1] - x_axis * (x_axis @ pose[:3, 1])
     y_axis = y_axis / _length(y_axis)

@@ -84,7 +84,7 @@ def make_surface(
                 used, index = np.unique(coarse, return_inverse=True)
                 points, triangles = refine_facets(vertices[used], index.reshape(-1, 3), spacing_m)
             except MeshError as error:
-                raise ValueError(f"spacing_m: {spacing_m}: {error}; or take a larger one") from None
+                raise ValueError(f"spacing_m: {spacing_m}: {error}") from None
             found = shape.closest(points)
             points, normals = found.point, found.normal
         case _:

@@ -1,4 +1,4 @@
-"""Curve the hull's edges onto the true surface where the elements stay valid."""
+"""Move the midpoints of boundary edges to the true surface where the elements remain valid."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MAX_SAG_RATIO = 0.25
-"""Maximum displacement of an edge's midpoint, over the edge's length. A farther surface point lies
-on another side of a thin rim."""
+"""Maximum displacement of an edge's midpoint over the edge's length. A farther surface point is on
+another side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
-    """Return the nodes (n, 3) with the midpoints of hull edges moved to their nearest surface
-    points.
+    """Return the nodes (n, 3) with midpoints of boundary edges moved to the nearest surface points.
 
-    Elements (e, 10) have straight edges before. An element keeps its straight edges where its
-    Jacobian would fall below `MIN_JACOBIAN_RATIO` of the straight element's.
+    elements (e, 10): with straight edges. The edges of an element are left straight if its Jacobian
+    would fall below `MIN_JACOBIAN_RATIO` of the straight element's.
     """
     middles = np.unique(boundary_faces(elements)[:, 3:])
     result = nodes.copy()
@@ -36,7 +35,7 @@ def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Float
     result[far] = nodes[far]
     while True:
         bad = min_jacobian_ratios(result, elements) < MIN_JACOBIAN_RATIO
-        # Straight elements have a ratio of exactly 1: this ends.
+        # The loop terminates, because straight elements have a ratio of 1.
         still_bent = np.unique(elements[bad][:, 4:])
         moved = still_bent[(result[still_bent] != nodes[still_bent]).any(axis=1)]
         if not len(moved):

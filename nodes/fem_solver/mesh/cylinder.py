@@ -1,11 +1,11 @@
 """Mesh a solid cylinder with quadratic tetrahedra, graded towards the side that fingers touch.
 
-The mesh frame has the cylinder's axis along x, its middle in the origin, and z away from the
-support. A cross-section is triangulated once (rings of points, Delaunay) and extruded along x to
-prisms. Each prism is split into three tetrahedra by the order of its vertices' numbers, so that
-neighbours use the same diagonal (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra
-into tetrahedra", 1999). Elements have 10 nodes. The midpoints of edges on the curved side lie on
-the true cylinder (isoparametric); all other edges are straight.
+The mesh frame has its origin at the cylinder's centre, x along the axis and z away from the
+support. A cross-section of point rings is triangulated (Delaunay) and extruded along x to prisms.
+Each prism is split into three tetrahedra by the order of its vertices' numbers, so that neighbours
+use the same diagonal (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra into
+tetrahedra", 1999). The midpoints of edges on the curved side are on the true cylinder
+(isoparametric elements); all other edges are straight.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """The one point of the side that is meshed finely.
+    """Point of the side around which the mesh is fine.
 
-    x_m: its position along the axis. angle_rad: its angle from +z. near_m: the distance within
-    which elements have the requested size.
+    x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
+    have the requested size.
     """
 
     x_m: float
@@ -55,23 +55,22 @@ def cylinder_mesh(
     skin_spacing_m: float,
     focus: Focus | None = None,
 ) -> SolidMesh:
-    """Return the solid cylinder, its skin nodes `skin_spacing_m` apart within `touch_angle_rad` of
-    +z.
+    """Return the mesh of a solid cylinder.
 
-    support_angle_rad: full angle of the fixed strip about -z. touch_angle_rad: half angle about +z
-    that fingers can load. Farther back and inwards, elements grow to twice the size. With a focus,
-    they grow away from that instead. Raises ValueError where no valid mesh results: spacing too
-    coarse for the radius, support all around, touchable part reaching into the support.
+    support_angle_rad: full angle of the fixed strip about -z. touch_angle_rad: half angle of the
+    touchable skin about +z, where the skin nodes are `skin_spacing_m` apart. Elements grow to twice
+    the size at the back and inside, or with the distance from a focus. Raises ValueError for a
+    spacing too coarse for the radius, or for invalid angles.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
         raise ValueError(
-            f"object.support_angle_rad: {support_angle_rad:g} must lie between 0 and 2 pi"
+            f"object.support_angle_rad: {support_angle_rad:g} must be between 0 and 2 pi"
         )
     if touch_angle_rad <= 0.0 or touch_angle_rad > np.pi - half_support + 1e-9:
         raise ValueError(
-            f"touchable half angle: {touch_angle_rad:g} rad must be positive and less than the "
-            f"support's begin at {np.pi - half_support:g} rad; lower object.support_angle_rad"
+            f"touchable half angle: {touch_angle_rad:g} rad must be positive and below the angle "
+            f"of the support, {np.pi - half_support:g} rad; reduce object.support_angle_rad"
         )
     if not 0.0 < skin_spacing_m <= 0.25 * min(radius_m, length_m):
         raise ValueError(
@@ -100,7 +99,7 @@ def cylinder_mesh(
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """Required edge lengths on the side, by the angle from +z (n,) and along the axis."""
+    """Required edge lengths around and along the cylinder's side."""
 
     element_m: float
     touch_angle: float
@@ -128,9 +127,9 @@ class _Sizes:
 
 
 def _stations(length_m: float, sizes: _Sizes) -> Floats:
-    """Return the positions of the cross-sections along the axis, ends included.
+    """Return the positions of the cross-sections along the axis, including both ends.
 
-    With a focus one lies there, with equal steps to both sides as far as elements are small.
+    One cross-section is at the focus, with equal steps on both sides within `near_m`.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -146,9 +145,9 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return angles from `start` (included) to `stop` (not), spaced by the sizes.
+    """Return angles from `start` to `stop` (excluded) on an arc, spaced by the required sizes.
 
-    The arc has this radius and lies at this depth below the side.
+    radius, depth: of the arc, m; the depth is below the cylinder's side.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -157,7 +156,7 @@ def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _
 
 
 def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
-    """Return points among `fine` with this density, from its first on, without its last."""
+    """Return points with the given density over `fine`, including its first and not its last."""
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
     pieces = max(min_count, round(float(total[-1])))
     result: Floats = np.interp(np.arange(pieces) * total[-1] / pieces, total, fine)
@@ -165,7 +164,7 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Yield radius and depth of the rings of points below the rim, inwards."""
+    """Yield radius and depth of each ring of points, from the outermost below the side inwards."""
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
@@ -177,9 +176,9 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 
 
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Return points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
+    """Return points (y, z) and triangles of the cross-section, counter-clockwise seen from +x.
 
-    One point of the rim is on each end of the support.
+    Both ends of the support are points.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
@@ -203,9 +202,8 @@ def _focused_disc(
 ) -> tuple[Floats, Ints]:
     """Return a cross-section as `_disc`, symmetric about the diameter through the focus.
 
-    Only the ends of the support may break the symmetry. An asymmetric mesh deflects a sphere that
-    is pressed into it sideways, by some percent of the force. Without friction the whole body then
-    moves to that side.
+    Only the ends of the support may break the symmetry. In an asymmetric mesh the force on a sphere
+    has a sideways component of some percent, which moves the whole body without friction.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -220,7 +218,7 @@ def _focused_disc(
         rim = [_sample_arc(a, b, radius_m, 0.0, sizes) for a, b in itertools.pairwise(stops)]
         rings = [(radius_m, np.concatenate(rim)), *inner]
         off = np.concatenate([_circle(r * (1.0 + SPIRAL * p[1:]), p[1:]) for r, p in rings])
-        # On a spiral, no four points are on a circle: both halves have the same triangulation.
+        # On a spiral, no four points are cocircular, so both halves get the same triangulation.
         flat = np.column_stack([0.0 * axis, axis * np.where(axis < 0.0, 1.0 + SPIRAL * np.pi, 1.0)])
         number = np.append(np.arange(len(axis)), count + np.arange(len(off)))
         true = np.concatenate([_circle(np.full(len(p) - 1, r), p[1:]) for r, p in rings])
@@ -241,7 +239,7 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 
 
 def _triangles(points: Floats, where: Floats) -> Ints:
-    """Return Delaunay triangles (t, 3) of points (n, 2), counter-clockwise, computed at `where`."""
+    """Return counter-clockwise triangles (t, 3) of points (n, 2); Delaunay at positions `where`."""
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
     triangles = Delaunay(where).simplices.astype(np.int64)
@@ -254,10 +252,9 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
-    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section, slice by
-    slice.
+    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section.
 
-    The diagonals alternate from slice to slice, so that the solid has no preferred direction.
+    The diagonals alternate between slices, so that the solid has no preferred direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
@@ -293,8 +290,7 @@ def _finish_mesh(
     half_support: float,
     touch_angle: float,
 ) -> SolidMesh:
-    """Add the edge midpoints, curve the side's edges onto the cylinder, and identify the skin's
-    parts."""
+    """Return the 10-node mesh with curved edges on the side, fixed and touchable nodes."""
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     middles = inverse.reshape(-1, 6) + len(corners)

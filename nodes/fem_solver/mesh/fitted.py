@@ -1,15 +1,15 @@
-"""Mesh any smooth closed surface: a core of lattice tetrahedra, fitted to the surface.
+"""Mesh any smooth closed surface by fitting a core of lattice tetrahedra to it.
 
-After Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing highly
-deformable objects with tetrahedra", 2003), on a bisected lattice:
+The method follows Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing
+highly deformable objects with tetrahedra", 2003), on a bisected lattice:
 
 1. The lattice is bisected to the required sizes, and finer where the surface is sharply curved.
-2. Vertices that lie deep enough inside are the core, and all tetrahedra about them are taken. So
-   every tetrahedron has a corner inside and at most one face on the hull. Where the hull touches
+2. Vertices deep enough inside form the core, and all tetrahedra with a core vertex are used. So
+   every tetrahedron has a corner inside and at most one boundary face. Where the boundary touches
    itself in an edge or a vertex, vertices are removed from the core.
-3. The hull is moved to the surface while the elements keep their shape (`smoothing`).
+3. The boundary is moved to the surface while the element shapes are optimized (`smoothing`).
 
-The same surface gives the same mesh. Parts thinner than the finest elements are left out.
+The method is deterministic. Parts thinner than the smallest elements are omitted.
 """
 
 from __future__ import annotations
@@ -39,25 +39,26 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 INITIAL_CELL_RATIO = 2
-"""Width of cells before bisection, in smallest required elements."""
+"""Width of the cells before bisection over the minimum element size."""
 MIN_SIZE_RATIO = 0.5
-"""Minimum element size at sharp curvature, over the size in front."""
+"""Minimum element size at sharp curvature, over the minimum size elsewhere."""
 CURVATURE_SIZE_RATIO = 0.8
 """Element size at sharp curvature, in radii of curvature."""
 SURFACE_DISTANCE_RATIO = 0.5
-"""A tetrahedron is at the surface if a corner is nearer to it than this fraction of an edge."""
+"""Maximum distance of a surface tetrahedron's nearest corner from the surface, over its longest
+edge."""
 CORE_DEPTH_RATIO = 0.4
 """Minimum depth of the core's vertices below the surface, over their shortest edge."""
 MAX_THINNED_FRACTION = 0.05
-"""A core that loses more than this fraction of its vertices was too thin for these elements."""
+"""Maximum fraction of core vertices that may be removed; otherwise the object is too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
-"""Maximum number of fits. While an element is flatter than `GOOD_RATIO`, core vertices there are
-removed and the hull is fitted again; the best fit is used."""
+"""Maximum number of fits. While an element is flatter than `GOOD_RATIO`, its highest core vertex
+is removed and the fit is repeated; the best fit is used."""
 
 
-class _Field:
-    """Depth, normal and curvature at lattice vertices; the surface is queried once for each."""
+class _SurfaceCache:
+    """Cache of distance, normal and curvature of the surface at lattice vertices."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
@@ -68,7 +69,7 @@ class _Field:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return signed distance (n,), normal of the nearest surface (n, 3), its curvature (n,)."""
+        """Return signed distance (n,), normal (n, 3) and curvature (n,) of the nearest surface."""
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
         if new:
@@ -83,13 +84,13 @@ class _Field:
 
 
 def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3) and elements (e, 10) of the solid within the shape's surface.
+    """Return nodes (n, 3) and elements (e, 10) of the solid inside the shape's surface.
 
-    low_m, high_m (3,): corners of a box around it. Raises UnfitMeshError where the shape is too
-    thin for elements of that size.
+    low_m, high_m (3,): corners of its bounding box. Raises UnfitMeshError for a shape that is too
+    thin for elements of this size.
     """
     cell = INITIAL_CELL_RATIO * grading.element_m
-    field = _Field(shape, 0.5 * (low_m + high_m), cell)
+    field = _SurfaceCache(shape, 0.5 * (low_m + high_m), cell)
     vertices, tetrahedra = _cover_with_lattice(field, 0.5 * (high_m - low_m), grading)
     distance, _, _ = field.at(vertices)
     points = field.positions(vertices)
@@ -122,8 +123,8 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
         core[ends[np.arange(len(ends)), height.argmax(axis=1)]] = False
     if best is None:
         raise UnfitMeshError(
-            f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the "
-            "object; lower it, or raise object.geometry.smoothing_m"
+            f"skin_spacing_m: elements of {grading.element_m:.3g} m that fill the object are too "
+            "distorted; reduce it, or increase object.geometry.smoothing_m"
         )
     nodes, elements = add_midside_nodes(*best)
     return curve_edges(nodes, elements, lambda points: shape.closest(points).point), elements
@@ -146,7 +147,9 @@ def hull_faces(tetrahedra: Ints) -> Ints:
     return np.asarray(unique[counts == 1])
 
 
-def _cover_with_lattice(field: _Field, half_m: Floats, grading: Grading) -> tuple[Ints, Ints]:
+def _cover_with_lattice(
+    field: _SurfaceCache, half_m: Floats, grading: Grading
+) -> tuple[Ints, Ints]:
     """Return bisected lattice vertices (n, 3) and tetrahedra (e, 4) that cover the solid."""
 
     def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
@@ -160,7 +163,7 @@ def _cover_with_lattice(field: _Field, half_m: Floats, grading: Grading) -> tupl
         matters = at_surface | (corners.min(axis=1) < 0.0)
         return np.asarray(matters & (length > EDGE_SIZE_RATIO * sizes))
 
-    # One more cell about the solid: no core vertex may be at the lattice's end.
+    # One extra layer of cells, because no core vertex may be on the lattice's boundary.
     counts = np.ceil(half_m / field.cell_m).astype(np.int64) + 1
     return bisect(*make_lattice((int(counts[0]), int(counts[1]), int(counts[2]))), too_large)
 
@@ -175,10 +178,9 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """Return the tetrahedra (k, 4) about the core, after vertices of the core (n,) were removed in
-    place.
+    """Return the tetrahedra (k, 4) around the core, without pinches of their boundary.
 
-    The hull of the result does not touch itself in an edge or a vertex.
+    Vertices where the boundary touches itself are removed from `core` (n,), in place.
     """
     before = int(core.sum())
     while True:
@@ -190,15 +192,15 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
         about = about[core[about]]
         if not len(about) or core.sum() < (1.0 - MAX_THINNED_FRACTION) * before:
             raise UnfitMeshError(
-                "skin_spacing_m: the object is too thin for elements of this size; lower it"
+                "skin_spacing_m: the object is too thin for elements of this size; reduce it"
             )
         core[about[distance[about].argmax()]] = False
 
 
 def _find_pinches(faces: Ints) -> Ints:
-    """Return the vertices at which a hull of faces (f, 3) touches itself.
+    """Return the vertices at which a boundary of faces (f, 3) touches itself.
 
-    They belong to edges of more than two faces, or their faces form more than one fan.
+    Such a vertex has an edge of more than two faces, or faces that form more than one fan.
     """
     edges, uses = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),
@@ -208,8 +210,8 @@ def _find_pinches(faces: Ints) -> Ints:
     crowded = np.unique(edges[uses != 2])
     if len(crowded):
         return crowded
-    # With every edge in two faces, the faces about a vertex form closed fans. Corners of faces are
-    # connected over their common edges. Each fan is one component, and each vertex should have one.
+    # Every edge has two faces, so the faces around a vertex form closed fans. In a graph of face
+    # corners connected across edges, each fan is a component; a vertex must have exactly one.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -230,7 +232,7 @@ def _find_pinches(faces: Ints) -> Ints:
 
 
 def _largest_piece(tetrahedra: Ints) -> Ints:
-    """Return the tetrahedra (k, 4) of the largest component; components share no vertex."""
+    """Return the tetrahedra (k, 4) of the largest connected component."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

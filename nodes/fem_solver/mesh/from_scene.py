@@ -1,4 +1,4 @@
-"""Mesh a scene's object: the specification, the required memory, and the mesh itself."""
+"""Mesh a scene's object: specification, resources and mesh."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Ints = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 VERSION = 1
-"""Increase whenever the same specification gives another mesh."""
+"""Version of the mesher. Increase it when the mesh for the same specification changes."""
 TOUCH_MARGIN_RAD = 0.45
 """Angle by which the touchable skin exceeds the working range's tilt."""
 SLAB_DEPTHS = 2.0
@@ -56,18 +56,18 @@ SAMPLES = 16
 """Sample points along each side of the bounding box for the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""Measured numbers of nodes over the sums in `mesh_budget`."""
+"""Measured numbers of nodes over the sums in `_budget`."""
 MAX_LOST_FRACTION = 0.1
-"""A mesh object that loses more than this fraction of its volume is too thin."""
+"""Maximum fraction of an object's volume that its mesh may omit."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshSpec:
-    """All that a mesh depends on.
+    """Inputs of a mesh.
 
-    towards_user: unit vector in the mesh frame. down: of a base, in the object's frame.
-    rotation_rad: of the mesh frame about the object's x, for cylinders. slab_depth_m: of the slab
-    that represents a half-space.
+    towards_user: unit vector in the mesh frame. down: direction of a base support, object frame.
+    rotation_rad: rotation of a cylinder's mesh frame about the object's x. slab_depth_m: depth of
+    the slab that represents a half-space.
     """
 
     geometry: Geometry
@@ -80,7 +80,7 @@ class MeshSpec:
     slab_depth_m: float
 
     def key(self) -> str:
-        """Return a digest that is equal for equal meshes."""
+        """Return a digest that identifies the mesh."""
         digest = hashlib.sha256(f"mesh {VERSION}".encode())
         for part in (self.geometry, self.support):
             for name, value in sorted(dict(part).items()):
@@ -99,15 +99,14 @@ class MeshSpec:
 
 @dataclass(frozen=True, slots=True)
 class MeshBudget:
-    """The approximate resources that meshing needs, known before it starts."""
+    """Approximate number of nodes and memory of a mesh."""
 
     nodes: int
     bytes: int
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
-    """Return what the mesh of this scene's object depends on; raises ValueError as
-    `world_from_mesh`."""
+    """Return the specification of a scene's mesh; raises ValueError as `world_from_mesh`."""
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
@@ -131,11 +130,11 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
 
 
 def world_from_mesh(scene: Scene) -> Floats:
-    """Return the pose of the mesh.
+    """Return the pose (4, 4) of the mesh frame.
 
-    It is the object's; a cylinder is rotated about its axis until its z points to the user as
-    closely as possible. Raises ValueError if a cylinder's axis points at the user, who then has no
-    side in front to touch.
+    It is the object's pose. A cylinder's frame is rotated about the axis so that z points to the
+    user. Raises ValueError if a cylinder's axis points to the user, because its side cannot be
+    touched then.
     """
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
@@ -160,26 +159,25 @@ def _cylinder_rotation_rad(scene: Scene) -> float:
 
 
 def _rounded(vector: Floats) -> Vector:
-    """Return a vector without the noise of rotation, so that the same scene has the same key."""
-    # Adding zero converts -0.0, which prints differently, to 0.0.
+    """Return the vector rounded, so that rounding errors do not change the mesh's key."""
+    # Adding zero converts -0.0 to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Return what `build_mesh` needs; errors as `_budget`. Takes a second for a mesh object."""
+    """Return the resources of `build_mesh`, in up to a second; errors as `_budget`."""
     return _budget(spec, make_shape(dict(spec.geometry)))
 
 
 def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     """Estimate the number of nodes of the mesh, within a factor of two.
 
-    Nodes are half a size apart. So the sum of (2 / size)^3 over the volume estimates those inside,
-    and the sum of (2 / size)^2 over a shell those on the skin. Meshes have more, by the factors
-    above: few elements have the maximum size.
+    Nodes are half an element size apart. The integral of (2 / size)^3 over the volume estimates the
+    inner nodes, and that of (2 / size)^2 over the surface the skin nodes. The measured factors
+    above correct both.
 
-    Raises UnfitMeshError where the spacing does not fit the object, or the mesh would have more
-    than `MAX_NODES`.
+    Raises UnfitMeshError for a spacing that does not fit the object, or more than `MAX_NODES`.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
@@ -188,7 +186,7 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
-            f"minimum extent, {thickness:g} m"
+            f"minimum extent ({thickness:g} m)"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -213,31 +211,30 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     budget = MeshBudget(nodes, nodes * BYTES_PER_NODE)
     if nodes > MAX_NODES:
         raise UnfitMeshError(
-            f"skin_spacing_m: {spacing:g} asks for about {nodes} nodes "
+            f"skin_spacing_m: {spacing:g} requires about {nodes} nodes "
             f"({budget.bytes / 2**30:.1f} GiB while meshing), the maximum is {MAX_NODES}; "
-            "raise the spacing"
+            "increase the spacing"
         )
     return budget
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
-    """Return the corners of the box around what is meshed; a half-space's slab is wider."""
+    """Return the lower and upper corner (3,) of the meshed volume's bounding box."""
     low, high = GEOMETRIES[spec.geometry.shape].bounds_m(spec.geometry)
     margin = spec.slab_depth_m
     return low - margin, high + np.array([margin, margin, 0.0])
 
 
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """Return the mesh of the scene's object in the frame of `world_from_mesh`; errors as
-    `build_mesh`."""
+    """Mesh the scene's object in the frame of `world_from_mesh`; errors as `build_mesh`."""
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
 
 def build_mesh(spec: MeshSpec) -> SolidMesh:
-    """Return the mesh.
+    """Return the mesh of a specification.
 
-    Raises UnfitMeshError (a ValueError) as `mesh_budget`. It also raises that for an object too
-    thin for these elements, and for a support that holds too little or all touchable skin.
+    Raises UnfitMeshError as `_budget`, for an object too thin for its elements, and for a support
+    that fixes too little or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
@@ -269,9 +266,9 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
 
 
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
-    """Return the cylinder's own mesh.
+    """Return the mesh of a cylinder.
 
-    The edges of a strip support are nodes; other supports take the nodes within them.
+    The mesh has nodes on the edges of a strip support; other supports fix the nodes inside them.
     """
     strip = isinstance(spec.support, StripSupport)
     mesh = cylinder_mesh(
@@ -293,7 +290,7 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
 
 
 def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
-    """Return which skin points (n, 3) of the mesh frame are fixed; see `supports.select_fixed`."""
+    """Return which skin points (n, 3), mesh frame, are fixed; see `supports.select_fixed`."""
     object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.rotation_rad, 0.0, 0.0])[:3, :3]
     return select_fixed(
         spec.support,
@@ -305,8 +302,7 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 
 
 def _slab_normals(nodes: Floats) -> Floats:
-    """Return outward normals (n, 3) at the nodes of a slab: top and bottom with their rims;
-    horizontal elsewhere."""
+    """Return the vertical normals (n, 3) of a slab's top and bottom; elsewhere, x."""
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()
@@ -317,12 +313,11 @@ def _slab_normals(nodes: Floats) -> Floats:
 
 
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
-    """Raise UnfitMeshError where too much of the object is missing: parts too thin for the
-    elements."""
+    """Raise UnfitMeshError if parts too thin for the elements are missing in the mesh."""
     required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
     lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
     if lost_fraction > MAX_LOST_FRACTION:
         raise UnfitMeshError(
             f"skin_spacing_m: {100 * lost_fraction:.0f} % of the object is too thin for elements "
-            f"of {2.0 * spec.skin_spacing_m:g} m; lower it"
+            f"of {2.0 * spec.skin_spacing_m:g} m; reduce it"
         )

@@ -1,4 +1,4 @@
-"""Define element sizes: fine on the skin that fingers reach, coarser behind and below it."""
+"""Define element sizes: fine on touchable skin, coarser behind and below it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
 """Growth of the element size per depth below the skin."""
 RAMP_RAD = 0.6
-"""Angle behind the touchable part over which the skin coarsens."""
+"""Angle behind the touchable skin over which the element size grows."""
 EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
-"""A tetrahedron's longest edge over its size: that of a half cube's face, with the stretch of
-maps."""
+"""Maximum longest edge of a tetrahedron over the required size: the diagonal of a square, plus 10 %
+for the distortion by maps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grading:
-    """Skin whose normal is within `touch_angle_rad` of the unit vector `towards_user` is fine."""
+    """Element sizes of a mesh.
+
+    Skin is fine where its normal is within `touch_angle_rad` of the unit vector `towards_user`.
+    """
 
     skin_spacing_m: float
     touch_angle_rad: float
@@ -31,7 +34,7 @@ class Grading:
 
     @property
     def element_m(self) -> float:
-        """Size of the smallest elements: each edge has a node at its midpoint."""
+        """Return the minimum element size, m: edges have a node at their midpoint."""
         return 2.0 * self.skin_spacing_m
 
     def touchable(self, normals: Floats) -> Bools:
@@ -39,7 +42,7 @@ class Grading:
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
-        """Return required sizes (n,), m, below skin with unit normals (n, 3), at depths (n,)."""
+        """Return the required sizes (n,), m, at depths (n,) below skin with unit normals (n, 3)."""
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind
         return np.asarray(self.element_m * coarser + DEPTH_GROWTH * np.maximum(depth_m, 0.0))
@@ -50,7 +53,7 @@ class Grading:
 
 
 def longest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the length (e,) of the longest of each tetrahedron's six edges."""
+    """Return the length (e,) of each tetrahedron's longest edge."""
     corners = points[tetrahedra]
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     square = [np.square(corners[:, i] - corners[:, j]).sum(axis=1) for i, j in pairs]

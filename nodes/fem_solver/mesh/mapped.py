@@ -1,17 +1,12 @@
-"""Mesh sphere, ellipsoid, rounded box and slab as images of a bisected lattice.
+"""Mesh sphere, ellipsoid, rounded box and slab by mapping a bisected lattice to them.
 
-A map takes the surface of a cuboid of lattice cells to the solid's surface. With s = max |u_i| over
-the cuboid's coordinates u in -1..1, and w = u / s on its surface,
+With the cuboid's coordinates u in -1..1, s = max |u_i|, and w = u / s on the cuboid's surface, the
+map is
 
     x(u) = c u + s^2 (X(w) - c w)
 
-X maps the cuboid's surface to the solid's, and c are the inner lattice's half extents: near the
-middle the lattice is undistorted. For an ellipsoid X is the smooth map of a cube's surface to the
-sphere with nearly even areas,
-
-    (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically), times the semi-axes,
-
-and for a rounded box the nearest point of its surface. Symmetric solids get symmetric meshes.
+X maps the cuboid's surface to the solid's (`CuboidMap.surface`). c are the half extents of the
+inner lattice, which is undistorted near the centre. Symmetric solids get symmetric meshes.
 """
 
 from __future__ import annotations
@@ -43,34 +38,34 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""Widths of cells before bisection, in smallest elements, or a little less."""
+"""Widths of the cells before bisection over the minimum element size."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
-"""Stiffness that keeps corners at the map's positions, see `smooth_mesh`. Lower values are tried
-until all elements are better than `GOOD_RATIO`."""
+"""Stiffness of springs to the map's positions, see `smooth_mesh`. The first value is used with
+which all elements are better than `GOOD_RATIO`."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""Lattices with more elements than this many times the fewest are not tried."""
+"""Maximum number of elements of a lattice, over that of the lattice with the fewest."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-    """Return images (n, 3) of lattice vertices (n, 3), and the surface points outside them."""
+    """Return images (n, 3) of lattice vertices (n, 3), and the surface points they project to."""
     u = vertices / (CELL * half_cells)
     weight = np.abs(u).max(axis=1, keepdims=True)
-    # The middle has no direction; any serves, because it has the maximum depth.
+    # The centre has no direction; any direction is valid there.
     w = np.where(weight > 0.0, u / np.maximum(weight, 1e-300), np.array([0.0, 0.0, 1.0]))
     outside = template.surface(w)
     return template.inner_m * u + weight**2 * (outside - template.inner_m * w), outside
 
 
 def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), object's frame, and elements (e, 10) of a shape with this map."""
+    """Return nodes (n, 3), object frame, and elements (e, 10) of a shape with this map."""
 
     def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
         points, outside = map_lattice(template, vertices, half_cells)
         depth = np.linalg.norm(outside - points, axis=1)
         return points, grading.sizes(shape.closest(outside).normal, depth)
 
-    # A lattice's outermost cells are compressed where its corners become round.
+    # The outermost cells are compressed where a corner of the lattice is mapped to a round surface.
     squeezed = np.pi / 4 if template.is_round else 1.0
     for corners, tetrahedra, on_hull in _map_lattices(
         squeezed * template.half_m, grading.element_m, positions
@@ -89,15 +84,15 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
                 nodes = curve_edges(nodes, elements, lambda points: shape.closest(points).point)
                 return nodes, elements
     raise UnfitMeshError(
-        f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the object; "
-        "change it, or choose a less elongated object"
+        f"skin_spacing_m: elements of {grading.element_m:.3g} m that fill the object are too "
+        "distorted; change it, or choose a less elongated object"
     )
 
 
 def mesh_slab(plane: Plane, margin_m: float, grading: Grading) -> tuple[Floats, Ints]:
     """Return nodes (n, 3) and elements (e, 10) of a slab that represents a half-space.
 
-    The slab is `margin_m` deep, and wider than the touchable rectangle by as much on each side.
+    The slab is `margin_m` deep and extends `margin_m` beyond each side of the touchable rectangle.
     """
     rectangle = 0.5 * np.array([plane.width_m, plane.height_m])
     half = np.array([*(rectangle + margin_m), 0.5 * margin_m])
@@ -119,17 +114,17 @@ def distance_to_rectangle(points: Floats, plane: Plane) -> Floats:
 
 
 MapFunction = Callable[[Ints, Ints], tuple[Floats, Floats]]
-"""Lattice vertices (n, 3) and half the cells of each side (3,) to the vertices' images (n, 3) and
-the required element sizes there (n,), m."""
+"""Function from lattice vertices (n, 3) and half the numbers of cells (3,) to the vertices' images
+(n, 3) and the required element sizes there (n,), m."""
 
 
 def _map_lattices(
     half_m: Floats, element_m: float, positions: MapFunction
 ) -> list[tuple[Floats, Ints, Bools]]:
-    """Return corners (n, 3), tetrahedra (e, 4) and hull corners (n,) of several lattices.
+    """Return corners (n, 3), tetrahedra (e, 4) and boundary flags (n,) of several lattices.
 
-    They begin with cells of several sizes and are bisected where required. Those with the fewest
-    elements are first.
+    They start with cells of different sizes and are bisected where required. They are sorted by
+    their number of elements.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:

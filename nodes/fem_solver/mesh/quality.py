@@ -1,4 +1,4 @@
-"""Measure the shape of tetrahedra, and the validity of curved ones."""
+"""Compute quality measures of straight and curved tetrahedra."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MIN_RADIUS_RATIO = 0.1
-"""Meshes with a smaller radius ratio are refused."""
+"""Minimum radius ratio of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
 """Minimum Jacobian of a curved element over that of the straight one."""
 
@@ -27,12 +27,11 @@ def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return three times the inscribed over the circumscribed radius (e,) of the straight
-    tetrahedra.
+    """Return the radius ratios 3 r / R (e,) of inscribed and circumscribed sphere.
 
-    1 for a regular one, 0 for a flat one, negative for an inverted one. Circumradius by the sides'
-    products (Crelle): 24 V R = sqrt of p (p - 2 a) (p - 2 b) (p - 2 c) with a, b, c the products of
-    opposite edges and p their sum.
+    The ratio is 1 for a regular tetrahedron, 0 for a flat and negative for an inverted one. By
+    Crelle, 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p - 2 c)) with the products a, b, c of opposite
+    edges and their sum p.
     """
     corners = points[tetrahedra[:, :4]]
     volume = signed_volumes(points, tetrahedra)
@@ -49,19 +48,19 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     )
     total = products.sum(axis=0)
     heron = total * (total - 2.0 * products).prod(axis=0)
-    # 3 r / R with r = 3 V / area and R = sqrt(heron) / (24 V); a flat one may have R = 0 / 0.
+    # r = 3 V / area and R = sqrt(heron) / (24 V); the maximum avoids 0 / 0 for flat tetrahedra.
     root = np.sqrt(np.maximum(heron, 1e-300))
     ratio: Floats = 216.0 * volume * np.abs(volume) / (area * root)
     return ratio
 
 
 def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
-    """Return a lower bound of each 10-node tetrahedron's Jacobian over the straight one's, (e,).
+    """Return a lower bound (e,) of each 10-node tetrahedron's Jacobian over the straight one's.
 
-    The determinant is a cubic; its coefficients in Bernstein's basis bound it (Johnen, Remacle,
-    Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The three derivatives
-    are linear. So the coefficient of three corners is the mean, over their orders, of the
-    determinant with one derivative taken at each.
+    The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients (Johnen,
+    Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The derivatives
+    are linear. The coefficient of three corners is therefore a mean over their permutations, of the
+    determinant with one derivative evaluated at each corner.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -1,12 +1,11 @@
-"""Move the corners of tetrahedra until all have a good shape and the hull lies on a surface.
+"""Optimize the shape of tetrahedra while their boundary is moved to a surface.
 
 The objective is the sum over tetrahedra of w^2, with w = (|A|^2 / 3)^(3/2) / det A and A the map
-from the regular tetrahedron. w is the inverse of the mean ratio: 1 for a regular tetrahedron of any
-size, infinite for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
-"Tetrahedral mesh improvement via optimization of the element condition number", 2002). So a mesh
-without inverted elements stays without. Springs along the normals pull the hull's corners to the
-surface, with a stiffness that increases from round to round. The corners slide along the surface
-freely.
+from the regular tetrahedron. w is the inverse mean ratio: 1 for a regular tetrahedron of any size,
+infinite for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
+"Tetrahedral mesh improvement via optimization of the element condition number", 2002). Elements
+therefore never become inverted. Springs along the normals pull the boundary corners to the surface;
+their stiffness increases in each round. The corners can slide along the surface.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""Points (n, 3) to the nearest points of the surface (n, 3) and its outward normals there."""
+"""Function from points (n, 3) to the nearest surface points and the outward normals there."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""Stiffness of the springs round by round, for lengths in usual edges. The hull begins up to an
-element off the surface, or on it."""
+"""Spring stiffness in each round, for lengths in median edges and a boundary that starts up to one
+element off the surface."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
-"""Stiffness of the springs round by round, for lengths in usual edges: where the hull begins up to
-an element off the surface, and where it begins on it."""
+"""Spring stiffness in each round, for lengths in median edges and a boundary that starts on the
+surface."""
 MIN_FINAL_RADIUS_RATIO = 0.15
-"""Minimum radius ratio of an element after the last, small step to the surface."""
+"""Minimum radius ratio of an element after its corners are moved onto the surface."""
 ROUND_STEPS = 20
 MEMORY = 8
-"""Pairs of steps and gradient changes that the minimiser stores."""
+"""Number of steps and gradient changes that L-BFGS stores."""
 
 _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
@@ -44,7 +43,7 @@ _FROM_REGULAR = np.linalg.inv(_REGULAR)
 
 
 def make_surface_query(shape: Shape) -> Surface:
-    """Return a shape as the `Surface` that `smooth_mesh` needs."""
+    """Return the `Surface` function of a shape, for `smooth_mesh`."""
 
     def nearest(points: Floats) -> tuple[Floats, Floats]:
         found = shape.closest(points)
@@ -62,12 +61,11 @@ def smooth_mesh(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Return the positions (n, 3) of the corners after smoothing; tetrahedra need a positive
-    volume.
+    """Return the smoothed corner positions (n, 3) of tetrahedra with positive volume.
 
-    anchor: stiffness of springs from each corner to its start, which keep the grading. hull:
-    numbers of the corners that move to the surface. They end on it, except where an element would
-    be flatter than `MIN_FINAL_RADIUS_RATIO`: there they stay at their nearest valid position.
+    hull: numbers of the corners that move to the surface. anchor: stiffness of springs from each
+    corner to its start position, which preserve the grading. Corners of elements that would be
+    flatter than `MIN_FINAL_RADIUS_RATIO` are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
@@ -110,22 +108,22 @@ def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
     if determinant.min() <= 0.0:
         return np.inf, np.zeros_like(points)
     square = (shape * shape).sum((1, 2))
-    badness = (square / 3.0) ** 1.5 / determinant
+    inverse_mean_ratio = (square / 3.0) ** 1.5 / determinant
     inverse = np.swapaxes(np.linalg.inv(shape), 1, 2)
     slope = 3.0 * shape / square[:, None, None] - inverse
-    slope *= 2.0 * np.square(badness)[:, None, None]
+    slope *= 2.0 * np.square(inverse_mean_ratio)[:, None, None]
     by_corner = np.swapaxes(slope @ _FROM_REGULAR.T, 1, 2)
     gradient = np.zeros_like(points)
     np.add.at(gradient, tetrahedra[:, 1:], by_corner)
     np.add.at(gradient, tetrahedra[:, 0], -by_corner.sum(axis=1))
-    return float(np.square(badness).sum()), gradient
+    return float(np.square(inverse_mean_ratio).sum()), gradient
 
 
 def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
-    """Take some steps of L-BFGS with backtracking.
+    """Minimize by `ROUND_STEPS` steps of L-BFGS with backtracking.
 
-    (Nocedal and Wright, Numerical Optimization, alg. 7.5.) scipy's own line search does not accept
-    infinite values.
+    See Nocedal and Wright, Numerical Optimization, alg. 7.5. The line search of scipy does not
+    accept infinite values.
     """
     value, gradient = energy(points)
     steps: list[tuple[Floats, Floats, float]] = []
@@ -135,7 +133,7 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
         if slope >= 0.0:
             steps, direction = [], -gradient
             slope = -float(np.square(gradient).sum())
-        # Limit the step to a fifth of an edge.
+        # A step of at most a fifth of a median edge.
         max_step = float(np.sqrt(np.square(direction).sum(axis=1).max()))
         step = min(1.0, 0.2 / max(max_step, 1e-300))
         while step > 1e-6:
@@ -154,7 +152,7 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
 
 
 def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, float]]) -> Floats:
-    """Apply the two loops of L-BFGS."""
+    """Multiply by the approximate inverse Hessian (two-loop recursion of L-BFGS)."""
     result = gradient.copy()
     weights = []
     for moved, gradient_change, inverse in reversed(steps):

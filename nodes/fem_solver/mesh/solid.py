@@ -1,7 +1,7 @@
-"""Define solid meshes: 10-node tetrahedra, their hull, and the parts of it that matter.
+"""Define solid meshes of 10-node tetrahedra with their skin, fixed and touchable parts.
 
-Corners come first in an element, then the midpoints of its edges (VTK's order). Edges on a curved
-hull are curved: their midpoints lie on the true surface. All other edges are straight.
+An element lists its corners, then the midpoints of its edges (VTK's order). Midpoints of edges on a
+curved surface are on the true surface; all other edges are straight.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
-    """An object cannot be meshed as specified; the text gives the reason and the remedy."""
+    """Raised for an object that cannot be meshed as specified."""
 
     code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."
@@ -34,14 +34,13 @@ class UnfitMeshError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SolidMesh:
-    """A solid of 10-node tetrahedra with the parts of its surface that matter.
+    """Solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3) metres, mesh frame. elements (e, 10). slab (n,): number of a node's slice along x.
-    The nodes of one element lie in at most two successive slabs, and nodes are sorted by slab.
-    fixed (n,) bool. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`,
-    outward. contact_nodes (m,): nodes that a finger can load, all in `skin`, sorted.
-    contact_normals (m, 3). contact_faces (f, 6): indices into `contact_nodes` of the six-node
-    triangles between them, outward.
+    nodes (n, 3): m, mesh frame. elements (e, 10). slab (n,): number of a node's slice along one
+    axis. The nodes of one element are in at most two successive slabs; nodes are sorted by
+    slab. fixed (n,) bool. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into
+    `skin`, outward. contact_nodes (m,): touchable nodes, a sorted subset of `skin`. contact_normals
+    (m, 3). contact_faces (f, 6): indices into `contact_nodes` of six-node triangles, outward.
     """
 
     nodes: Floats
@@ -56,8 +55,7 @@ class SolidMesh:
 
 
 def triangle_shape_functions(local: Floats) -> Floats:
-    """Return the shape functions (..., 6) of the six-node triangle at local coordinates (...,
-    2)."""
+    """Return a six-node triangle's shape functions (..., 6) at local coordinates (..., 2)."""
     a, b = local[..., 0], local[..., 1]
     c = 1.0 - a - b
     result = np.empty((*local.shape[:-1], 6))
@@ -71,14 +69,14 @@ def triangle_shape_functions(local: Floats) -> Floats:
 
 
 def triangle_shape_functions_at(a: float, b: float) -> tuple[float, ...]:
-    """Return `triangle_shape_functions` at one point; arrays are slow for so few numbers."""
+    """Return `triangle_shape_functions` at one point, faster than with arrays."""
     c = 1.0 - a - b
     corners = (c * (2.0 * c - 1.0), a * (2.0 * a - 1.0), b * (2.0 * b - 1.0))
     return (*corners, 4.0 * c * a, 4.0 * a * b, 4.0 * b * c)
 
 
 def boundary_faces(elements: Ints) -> Ints:
-    """Return the six-node faces (f, 6) that belong to one element only, outward."""
+    """Return the outward six-node faces (f, 6) that belong to a single element."""
     faces = elements[:, FACES].reshape(-1, 6)
     _, first, counts = np.unique(
         np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
@@ -88,7 +86,7 @@ def boundary_faces(elements: Ints) -> Ints:
 
 
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), the corners first, and elements (e, 10) with straight edges."""
+    """Return nodes (n, 3), corners first, and elements (e, 10) with straight edges."""
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     elements = np.concatenate([tetrahedra, inverse.reshape(-1, 6) + len(corners)], axis=1)
@@ -96,7 +94,7 @@ def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
 
 
 def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
-    """Return the tetrahedra (e, 4), with those reversed whose volume was negative."""
+    """Return the tetrahedra (e, 4), reordered so that all volumes are positive."""
     sides = corners[tetrahedra[:, 1:]] - corners[tetrahedra[:, :1]]
     oriented = tetrahedra.copy()
     oriented[:, 1:3] = np.where(
@@ -106,9 +104,10 @@ def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
-    """Return the slab (n,) of each node, counted from the low end of the longest side.
+    """Return the slab (n,) of each node, counted along the longest axis.
 
-    Elements extend from one slab into the next at most.
+    The nodes of an element are in at most two successive slabs. Raises UnfitMeshError for several
+    components.
     """
     axis = int(np.ptp(nodes, axis=0).argmax())
     level = np.full(len(nodes), -1)
@@ -118,7 +117,7 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
     while len(waiting):
         reached = (level[waiting] >= 0).any(axis=1)
         if not reached.any():
-            raise UnfitMeshError("the mesh has several components; lower skin_spacing_m")
+            raise UnfitMeshError("the mesh has several components; reduce skin_spacing_m")
         number += 1
         new_nodes = np.unique(waiting[reached])
         level[new_nodes[level[new_nodes] < 0]] = number
@@ -129,10 +128,10 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
 def make_solid_mesh(
     nodes: Floats, elements: Ints, *, touchable: Bools, fixed: Bools, normals: Floats
 ) -> SolidMesh:
-    """Return the mesh with its nodes sorted by slab, and its hull's parts.
+    """Return the mesh with nodes sorted by slab, and with its skin and touchable part.
 
-    touchable, fixed (n,): of nodes on the hull. normals (n, 3), outward, where they are touchable.
-    Faces are touchable where all their nodes are, and none is fixed.
+    touchable, fixed (n,): flags of boundary nodes. normals (n, 3): outward at touchable nodes.
+    Faces are touchable if all their nodes are touchable and none is fixed.
     """
     level = number_slabs(nodes, elements)
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))
@@ -159,17 +158,16 @@ def make_solid_mesh(
 
 
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
-    """Return the mesh with its touchable part limited to where `touchable` (n,) is true and nothing
-    is fixed.
+    """Restrict the touchable part to nodes that are `touchable` (n,) and not fixed.
 
-    Raises UnfitMeshError where no face is left.
+    Raises UnfitMeshError if no face remains.
     """
     good = (touchable & ~mesh.fixed)[mesh.contact_nodes]
     faces = mesh.contact_faces[good[mesh.contact_faces].all(axis=1)]
     if not len(faces):
         raise UnfitMeshError(
-            "no part of the skin can be touched: object.support fixes it, or it faces away from "
-            "the user by more than working_range.tilt_rad; reduce the support, or rotate the object"
+            "no part of the skin is touchable: object.support fixes it, or it faces away from the "
+            "user by more than working_range.tilt_rad; reduce the support or rotate the object"
         )
     used = np.unique(faces)
     return replace(

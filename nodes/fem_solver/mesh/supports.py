@@ -1,4 +1,4 @@
-"""Select the skin that a scene's support fixes."""
+"""Select the skin nodes that a scene's support fixes."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def select_fixed(
 ) -> Bools:
     """Return which skin points (n, 3) with outward unit normals (n, 3) are fixed, (n,).
 
-    All in the object's frame: towards_user (3,) unit vector; down (3,) of a base, of any length.
-    Raises UnfitMeshError for a support that fixes nothing, or too little for the body to stay in
-    place.
+    All vectors are in the object's frame: towards_user (3,), unit vector; down (3,), of a base, of
+    any length. Raises UnfitMeshError for a support that fixes fewer than three points that are not
+    collinear.
     """
     chosen: Bools
     match support:
         case StripSupport():
             if support.angle_rad >= 2.0 * np.pi:
                 raise UnfitMeshError(
-                    f"object.support.angle_rad: {support.angle_rad:g} must be below 2 pi, so "
-                    "that some skin can be touched"
+                    f"object.support.angle_rad: {support.angle_rad:g} must be less than 2 pi, "
+                    "because no skin would be touchable"
                 )
             away = np.arccos(np.clip(-(normals @ towards_user), -1.0, 1.0))
             chosen = np.asarray(away <= 0.5 * support.angle_rad + 1e-9)
@@ -55,7 +55,7 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError unless three chosen points are not on one line."""
+    """Raise UnfitMeshError if all chosen points are collinear."""
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
@@ -64,5 +64,5 @@ def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
             return
     raise UnfitMeshError(
         f"object.support: this {kind} fixes {len(some)} of {len(points)} skin nodes; at least "
-        "three not on one line are needed; enlarge it, or lower skin_spacing_m"
+        "three that are not collinear are required; enlarge it, or reduce skin_spacing_m"
     )

@@ -1,4 +1,4 @@
-"""Make the shapes of virtual objects; `surface` defines what all of them offer."""
+"""Shapes of virtual objects; `surface.Shape` is their interface."""
 
 from __future__ import annotations
 
@@ -34,11 +34,8 @@ from flexsheet.nodes.models.shapes.triangles import MeshError
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
     """Make the shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
 
-    `shape` names it; the other keys are its dimensions, with the names of the class's fields.  A
-    key `origin` is ignored.
-
-    Raises KeyError for an unknown name, and ValueError (MeshError) for dimensions that make no
-    solid.
+    The key `shape` is the name, `origin` is ignored, and the other keys are the dimensions. Raises
+    KeyError for an unknown name and ValueError (MeshError) for invalid dimensions.
     """
     dimensions = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
     return GEOMETRIES[geometry["shape"]].make_shape(**dimensions)

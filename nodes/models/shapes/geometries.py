@@ -1,8 +1,8 @@
-"""Describe each kind of geometry in one place, for all parts of the program that use it.
+"""Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions of a description take the dimensions of one geometry: an object with the fields of
-that kind, such as `scene.object.geometry` or the shape itself.  To add a kind of geometry, add its
-shape and its description to `GEOMETRIES`.
+The functions of a description receive the dimensions of a geometry: an object with its fields, such
+as `scene.object.geometry` or the shape itself. To add a kind of geometry, add its shape and its
+description to the table.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from flexsheet.nodes.models.shapes.surface import Shape
 Floats = NDArray[np.float64]
 
 INNER_RATIO = 0.8
-"""Half extents of the inner lattice of a round solid, over those of the solid."""
+"""Half extents of a round solid's inner lattice over those of the solid."""
 
 
 @dataclass(frozen=True, slots=True)
 class CuboidMap:
-    """Map the surface of the cube -1..1 to the surface of a solid.
+    """Map from the surface of the cube -1..1 to the surface of a solid.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) of the undistorted lattice in its middle.
-    surface: points (n, 3) of the cube's surface to points (n, 3) of the solid's.
-    is_round: whether the whole surface is curved, like an ellipsoid's; else it has flat faces.
+    inner_m: half extents (3,) of the undistorted lattice near its centre.
+    surface: function from points (n, 3) on the cube to points (n, 3) on the solid.
+    is_round: whether the whole surface is curved, as an ellipsoid's; otherwise it has flat faces.
     """
 
     half_m: Floats
@@ -48,17 +48,14 @@ class CuboidMap:
 
 @dataclass(frozen=True, slots=True)
 class GeometryDescription:
-    """Describe one kind of geometry.
+    """Description of one kind of geometry by functions of its dimensions.
 
-    make_shape: makes the shape, which answers queries for nearest points, of the dimensions given
-        by keyword.
-    bounds_m: dimensions to the lower and the upper corner (3,) of the box around the touchable
-        surface and its solid; of a half-space, around the touchable rectangle.
-    extent_m: dimensions and a unit vector (3,) to how far the touchable surface extends from the
-        origin in that direction.
-    scale: dimensions and a ratio to the changed dimensions of the scaled geometry.
-    cuboid_map: dimensions and shape to the map for its meshes; None if its meshes are made in
-        another way.
+    make_shape: makes the shape from the dimensions as keywords.
+    bounds_m: returns the lower and upper corner (3,) of the solid's bounding box; for a half-space,
+        of the touchable rectangle.
+    extent_m: returns the maximum extent of the touchable surface along a unit vector (3,).
+    scale: returns the changed dimensions of the geometry scaled by a ratio.
+    cuboid_map: returns the map for meshing, from dimensions and shape; None for other mesh methods.
     """
 
     make_shape: Callable[..., Shape]
@@ -69,20 +66,20 @@ class GeometryDescription:
 
 
 def map_round_solid(half_m: Floats) -> CuboidMap:
-    """Return the map of an ellipsoid about the origin."""
+    """Return the map of an ellipsoid with half extents (3,), centred on the origin."""
     return CuboidMap(half_m, INNER_RATIO * half_m, lambda w: half_m * cube_to_sphere(w), True)
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return the map of a box-like solid about the origin: the surface point nearest to the box."""
+    """Return the map from a box to the nearest points of a box-like solid."""
     return CuboidMap(half_m, half_m, lambda w: shape.closest(half_m * w).point, False)
 
 
 def cube_to_sphere(w: Floats) -> Floats:
     """Map points (n, 3) of the surface of the cube -1..1 to the unit sphere.
 
-    The map is smooth and nearly preserves areas:
-    (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically).
+    The map is smooth and nearly area-preserving:
+    w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically.
     """
     square = np.square(w)
     second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
@@ -99,7 +96,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent of the side; the end caps are not touchable."""
+    """Return the extent of the side, because the end caps are not touchable."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 

@@ -1,23 +1,19 @@
-"""Represent a closed triangle mesh as a smooth surface, so that the sheet does not rattle on
-facets.
+"""Represent a closed triangle mesh as a smooth implicit surface.
 
-The surface is built in two steps, the first when the shape is made.  `rho` is the smoothing length.
+Facets would cause jumps of the sheet's orientation. `rho` is the smoothing length.
 
 1. Osculating jets (Cazals and Pouget, Estimating Differential Quantities Using Polynomial Fitting
-of Osculating Jets, 2005): about selected vertices a quadratic is fitted to the vertices around by
-least squares.  Position, normal and shape operator A of each give the signed distance to second
-order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
+of Osculating Jets, 2005): around selected vertices a quadratic is fitted by least squares. Its
+position, normal and shape operator A give the signed distance to second order: s_i(x) = n_i d +
+d A_i d / 2 with d = x - p_i.
 2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003): f(x) = sum
-w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and w_i = 0 beyond t_i
-= 1.  The surface is f = 0.
+w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and w_i = 0 for t_i >
+1. The surface is f = 0.
 
-The weights are three times continuously differentiable, and so is f.  Along a path the normal thus
-has a continuous second derivative, unlike with facets, interpolated vertex normals, or patches
-joined with a common tangent plane.  Supports are half as thick along the normal as across it, so
-that the two sides of a thin part do not affect one another.
-
-Edges sharper than `rho` are rounded over about that length; `deviation_m` measures the resulting
-distance of the surface from the mesh.
+f is three times continuously differentiable, so the normal has a continuous second derivative along
+a path. Supports are half as thick along the normal as across it, so that the two sides of a thin
+part do not affect each other. Edges sharper than `rho` are rounded over about that length;
+`deviation_m` measures the resulting distance between surface and mesh.
 """
 
 from __future__ import annotations
@@ -50,40 +46,39 @@ from flexsheet.nodes.models.shapes.triangles import (
 )
 
 FLATNESS = 3.0
-"""Supports are 1 / sqrt(1 + FLATNESS) as thick along the normal as across it."""
+"""A support's thickness along the normal is 1 / sqrt(1 + FLATNESS) of that across it."""
 FIT_RATIO = 1.25
-"""A jet is fitted to the vertices within this many `rho`."""
+"""Radius in which vertices are used for the fit of a jet, over `rho`."""
 SPACING_RATIO = 1.0 / 3.0
-"""Jets of one side of the surface lie at least this many `rho` apart."""
+"""Minimum distance of jets on the same side of the surface, over `rho`."""
 MIN_NORMAL_COSINE = 0.2
 """Minimum cosine between a jet's normal and that of a vertex in its fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""Curvatures are bounded by this over `rho`; sharper ones are smoothed to it."""
+"""Maximum curvature of a jet, times `rho`."""
 EDGE = 1.5
-"""A curvature this many times a jet's maximum comes from jets of different directions: an edge."""
+"""Minimum curvature at an edge over the maximum curvature of a jet."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""f is nearly a distance, with a gradient of nearly unit length.  A deviation above the first bound
-comes from jets of different directions: an edge.  Above the second, f = 0 beyond the rim of a thin
-part, which is no surface."""
+"""Deviations of the length of f's gradient from 1. Above the first, jets of different directions
+meet at an edge. Above the second, f = 0 is beyond the rim of a thin part and not on the surface."""
 MIN_SUPPORT = 0.1
-"""Minimum sum of the weights; on the mesh it is several times this, and less beyond a rim."""
+"""Minimum sum of the weights on the surface; it is smaller only beyond a rim."""
 MEMBERS_KNOWN = 0.1
-"""Distance, in `rho`, over which a list of the supports around a point remains complete."""
+"""Distance, in `rho`, over which a list of the supports near a point remains complete."""
 STRIDE_RATIO = 0.4
-"""Maximum step of a descent in `rho`, so that it never leaves the supports."""
+"""Maximum step of the projection in `rho`, so that it remains within the supports."""
 REST_RATIO = 1e-3
-"""A descent ends at a step below this many `rho`; it leaves nanometres, and some 1e-5 rad."""
+"""Step in `rho` below which the projection has converged, to nanometres and about 1e-5 rad."""
 APART_RATIO = 0.4
-"""Nearest points farther apart than this, in `rho`, are distinct."""
+"""Minimum distance of distinct nearest points, in `rho`."""
 MAX_DEVIATION_RATIO = 0.22
-"""Maximum distance of the surface from the mesh in `rho`; otherwise `rho` is too long."""
+"""Maximum distance of the surface from the mesh, in `rho`."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
-"""Number of further starts that are tried for the global nearest point."""
+"""Maximum number of additional starts in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""Near a centre of curvature, where I + h A is below this, a jet's nearest point is inaccurate."""
+"""Lower bound of the eigenvalues of I + h A near a centre of curvature."""
 RIM_FRACTION = 0.8
-"""From this fraction of a circle's radius on, the weight of what rises in it decreases."""
+"""Fraction of the radius from which the weight decreases in `rise_m`."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -92,10 +87,9 @@ if TYPE_CHECKING:
 
 
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """Return a smoothing length that hides the facets and preserves the form: 1.75 typical edges.
+    """Return the default smoothing length, 1.75 median edges, m.
 
-    Shorter lengths show facets, longer ones flatten what is curved over a few edges; see
-    docs/shapes.md for figures.
+    Shorter lengths leave facets visible, longer ones flatten curved parts; see docs/shapes.md.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -103,13 +97,13 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """Smooth a closed mesh over `smoothing_m`; see the module's text."""
+    """Shape of a closed mesh that is smoothed over `smoothing_m`; see the module docstring."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Build the smooth surface of a closed mesh.
 
-        Raises MeshError for a mesh that bounds no solid or is too small for this smoothing, and
-        ValueError for a length that is not positive.
+        Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
+        length, and ValueError for a length that is not positive.
         """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
@@ -118,8 +112,8 @@ class SmoothMeshShape:
         extent = float(np.ptp(vertices[faces], axis=(0, 1)).max())
         if smoothing_m > MAX_EXTENT_FRACTION * extent:
             raise MeshError(
-                f"smoothed over {smoothing_m * 1e3:.3g} mm little would be left of an object of "
-                f"{extent * 1e3:.3g} mm; smooth over a shorter length"
+                f"smoothing_m: {smoothing_m * 1e3:.3g} mm is more than a third of the object's "
+                f"extent of {extent * 1e3:.3g} mm; reduce it"
             )
         self.smoothing_m = smoothing_m
         used = np.unique(faces)
@@ -135,7 +129,7 @@ class SmoothMeshShape:
         self._samples = np.concatenate(
             [fine_vertices, middles.reshape(-1, 3), corners.mean(axis=1)]
         )
-        # How far from a jet the points can be to which it is the nearest.
+        # Maximum distance of each jet from the points to which it is the nearest.
         away, nearest = self._tree.query(self._samples)
         cover = np.zeros(len(self._centre))
         np.maximum.at(cover, nearest, away)
@@ -143,34 +137,31 @@ class SmoothMeshShape:
         self._table, self._counts = self._support_table(1.1 * cover)
 
     def deviation_m(self) -> float:
-        """Return the largest distance of the mesh from the smooth surface.
+        """Return the maximum distance of the mesh from the smooth surface, m.
 
-        Vertices, midpoints of edges and centres of triangles are checked, which takes as long as
-        some thousand queries.
-
-        Raises MeshError where it is more than `MAX_DEVIATION_RATIO` of `smoothing_m`.
+        It is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError above
+        `MAX_DEVIATION_RATIO` of `smoothing_m`.
         """
         deviation = float(np.abs(self.closest(self._samples).height_m).max())
         if deviation > MAX_DEVIATION_RATIO * self.smoothing_m:
             raise MeshError(
-                f"smoothed over {self.smoothing_m * 1e3:.3g} mm the surface leaves the mesh by "
-                f"{deviation * 1e3:.3g} mm; smooth over a shorter length or refine the mesh"
+                f"smoothing_m: with {self.smoothing_m * 1e3:.3g} mm the surface deviates from the "
+                f"mesh by {deviation * 1e3:.3g} mm; reduce it or refine the mesh"
             )
         return deviation
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided where two separate places are as near.
+        """Implement `Shape.closest`; undecided where two distinct points are equally near.
 
-        `on_edge` where the surface is more sharply curved than `EDGE * MAX_CURVATURE_RATIO /
-        smoothing_m`: at rims thinner than `smoothing_m` and at rounded edges, which a sheet cannot
-        roll over.
+        `on_edge` is true for curvatures above `EDGE * MAX_CURVATURE_RATIO / smoothing_m`: at rims
+        thinner than `smoothing_m` and at rounded edges, over which a sheet cannot roll.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
         if queries.ndim == 1 and before is not None:
-            going_on = self._continue_from(queries, before)
-            if going_on is not None:
-                return going_on
+            continued = self._continue_from(queries, before)
+            if continued is not None:
+                return continued
         flat = queries.reshape(-1, 3)
         earlier = None if before is None else before.reshape(-1, 3)
         point, normal, operator = (np.empty((len(flat), *end)) for end in ((3,), (3,), (3, 3)))
@@ -178,13 +169,13 @@ class SmoothMeshShape:
         undecided = np.zeros(len(flat), dtype=bool)
         for start in range(0, len(flat), CHUNK):
             part = slice(start, start + CHUNK)
-            begun = None if earlier is None else earlier[part]
-            feet, undecided[part] = self._project(flat[part], begun)
+            starts = None if earlier is None else earlier[part]
+            feet, undecided[part] = self._project(flat[part], starts)
             point[part], normal[part] = feet.point, feet.normal
             operator[part], steepness[part] = feet.shape_operator, feet.steepness
             support[part] = feet.support
         height = ((flat - point) * normal).sum(-1)
-        # The Frobenius norm, one to root two times the larger curvature: no eigenvalues needed.
+        # The Frobenius norm is 1 to sqrt(2) times the larger curvature and needs no eigenvalues.
         sharpness = np.sqrt(np.square(operator).sum((1, 2)))
         on_edge = sharpness > EDGE * MAX_CURVATURE_RATIO / self.smoothing_m
         on_edge |= (np.abs(steepness - 1.0) > OFF_ONE) | (support < MIN_SUPPORT)
@@ -199,13 +190,13 @@ class SmoothMeshShape:
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`."""
+        """Implement `Shape.signed_distance`."""
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Return `closest` for one query (3,) by a descent from the previous point.
+        """Return `closest` for one query (3,) by projection from the previous point.
 
-        Returns None if that descent does not converge, which is rare.
+        Returns None if that does not converge.
         """
         feet = self._descend_one(query, before)
         if not feet.is_nearest[0]:
@@ -222,34 +213,35 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest points of queries (n, 3), from previous points, and which are
-        undecided.
+        """Return the nearest points of queries (n, 3), and which are undecided (n,).
+
+        before: previous points (n, 3), or None.
         """
         if before is None:
-            return self._nearest_of_all(queries)
+            return self._find_global_nearest(queries)
         feet = self._descend(queries, before)
         undecided = np.zeros(len(queries), dtype=bool)
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
-            found_again, undecided[lost] = self._nearest_of_all(queries[lost])
-            _put(feet, lost, found_again)
+            replacement, undecided[lost] = self._find_global_nearest(queries[lost])
+            _put(feet, lost, replacement)
         return feet, undecided
 
-    def _nearest_of_all(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest points, whatever was found before.
+    def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
+        """Return the global nearest points without previous points, and which are undecided.
 
-        A descent from the nearest jet ends at distance D. Any nearer point has a jet within the
-        cover c of it. By the bound on curvature, that jet is at most sqrt(D^2 + c^2 (1 + 4 D /
-        rho)) away. Further descents start from the jets that `_select_starts` leaves of them.
+        The projection from the nearest jet ends at distance D. A nearer point has a jet within the
+        cover radius c. By the bound on curvature, that jet is at most sqrt(D^2 + c^2 (1 + 4 D /
+        rho)) from the query. `_select_starts` selects the starts of further projections from these.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
         feet = self._descend(queries, self._on_jet(queries, nearest))
         distance = np.linalg.norm(queries - feet.point, axis=1)
-        # A descent that ended farther away than it began went astray.
-        begun = np.linalg.norm(queries - start, axis=1)
-        feet.is_nearest[distance > begun + self._cover] = False
-        distance = np.where(feet.is_nearest, distance, begun)
+        # A projection that ended farther from the query than its start diverged.
+        start_distance = np.linalg.norm(queries - start, axis=1)
+        feet.is_nearest[distance > start_distance + self._cover] = False
+        distance = np.where(feet.is_nearest, distance, start_distance)
         slack = self._cover**2 * (1.0 + 2.0 * MAX_CURVATURE_RATIO * distance / rho)
         lists = self._tree.query_ball_point(queries, np.sqrt(distance**2 + slack))
         undecided = np.zeros(len(queries), dtype=bool)
@@ -267,7 +259,7 @@ class SmoothMeshShape:
                     undecided[row] = True
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
-            # At a rim that the jets do not close: the nearest jet itself.
+            # At a rim that the jets do not cover, the nearest jet is the result.
             feet.point[lost], feet.normal[lost] = start[lost], self._normal[nearest[lost]]
             feet.shape_operator[lost] = self._operator[nearest[lost]]
             feet.support[lost], undecided[lost] = 0.0, True
@@ -276,11 +268,11 @@ class SmoothMeshShape:
     def _select_starts(
         self, queries: Floats, lists: list[list[int]], feet: Floats, distance: Floats
     ) -> tuple[Indices, Indices]:
-        """Select the jets from which a nearer point may be found; return rows of queries, and jets.
+        """Return starts for a nearer point: rows of the queries (k,), and jets (k,).
 
-        The quadratic of such a jet has a nearest point that is a minimum, not far from the jet, and
-        not much farther than `distance` (n,). Of jets within `rho` of one another, one is taken.
-        Jets near the points `feet` that are known already are left out.
+        The nearest point of such a jet's quadratic is a minimum near the jet, at a distance not
+        much above `distance` (n,). Only one of the jets within `rho` is selected. Jets near the
+        projections `feet` (n, 3) are excluded.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -295,19 +287,19 @@ class SmoothMeshShape:
         across = offset - height * normal
         values, vectors = np.linalg.eigh(_IDENTITY + height[:, :, None] * self._operator[jets])
         along = (np.swapaxes(vectors, 1, 2) @ across[:, :, None])[:, :, 0]
-        # Feet of quadratics are rough, hence the room that is given.
+        # The factor 1.5 covers the error of a quadratic's nearest point.
         reach = 1.5 * self._cover * np.maximum(values, MIN_CURVATURE_FACTOR)
-        hopeful = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
+        promising = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
         rough_distance = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
-        hopeful &= rough_distance < distance[rows] + self._cover
-        rows, jets, offset = rows[hopeful], jets[hopeful], offset[hopeful]
-        taken: dict[int, list[int]] = {}
+        promising &= rough_distance < distance[rows] + self._cover
+        rows, jets, offset = rows[promising], jets[promising], offset[promising]
+        selected: dict[int, list[int]] = {}
         for i in np.argsort(np.square(offset).sum(1)):
-            kept = taken.setdefault(int(rows[i]), [])
-            apart = np.square(self._centre[jets[kept]] - self._centre[jets[i]]).sum(1) > square
-            if len(kept) < MAX_STARTS and apart.all():
-                kept.append(int(i))
-        chosen = np.array(sorted(i for kept in taken.values() for i in kept), dtype=np.int64)
+            starts = selected.setdefault(int(rows[i]), [])
+            apart = np.square(self._centre[jets[starts]] - self._centre[jets[i]]).sum(1) > square
+            if len(starts) < MAX_STARTS and apart.all():
+                starts.append(int(i))
+        chosen = np.array(sorted(i for some in selected.values() for i in some), dtype=np.int64)
         return rows[chosen], jets[chosen]
 
     def _descend(self, queries: Floats, starts: Floats) -> SurfaceProjections:
@@ -329,7 +321,7 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """See `Shape`; evaluated at the jets, which are closer to each other than `smoothing_m`."""
+        """Implement `Shape.rise_m`, evaluated at the jets."""
         offset = self._centre[:-1] - point
         height = offset @ normal
         across = np.einsum("ji,ji->j", offset, offset) - height * height
@@ -340,12 +332,12 @@ class SmoothMeshShape:
         return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Return rough nearest points (n, 3) of queries on the quadratics of single jets (n,)."""
+        """Return approximate nearest points (n, 3) of queries on the quadratics of jets (n,)."""
         normal, operator = self._normal[jet], self._operator[jet]
         offset = queries - self._centre[jet]
         height = (offset * normal).sum(1)[:, None]
         across = offset - height * normal
-        # The first two terms of (I + h A)^-1, as long as it is a small correction.
+        # The first two terms of the series of (I + h A)^-1, for small h only.
         near = np.clip(height, -0.25 * self.smoothing_m, 0.25 * self.smoothing_m)
         along = across - near * (operator @ across[:, :, None])[:, :, 0]
         length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -354,10 +346,10 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """Return, for each jet, the jets whose supports reach its neighbourhood, and their number.
+        """Return the jets (j, k) whose supports reach each jet's neighbourhood, and counts (j,).
 
-        cover: (j,) radius of that neighbourhood: the points to which the jet is the nearest. Rows
-        are padded with a jet at infinity.
+        cover (j,): radius of that neighbourhood. Rows are padded with the number of a jet at
+        infinity, which is appended to the jets.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -371,7 +363,7 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f with its derivatives at points (n, 3) near the surface, see `LevelSet`.
+        """Evaluate f as a `LevelSet` at points (n, 3) near the surface.
 
         The support is the sum of the weights.
         """
@@ -385,7 +377,7 @@ class SmoothMeshShape:
         inside = np.maximum(inside, 0.0)
         weight = inside**4
         total = weight.sum(1)
-        # Never on the way, by the stride; a start far off takes the nearest jet's alone.
+        # Only a start far from the surface is outside all supports; it uses the nearest jet alone.
         alone = total < 1e-12
         if alone.any():
             weight[alone] = members[alone] == nearest[alone, None]
@@ -412,9 +404,9 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the jet nearest to a point (3,), and the jets whose supports may reach near it.
+        """Return the nearest jet of a point (3,) and the jets (k,) with supports near it.
 
-        Their centres (k, 3), normals (k, 3) and shape operators (k, 3, 3) follow.
+        Also returns their centres (k, 3), normals (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -428,22 +420,22 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """Evaluate `SmoothMeshShape._level` at the single points of one descent, see `LevelAt`.
+    """`LevelAt` of a `SmoothMeshShape` for the points of one projection.
 
-    The list of jets is renewed only after a longer distance.
+    The list of jets is updated only after a distance of `MEMBERS_KNOWN`.
     """
 
-    __slots__ = ("_asked_at", "_jets", "_shape")
+    __slots__ = ("_jets", "_jets_point", "_shape")
 
     def __init__(self, shape: SmoothMeshShape, start: Floats) -> None:
-        self._shape, self._asked_at = shape, start
+        self._shape, self._jets_point = shape, start
         self._jets = shape.surroundings(start)
 
     def __call__(self, point: Triple) -> tuple[float, list[float], list[list[float]], float]:
         here, rho = np.array(point), self._shape.smoothing_m
-        square, gone = rho**2, here - self._asked_at
-        if gone @ gone > MEMBERS_KNOWN**2 * square:
-            self._asked_at, self._jets = here, self._shape.surroundings(here)
+        square, moved = rho**2, here - self._jets_point
+        if moved @ moved > MEMBERS_KNOWN**2 * square:
+            self._jets_point, self._jets = here, self._shape.surroundings(here)
         nearest, members, centre, normal, operator = self._jets
         offset = here - centre
         height = np.einsum("ki,ki->k", offset, normal)
@@ -473,7 +465,7 @@ class _LevelNear:
 
 
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
-    """Mark points where f = 0 beyond the rim of a thin part as not nearest."""
+    """Clear `is_nearest` of points with f = 0 beyond the rim of a thin part."""
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
     return feet
@@ -485,7 +477,7 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Store the chosen rows of other projections."""
+    """Replace rows of projections by the chosen rows of other projections."""
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
     feet.steepness[rows], feet.support[rows] = other.steepness[chosen], other.support[chosen]
@@ -493,7 +485,7 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Fit points (j, 3), normals (j, 3) and shape operators (j, 3, 3) about selected vertices."""
+    """Return points (j, 3), normals (j, 3) and shape operators (j, 3, 3) of the fitted jets."""
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
 
@@ -514,22 +506,22 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Select vertices such that no two on the same side are closer than `spacing`.
+    """Return vertices of which no two on the same side are closer than `spacing`.
 
     Every other vertex has a selected one within that distance.
     """
-    taken, covered = [], np.zeros(len(vertices), dtype=bool)
+    selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
         if covered[vertex]:
             continue
-        taken.append(vertex)
+        selected.append(vertex)
         near = np.array(tree.query_ball_point(vertices[vertex], spacing))
         covered[near[normals[near] @ normals[vertex] > 0.5]] = True
-    return taken
+    return selected
 
 
 def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
-    """Return the allowed vertices that are connected to `start` through allowed ones."""
+    """Return the allowed vertices that are connected to `start` through allowed vertices."""
     found, edge = [start], [start]
     left = allowed - {start}
     while edge:
@@ -543,10 +535,10 @@ def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
 def _jet(
     origin: Floats, rough: Floats, around: Floats, rho: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit the quadratic z(x, y) to points (m, 3); return point, normal (3,), shape operator (3, 3).
+    """Fit a quadratic z(x, y) to points (m, 3); return point, normal (3,), shape operator (3, 3).
 
-    z is along the rough normal; lengths are scaled by the fit's radius. For too few points the
-    solution of least norm is taken.
+    z is along the approximate normal; lengths are scaled by the fit's radius. For too few points
+    the result is the solution of minimum norm.
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])
@@ -566,12 +558,12 @@ def _jet(
     values, vectors = np.linalg.eigh(tangent @ graph @ tangent)
     bound = MAX_CURVATURE_RATIO / rho
     bounded = np.clip(values, -bound, bound)
-    turned = frame @ vectors
-    operator = turned @ np.diag(bounded) @ turned.T
+    rotated = frame @ vectors
+    operator = rotated @ np.diag(bounded) @ rotated.T
     normal = frame @ normal
     point = origin + shift * reach * rough
     if (bounded != values).any():
-        # A blunter quadratic through the same point would bulge out of the edge: move it back in.
+        # With bounded curvature the quadratic is outside the edge; move it inwards.
         offset = around - point
         distance = offset @ normal + 0.5 * np.einsum("mi,ij,mj->m", offset, operator, offset)
         point = point + (distance @ weight / weight.sum()) * normal

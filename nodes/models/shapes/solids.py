@@ -1,4 +1,4 @@
-"""Define the shapes with a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
+"""Define the analytic shapes: cylinder, sphere, plane, ellipsoid, rounded box."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class CylinderShape(Convex):
-    """Define a circular cylinder about the x axis, centred on the origin.
+    """Circular cylinder about the x axis, centred on the origin.
 
-    Only its side is touchable, because the sheet is clamped along x. A finger beyond an end cap
-    gets the nearest point of the side's rim, with `on_edge`.
+    Only the side is touchable, because the sheet is clamped along x. The nearest point to a finger
+    beyond an end cap is on the side's rim, with `on_edge`.
     """
 
     radius_m: float
@@ -40,7 +40,7 @@ class CylinderShape(Convex):
         check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided on the axis."""
+        """Implement `Shape.closest`; undecided on the axis."""
         queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
         normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
@@ -54,7 +54,7 @@ class CylinderShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, beyond, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`; of the solid with its end caps."""
+        """Implement `Shape.signed_distance` for the solid with its end caps."""
         queries = check_points(points)
         aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
         beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
@@ -62,13 +62,13 @@ class CylinderShape(Convex):
         return np.asarray(outside + np.minimum(np.maximum(aside, beyond), 0.0))
 
     def angle_rad(self, point: Floats) -> float:
-        """Return the angle of a point (3,) about the axis, 0 on +z, growing towards +y."""
+        """Return the angle of a point (3,) about the axis: 0 on +z, positive towards +y."""
         return float(np.arctan2(point[1], point[2]))
 
 
 @dataclass(frozen=True, slots=True)
 class SphereShape(Convex):
-    """Define a sphere about the origin."""
+    """Sphere about the origin."""
 
     radius_m: float
 
@@ -76,7 +76,7 @@ class SphereShape(Convex):
         check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided at the centre."""
+        """Implement `Shape.closest`; undecided at the centre."""
         queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
         operator = (_IDENTITY - _outer(normal)) / self.radius_m
@@ -85,13 +85,13 @@ class SphereShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, nowhere, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`."""
+        """Implement `Shape.signed_distance`."""
         return np.asarray(np.linalg.norm(check_points(points), axis=-1) - self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """Define the half-space z <= 0, touchable on a rectangle of its face about the origin."""
+    """Half-space z <= 0, touchable on a rectangle of its face about the origin."""
 
     width_m: float
     height_m: float
@@ -100,7 +100,7 @@ class PlaneShape(Convex):
         check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; past the rectangle (x along the width, y along the height) `on_edge`."""
+        """Implement `Shape.closest`; `on_edge` beyond the rectangle (x: width, y: height)."""
         queries = check_points(points)
         check_previous(previous, queries)
         half = 0.5 * np.array([self.width_m, self.height_m, np.inf])
@@ -114,13 +114,13 @@ class PlaneShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`; of the whole half-space."""
+        """Implement `Shape.signed_distance` for the whole half-space."""
         return check_points(points)[..., 2].copy()
 
 
 @dataclass(frozen=True, slots=True)
 class EllipsoidShape(Convex):
-    """Define an ellipsoid about the origin, its semi-axes along x, y, z."""
+    """Ellipsoid about the origin with semi-axes along x, y, z."""
 
     semi_axes_m: tuple[float, float, float]
 
@@ -129,7 +129,7 @@ class EllipsoidShape(Convex):
             check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided on the medial disc, across the shortest axis."""
+        """Implement `Shape.closest`; undecided on the medial disc across the shortest axis."""
         queries = check_points(points)
         before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
@@ -138,11 +138,11 @@ class EllipsoidShape(Convex):
             point = self._nearest(flat, np.broadcast_to(FRONT, flat.shape))
         else:
             starts = before.reshape(-1, 3)
-            # At the centre the level set has no slope and gives no side.
-            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < EQUAL_DISTANCE_M
-            starts = np.where(blind, FRONT * self.semi_axes_m, starts)
-            least = min(self.semi_axes_m)
-            stride_m, rest_m = 0.5 * least, 1e-7 * least
+            # The level set has no slope at the centre, so it cannot be a start.
+            at_centre = np.linalg.norm(starts, axis=-1, keepdims=True) < EQUAL_DISTANCE_M
+            starts = np.where(at_centre, FRONT * self.semi_axes_m, starts)
+            min_axis_m = min(self.semi_axes_m)
+            stride_m, rest_m = 0.5 * min_axis_m, 1e-7 * min_axis_m
             if len(flat) == 1:
                 feet = descend_one(
                     self._level_at, flat[0], starts[0], stride_m=stride_m, rest_m=rest_m
@@ -171,11 +171,11 @@ class EllipsoidShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`."""
+        """Implement `Shape.signed_distance`."""
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate the ellipsoid as a level set, see `LevelSet`; supported everywhere."""
+        """Evaluate the ellipsoid as a `LevelSet` with support 1."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -185,17 +185,16 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate it at a single point, see `LevelAt`."""
+        """Evaluate the ellipsoid as a `LevelAt` at a single point."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
         return value, (x * p, y * q, z * r), ((p, 0.0, 0.0), (0.0, q, 0.0), (0.0, 0.0, r)), 1.0
 
     def _undecided(self, queries: Floats) -> Bools:
-        """Return whether two surface points are equally near to queries.
+        """Return which queries (n, 3) have two equally near surface points.
 
-        That is so on a plane of symmetry, within the centres of curvature of the other two
-        directions.
+        These are on a plane of symmetry, within the centres of curvature of the other two axes.
         """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
@@ -206,22 +205,20 @@ class EllipsoidShape(Convex):
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
-        """Return the nearest of all surface points, (n, 3).
+        """Return the global nearest surface points (n, 3).
 
-        With e the semi-axes, the nearest point is x_i = e_i^2 q_i / (t + e_i^2), where t is the
+        With the semi-axes e, the nearest point is x_i = e_i^2 q_i / (t + e_i^2), where t is the
         largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to an
-        Ellipsoid, 2013).  As for a trust-region problem, the root is found in the reciprocal norm.
-        That norm is concave and almost straight, so that Newton's method approaches it from the
-        left and never passes it (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3).  A query on a
-        plane of symmetry is moved off it, towards `sides` (n, 3), by a billionth of the shortest
-        axis, which avoids the poles.
+        Ellipsoid, 2013). Newton's method is applied to the reciprocal norm, which is concave, so it
+        converges monotonically (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3). Queries on a
+        plane of symmetry are moved towards `sides` (n, 3) by a billionth of the shortest axis, to
+        avoid the poles.
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
         towards = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
         moved = np.where(np.abs(queries) < nudge, nudge * towards, queries)
-        # A side without a component across the shortest axis decides nothing: take the positive
-        # one.
+        # Without a component across the shortest axis, the positive side is chosen.
         moved = np.where(np.abs(moved) < 1e-3 * nudge, 1e-3 * nudge, moved)
         size, squares = np.abs(moved) * axes, axes**2
         root = (size - squares).max(axis=-1)
@@ -234,18 +231,16 @@ class EllipsoidShape(Convex):
             if not (np.abs(step) > 1e-15 * (np.abs(root) + squares.min())).any():
                 break
         foot = squares * moved / (root[:, None] + squares)
-        # Project onto the surface, to remove what the last step left.
+        # Scale onto the surface, to remove the residual of the iteration.
         return np.asarray(foot / np.linalg.norm(foot / axes, axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)
 class RoundedBoxShape(Convex):
-    """Define a box about the origin whose edges and corners are rounded by a ball.
+    """Box about the origin with rounded edges and corners.
 
-    size_m: full extents along x, y, z, rounding included.
-    edge_radius_m: at most half the smallest extent.
-
-    Its normal is continuous; its curvature steps between faces, edges (1/r once) and corners.
+    size_m: full extents along x, y, z, including the rounding. edge_radius_m: at most half the
+    smallest extent. The normal is continuous; the curvature is not.
     """
 
     size_m: tuple[float, float, float]
@@ -257,12 +252,12 @@ class RoundedBoxShape(Convex):
         check_positive(edge_radius_m=self.edge_radius_m)
         if 2.0 * self.edge_radius_m > min(self.size_m):
             raise ValueError(
-                f"edge_radius_m is {self.edge_radius_m}, more than half the least size "
-                f"{min(self.size_m)}"
+                f"edge_radius_m: {self.edge_radius_m} is more than half the minimum of size_m, "
+                f"{min(self.size_m)}; reduce it"
             )
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided inside where two faces are equally near."""
+        """Implement `Shape.closest`; undecided inside where two faces are equally near."""
         queries = check_points(points)
         before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
@@ -299,37 +294,36 @@ class RoundedBoxShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """See `Shape`."""
+        """Implement `Shape.signed_distance`."""
         away = np.abs(check_points(points)) - self._core()
         outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,) of the box that contains the ball's centre."""
+        """Return the half extents (3,) of the box inside the rounding."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return axis, sign and depth below the core's face of the nearest face, and whether it is
-        tied.
+        """Return axis, sign and depth (n,) of the nearest core face, and whether it is ambiguous.
 
-        With previous points, only their faces, or those at their rounded edge, are considered.
-        Without, ties are resolved in the order z, y, x, -z, -y, -x: the front first.
+        With previous points, only faces at these points are considered. Otherwise the first of
+        equally near faces in the order z, y, x, -z, -y, -x is returned.
         """
         core = self._core()
-        # Columns z, y, x, -z, -y, -x, so that the first of equals is the front.
+        # Columns z, y, x, -z, -y, -x.
         margins = np.concatenate([core - queries, core + queries], axis=1)[:, [2, 1, 0, 5, 4, 3]]
         allowed = np.ones(margins.shape, dtype=bool)
         if before is not None:
             out = (before - np.clip(before, -core, core)) / self.edge_radius_m
             allowed = np.concatenate([out, -out], axis=1)[:, [2, 1, 0, 5, 4, 3]] > 0.5
-            # A previous point that is not on the surface decides nothing.
+            # A previous point off the surface is ignored.
             allowed |= ~allowed.any(axis=1, keepdims=True)
         first = margins.min(axis=1)
         tied = (margins < first[:, None] + EQUAL_DISTANCE_M).sum(axis=1) > 1
         chosen = np.where(allowed, margins, np.inf)
-        # Rounding errors must not decide between equals.
+        # The tolerance prevents that rounding errors choose between equally near faces.
         face = (chosen <= chosen.min(axis=1, keepdims=True) + 1e-12).argmax(axis=1)
         depth = margins[np.arange(len(face)), face]
         return 2 - face % 3, np.where(face < 3, 1.0, -1.0), depth, tied
@@ -342,11 +336,10 @@ def _outer(normal: Floats) -> Floats:
 def _directions(
     offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
 ) -> tuple[Floats, Floats, Bools]:
-    """Return unit directions of offsets from an axis or a centre, their lengths, and where
-    undecided.
+    """Return unit directions and lengths of offsets from an axis or a centre, and which are zero.
 
-    across: the coordinates that offsets have.  Undecided ones follow the previous points, or
-        `FRONT`.
+    across: coordinates that offsets may have. Zero offsets get the direction of the previous
+    points, or `FRONT`.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)
@@ -356,8 +349,8 @@ def _directions(
         mask = np.zeros(3)
         mask[list(across)] = 1.0
         sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * mask
-        blind = np.linalg.norm(sides, axis=-1) < EQUAL_DISTANCE_M
-        sides = np.where(blind[..., None], FRONT, sides)
+        is_zero = np.linalg.norm(sides, axis=-1) < EQUAL_DISTANCE_M
+        sides = np.where(is_zero[..., None], FRONT, sides)
         direction = np.where(undecided[..., None], sides, offsets)
     unit = direction / np.linalg.norm(direction, axis=-1)[..., None]
     return unit, np.asarray(length), np.asarray(undecided)

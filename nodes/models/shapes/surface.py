@@ -1,10 +1,10 @@
-"""Define what every shape offers: the nearest surface point, with its normal and curvature.
+"""Define the interface of shapes: nearest surface points with normals and curvature.
 
-Points are (3,) or (n, 3) arrays in the object's frame, lengths in metres; results have the same
-leading shape.  Normals point out of the object.  Curvature is given as the shape operator W, a
-symmetric 3x3 matrix with W n = 0.  Along the surface the normal changes by dn = W dp, so that its
-two other eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
-Differential Geometry of Curves and Surfaces, ch. 3).
+Points are (3,) or (n, 3) arrays in the object's frame, m; results have the same leading shape.
+Normals point out of the object. Curvature is given as the shape operator W, a symmetric 3x3 matrix
+with W n = 0. Along the surface the normal changes by dn = W dp. The two other eigenvalues are the
+principal curvatures, positive where the object is convex (do Carmo, Differential Geometry of Curves
+and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 EQUAL_DISTANCE_M = 1e-6
-"""Distances to the surface that differ by less than this count as equal."""
+"""Maximum difference of distances that are considered equal."""
 
 MAX_QUERY_M = 1e6
-"""A query farther from the origin than this is an error."""
+"""Maximum distance of a query from the origin."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
-"""Side that is chosen where all surface points are equally near and there is no previous point.  It
-faces the user if the object is not rotated."""
+"""Direction that is chosen if all surface points are equally near and there is no previous point.
+It faces the user if the object is not rotated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
-    """Hold the touchable surface points nearest to some queries; shapes as the queries'.
+    """Touchable surface points nearest to queries, with the queries' leading shape.
 
-    height_m: height of the query above the tangent plane at `point`, negative below it.  It is the
-        signed distance, except past an end.
+    height_m: height of the query above the tangent plane at `point`, negative below it. It is the
+        signed distance, except past an end of the surface.
     shape_operator: (..., 3, 3) at `point`, 1/m.
-    on_edge: the query lies past an end of the touchable surface and `point` is on its rim, or
-        `point` is on an edge of a mesh.  A sheet can be tangent there, but cannot roll on.
-    undecided: another point is equally near; `previous` or `FRONT` decided between them.
+    on_edge: whether `point` is on the rim of the touchable surface with the query past its end, or
+        on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
+    undecided: whether another point is equally near; `previous` or `FRONT` selected this one.
     """
 
     point: Floats
@@ -52,52 +52,50 @@ class Nearest:
 
 
 class Shape(Protocol):
-    """Define a solid with a touchable surface."""
+    """Interface of a solid with a touchable surface."""
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Return the nearest touchable points.
 
-        previous: the surface points of the previous queries, shaped as `points`.  Where several
-            points are equally near, and inside the object also where a nearer one appears
-            elsewhere, the nearest point of the same neighbourhood is returned as long as it exists.
-            Leave it out for a new contact.
+        previous: surface points of the previous queries, shaped as `points`; None for a new
+            contact. The local nearest point that continues them is returned as long as it exists,
+            even if another point is equally near, or, inside the object, nearer.
 
-        Raises ValueError for NaN, infinity, another shape than (3,) or (n, 3), or points beyond
+        Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
         `MAX_QUERY_M`.
         """
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the distance (m) to the whole solid's surface, negative inside; errors as
-        `closest`."""
+        """Return the signed distance (m) to the solid, negative inside; errors as `closest`."""
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return how far the object rises above its tangent plane at a surface point (3,).
+        """Return the maximum height of the object above its tangent plane at a point (3,), m.
 
-        Only the surface within `radius_m` of the point along that plane counts; 0 where it is not
-        concave. The result is continuous in the point and the normal: what rises near the rim of
-        that circle has a smaller weight.
+        Only the surface within `radius_m` of the point along that plane is considered; 0 where it
+        is not concave. Heights near the rim of that circle have a smaller weight, so that the
+        result is continuous.
         """
         ...
 
 
 class Convex:
-    """Base of a solid that never rises above its tangent planes."""
+    """Base class of convex solids."""
 
     __slots__ = ()
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """See `Shape`."""
+        """Return 0: a convex solid is below its tangent planes."""
         return 0.0
 
 
 def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
-    """Return the principal curvatures (..., 2), ascending (1/m), and their directions (..., 2, 3).
+    """Return the principal curvatures (..., 2), ascending, 1/m, and their directions (..., 2, 3).
 
-    The directions are unit tangents; at an umbilic (sphere, plane) any two perpendicular ones.
+    The directions are unit tangents; at an umbilic point they are any perpendicular pair.
     """
-    # The normal's own eigenvalue, zero, is shifted away from the two relevant ones.
+    # Shift the normal's eigenvalue, which is zero, away from the principal curvatures.
     bound = 1.0 + np.linalg.norm(shape_operator, axis=(-2, -1))
     outer = normal[..., :, None] * normal[..., None, :]
     values, vectors = np.linalg.eigh(shape_operator + 2.0 * bound[..., None, None] * outer)
@@ -105,9 +103,9 @@ def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats
 
 
 def tightest_curvature(shape_operator: Floats) -> float:
-    """Return the larger principal curvature (1/m) of one shape operator (3, 3).
+    """Return the larger principal curvature (1/m) of a shape operator (3, 3).
 
-    It follows from k1 + k2, the trace, and k1^2 + k2^2, the sum of squares.
+    It is computed from k1 + k2 (trace) and k1^2 + k2^2 (squared Frobenius norm).
     """
     total = float(np.einsum("ii", shape_operator))
     squares = float(np.einsum("ij,ij", shape_operator, shape_operator))
@@ -115,11 +113,10 @@ def tightest_curvature(shape_operator: Floats) -> float:
 
 
 def projection_jacobian(found: Nearest) -> Floats:
-    """Return d point / d query, (..., 3, 3): how the nearest point moves with the query.
+    """Return the derivative (..., 3, 3) of the nearest point by the query: (I + h W)^-1 P.
 
-    On a parallel surface at height h, W becomes W (I + h W)^-1.  The projected point therefore
-    moves by P (I + h W)^-1, and the normal by W times that.  At a centre of curvature inside, I + h
-    W is singular and LinAlgError is raised.
+    h is the height of the query and P projects onto the tangent plane. Raises LinAlgError at a
+    centre of curvature, where I + h W is singular.
     """
     normal, operator = found.normal, found.shape_operator
     tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
@@ -128,23 +125,23 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Return `points` as floats (3,) or (n, 3); raise ValueError if they are not valid."""
+    """Return points as floats (3,) or (n, 3); raise ValueError for invalid ones."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
-        raise ValueError(f"{name} of shape {array.shape}, wanted (3,) or (n, 3)")
+        raise ValueError(f"{name}: expected shape (3,) or (n, 3), found {array.shape}")
     # A comparison with NaN is false, hence the double negation.
     if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
-        raise ValueError(f"{name} hold NaN, infinity or positions beyond {MAX_QUERY_M:g} m")
+        raise ValueError(f"{name}: contains NaN, infinity or positions beyond {MAX_QUERY_M:g} m")
     return array
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Return `previous` as floats, shaped as `points`; ValueError otherwise."""
+    """Return previous points as floats; raise ValueError if their shape is not that of `points`."""
     if previous is None:
         return None
     array = check_points(previous, "previous")
     if array.shape != points.shape:
-        raise ValueError(f"previous of shape {array.shape}, points of shape {points.shape}")
+        raise ValueError(f"previous: expected shape {points.shape}, found {array.shape}")
     return array
 
 
@@ -152,21 +149,20 @@ def check_positive(**lengths_m: float) -> None:
     """Raise ValueError unless every length is a positive number."""
     for name, length in lengths_m.items():
         if not (np.isfinite(length) and length > 0.0):
-            raise ValueError(f"{name} is {length}, wanted a positive length in metres")
+            raise ValueError(f"{name}: {length} must be a positive length in metres")
 
 
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
 """Function of points (n, 3) that returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and
-support (n,).  It is zero on the surface and grows outwards."""
+support (n,). It is zero on the surface and increases outwards."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceProjections:
-    """Hold points, normals (n, 3) and shape operators (n, 3, 3) where descents to the surface
-    ended.
+    """Results of projections to the surface: points, normals (n, 3) and shape operators (n, 3, 3).
 
-    steepness, support: (n,) length of the level set's gradient, and its support.
-    is_nearest: (n,) the descent converged to a point that is nearest within its neighbourhood.
+    steepness, support (n,): length of the level set's gradient, and its support. is_nearest (n,):
+    whether the projection converged to a local minimum of the distance.
     """
 
     point: Floats
@@ -179,21 +175,19 @@ class SurfaceProjections:
 
 MAX_STEPS = 25
 MIN_EIGENVALUE = 0.02
-"""Lower bound on the eigenvalues' size in the reduced Hessian (1 on a flat surface).  Close to a
-centre of curvature the full Newton step would be too long; past it, descent has the opposite
-sign."""
+"""Lower bound on the absolute eigenvalues of the reduced Hessian, which are 1 on a flat surface.
+Near a centre of curvature the full Newton step would be too long; beyond it, the sign changes."""
 
 
 def descend(
     level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Move from `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
+    """Project `queries` (n, 3) to their nearest surface points, starting at `starts` (n, 3).
 
     Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization, ch.
-    18).  Each step returns to the surface along the gradient, and moves along the surface by the
-    reduced system with the Lagrangian's Hessian I + lambda H.  Its eigenvalues are kept positive,
-    so that each step descends.  No step is longer than `stride_m`, and one under `rest_m` is the
-    last: its error is of second order, and so is that of the normal.
+    18). Each step moves to the surface along the gradient, and along the surface by the reduced
+    system with the Lagrangian's Hessian I + lambda H. Its eigenvalues are made positive, so that
+    each step is a descent. stride_m: maximum step. rest_m: step below which it has converged.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -225,7 +219,7 @@ def descend(
         point[moving] = x + step
         normal[moving] = rotated / np.sqrt((rotated * rotated).sum(-1))[:, None]
         operator[moving] = weingarten
-        # Bounded eigenvalues shrink the steps slowly, so that the last step must be far shorter.
+        # Bounded eigenvalues converge slowly, so the last step must be much shorter.
         slow = values[:, 0] < MIN_EIGENVALUE
         resting = size <= np.where(slow, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
@@ -240,17 +234,16 @@ _IDENTITY = np.eye(3)
 
 Triple = tuple[float, float, float]
 LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
-"""Function as `LevelSet`, for a single point, in plain numbers."""
+"""`LevelSet` for a single point, with Python numbers."""
 
 
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Descend as `descend` for one query (3,), at a fraction of its time; the results have length
-    one.
+    """Project one query (3,) as `descend`, faster; the results have length one.
 
-    It is written out in the two directions of the tangent plane, since arrays of three numbers cost
-    more than their sums.
+    The method is written out in the two tangent directions with Python numbers, because operations
+    on small arrays are slow.
     """
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()
@@ -265,7 +258,7 @@ def descend_one(
         ox, oy, oz = qx - x, qy - y, qz - z
         multiplier = (ox * gx + oy * gy + oz * gz) / square
         fall = -value / length
-        # The Hessian's parts along the tangents, and those between them and the normal.
+        # The Hessian's components in the tangent plane, and those between tangents and normal.
         h11, h12, h22 = _dot(e, he), _dot(f, he), _dot(f, hf)
         h1n, h2n = _dot((ux, uy, uz), he), _dot((ux, uy, uz), hf)
         slope = (
@@ -286,7 +279,7 @@ def descend_one(
             break
     basis = np.array([e, f])
     inner = np.array([[h11, h12], [h12, h22]]) / length
-    # Rotated with the last step's part within the first tangent plane, like the operator.
+    # The normal is rotated by the tangential part of the last step.
     rotated = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
     return SurfaceProjections(
         np.array([[x, y, z]]),
@@ -299,8 +292,10 @@ def descend_one(
 
 
 def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
-    """Return two unit vectors that form a basis with a third (Duff et al., Building an Orthonormal
-    Basis, Revisited, 2017)."""
+    """Return two unit vectors that complete a unit vector to an orthonormal basis.
+
+    Source: Duff et al., Building an Orthonormal Basis, Revisited, 2017.
+    """
     side = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (side + z)
     b = x * y * a
@@ -310,11 +305,13 @@ def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
 def _downhill(
     b11: float, b12: float, b22: float, slope: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Return the Newton step of a symmetric 2x2 system with eigenvalues kept away from zero, and
-    the smaller eigenvalue."""
+    """Solve a symmetric 2x2 system with bounded eigenvalues.
+
+    Returns the Newton step and the smaller eigenvalue.
+    """
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
-    turn = 0.5 * atan2(2.0 * b12, b11 - b22)
-    c, s = cos(turn), sin(turn)
+    angle = 0.5 * atan2(2.0 * b12, b11 - b22)
+    c, s = cos(angle), sin(angle)
     along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), MIN_EIGENVALUE)
     along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), MIN_EIGENVALUE)
     return c * along_high - s * along_low, s * along_high + c * along_low, middle - spread

@@ -1,6 +1,6 @@
-"""Check triangle meshes, and compute normals and the nearest points of facets.
+"""Check and refine triangle meshes, and compute their normals and nearest points.
 
-Vertices are (v, 3) m, triangles (t, 3) indices of vertices, counter-clockwise from outside.
+Vertices are (v, 3), m. Triangles are (t, 3) vertex numbers, counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Indices = NDArray[np.int64]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
-"""A triangle whose height over its longest edge is smaller has no direction."""
+"""Minimum ratio of a triangle's height to its longest edge; below it, it is degenerate."""
 MAX_DIHEDRAL_RAD = np.radians(175.0)
-"""Neighbours with a larger angle between their normals are folded onto one another."""
+"""Maximum angle between the normals of neighbouring triangles; above it, they are folded."""
 
 
 class MeshError(FlexsheetError, ValueError):
-    """Raised for a mesh that bounds no solid; the message says why and what to do."""
+    """Raised for a mesh that does not bound a solid."""
 
     code = "mesh"
     remedy = "Repair the mesh: closed, outward, no inverted elements; see docs/meshing.md."
@@ -32,24 +32,27 @@ class MeshError(FlexsheetError, ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
 
-    Rejected are meshes that are not finite, empty, larger than `MAX_TRIANGLES`, or inside out. So
-    are indices out of range, degenerate or repeated triangles, holes, edges of more than two
-    triangles, inconsistent winding, parts that share one vertex only, and triangles folded onto
-    their neighbours.  Intersections of other triangles are more expensive to find: see
-    `count_intersections`.
+    Checked are shapes, size, vertex numbers, degenerate and repeated triangles, holes, edges of
+    more than two triangles, winding, parts that share a single vertex, folded neighbours and
+    orientation. Intersections of other triangles are slow to find, see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
-        raise MeshError(f"arrays of shapes {vertices.shape} and {triangles.shape} are no mesh")
+        raise MeshError(
+            f"expected vertices (v, 3) and triangles (t, 3), found {vertices.shape} and "
+            f"{triangles.shape}"
+        )
     if len(triangles) < 4:
-        raise MeshError(f"a mesh of {len(triangles)} triangles bounds no solid")
+        raise MeshError(f"a mesh of {len(triangles)} triangles cannot bound a solid; complete it")
     if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"{len(triangles)} triangles, at most {MAX_TRIANGLES} are taken; decimate the mesh"
+            f"{len(triangles)} triangles exceed the maximum of {MAX_TRIANGLES}; decimate the mesh"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise MeshError(f"a triangle names a vertex that is not among the {len(vertices)}")
+        raise MeshError(
+            f"a triangle has a vertex number outside 0..{len(vertices) - 1}; export it again"
+        )
     if not np.isfinite(vertices).all():
-        raise MeshError("a vertex is NaN or infinite")
+        raise MeshError("a vertex is NaN or infinite; export the mesh again")
     flat = int(find_degenerate(vertices, triangles).sum())
     if flat:
         raise MeshError(f"{flat} triangles are degenerate (no area); remove them")
@@ -57,13 +60,13 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
     _check_fans(triangles)
     folded = int((dihedrals_rad(vertices, triangles)[1] > MAX_DIHEDRAL_RAD).sum())
     if folded:
-        raise MeshError(f"{folded} pairs of neighbouring triangles lie on one another; untangle it")
+        raise MeshError(f"{folded} pairs of neighbouring triangles are folded; repair them")
     if volume_m3(vertices, triangles) <= 0.0:
         raise MeshError("the mesh is inside out; reverse its triangles")
 
 
 def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
-    """Return which triangles (t,) have no direction: repeated vertices, or all three collinear."""
+    """Return which triangles (t,) have repeated or collinear vertices."""
     corners = vertices[triangles]
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(-1).max(-1)
@@ -72,8 +75,7 @@ def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
 
 
 def half_edges(triangles: Indices) -> Indices:
-    """Return (3 t, 2) the edges in each triangle's direction: its first, second and third in
-    turn."""
+    """Return the directed edges (3 t, 2): first all triangles' first edges, then second, third."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
@@ -83,7 +85,9 @@ def _check_edges(triangles: Indices) -> None:
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
     if open_edges:
-        raise MeshError(f"the surface is not closed: {open_edges} edges have one triangle; fill it")
+        raise MeshError(
+            f"the surface is not closed: {open_edges} edges have one triangle; fill the holes"
+        )
     if crowded:
         raise MeshError(f"{crowded} edges have more than two triangles; separate the parts there")
     twice = len(run) - len(np.unique(run, axis=0))
@@ -92,11 +96,11 @@ def _check_edges(triangles: Indices) -> None:
 
 
 def _check_fans(triangles: Indices) -> None:
-    """Raise MeshError unless the triangles about each vertex form one fan."""
+    """Raise MeshError unless the triangles around each vertex form a single fan."""
     count = len(triangles)
     first, second = _neighbours(triangles)
-    # Corner c of triangle t has number c * count + t; across an edge the corners of both triangles
-    # at each of its two ends belong together.
+    # Corner c of triangle t has number c * count + t. At each end of an edge, the corners of its
+    # two triangles are connected.
     ends = [(first, (second + count) % (3 * count)), ((first + count) % (3 * count), second)]
     rows, columns = (np.concatenate(side) for side in zip(*ends, strict=True))
     from scipy.sparse import coo_array  # imported here, since processes must start quickly
@@ -112,8 +116,8 @@ def _check_fans(triangles: Indices) -> None:
 def unify_winding(triangles: Indices) -> Indices:
     """Reverse some triangles (t, 3) so that neighbours across edges have the same winding.
 
-    In each connected part the fewer triangles are reversed.  Where that is impossible, as on a
-    Möbius strip, `check_mesh` finds the seam.
+    In each connected part the minority is reversed. On a surface without consistent winding, such
+    as a Möbius strip, `check_mesh` fails afterwards.
     """
     count = len(triangles)
     run = half_edges(triangles)
@@ -126,11 +130,11 @@ def unify_winding(triangles: Indices) -> Indices:
     one, other = order[shared], order[shared + 1]
     against = (run[one] == run[other]).all(axis=1)
     beside: list[list[tuple[int, bool]]] = [[] for _ in range(count)]
-    for a, b, turn in zip(
+    for a, b, reverse in zip(
         (one % count).tolist(), (other % count).tolist(), against.tolist(), strict=True
     ):
-        beside[a].append((b, turn))
-        beside[b].append((a, turn))
+        beside[a].append((b, reverse))
+        beside[b].append((a, reverse))
     flipped = np.zeros(count, dtype=bool)
     seen = np.zeros(count, dtype=bool)
     for start in range(count):
@@ -138,9 +142,9 @@ def unify_winding(triangles: Indices) -> Indices:
             continue
         seen[start], part = True, [start]
         for triangle in part:
-            for near, turn in beside[triangle]:
+            for near, reverse in beside[triangle]:
                 if not seen[near]:
-                    seen[near], flipped[near] = True, flipped[triangle] ^ turn
+                    seen[near], flipped[near] = True, flipped[triangle] ^ reverse
                     part.append(near)
         if flipped[part].sum() > 0.5 * len(part):
             flipped[part] = ~flipped[part]
@@ -159,15 +163,17 @@ def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
 
 
 def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return unit normals (t, 3)."""
+    """Return the triangles' unit normals (t, 3)."""
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return unit normals (v, 3): means of the triangles' normals, weighted by their angle at the
-    vertex (Thürmer and Wüthrich 1998)."""
+    """Return the vertices' unit normals (v, 3): angle-weighted means of the triangles' normals.
+
+    Source: Thürmer and Wüthrich, 1998.
+    """
     corners, normal = vertices[triangles], triangle_normals(vertices, triangles)
     total = np.zeros_like(vertices)
     for i in range(3):
@@ -180,8 +186,7 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Return the edges (e, 2) of a closed mesh, and the angles (e,) between the normals on their
-    sides."""
+    """Return the edges (e, 2) of a closed mesh and the angles (e,) between their normals, rad."""
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
     one, other = normal[first % count], normal[second % count]
@@ -190,23 +195,23 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Return the enclosed volume, negative when the triangles are clockwise."""
+    """Return the enclosed volume, m^3, negative for clockwise triangles."""
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
 def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
-    """Divide the facets into smaller triangles with no edge longer than `longest_m`.
+    """Divide the triangles until no edge is longer than `longest_m`.
 
-    Each long edge is halved in all its triangles until none is left, so that a closed mesh stays
-    closed.  Raises MeshError where that would take more than `MAX_TRIANGLES`.
+    A long edge is halved in both of its triangles, so that a closed mesh remains closed. Raises
+    MeshError for more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
         edges, which = np.unique(run, axis=0, return_inverse=True)
         which = which.reshape(3, -1).T
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-        # An edge is halved where it is its triangle's longest, so that triangles keep their shape.
+        # Only a triangle's longest edge is halved, which preserves the triangles' shape.
         longest = which[np.arange(len(which)), length[which].argmax(axis=1)]
         halved = np.zeros(len(edges), dtype=bool)
         halved[longest[length[longest] > longest_m]] = True
@@ -218,13 +223,13 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
         triangles = np.concatenate(list(_split(triangles, middle[which])))
         if len(triangles) > MAX_TRIANGLES:
             raise MeshError(
-                f"edges up to {length.max():.3g} m cannot be cut down to {longest_m:.3g} m within "
-                f"{MAX_TRIANGLES} triangles; smooth over a longer distance"
+                f"dividing edges of up to {length.max():.3g} m into edges of {longest_m:.3g} m "
+                f"needs more than {MAX_TRIANGLES} triangles; increase the edge length"
             )
 
 
 def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
-    """Split the triangles at the middles (t, 3) of their edges; -1 keeps an edge whole."""
+    """Split the triangles at the midpoints (t, 3) of their edges; -1: the edge is not split."""
     cuts = (middle >= 0).sum(axis=1)
     yield triangles[cuts == 0]
     for i in range(3):
@@ -246,10 +251,10 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 
 
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
-    """Count the pairs of triangles that cut through one another.
+    """Count the pairs of triangles that intersect.
 
-    A pair counts if an edge of one passes through the inside of the other and they share no vertex.
-    Triangles that only touch, or overlap in one plane, are not found.
+    An edge of one must pass through the interior of the other, and they must not share a vertex.
+    Triangles that only touch, or overlap in one plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -272,10 +277,9 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 
 
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
-    """Yield pairs of overlapping balls (rows, columns) in portions.
+    """Yield the pairs of overlapping balls (rows, columns) in batches.
 
-    Balls of similar size are searched together, so that one large triangle does not make all of
-    them neighbours.
+    Balls of similar size are searched together, because the search radius is that of the largest.
     """
     from scipy.spatial import cKDTree
 
@@ -296,8 +300,10 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return which segments (n, 3) pass through the inside of their triangles (n, 3, 3) (Möller and
-    Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997)."""
+    """Return which segments (n, 3) pass through the interior of their triangles (n, 3, 3).
+
+    Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
+    """
     along = end - start
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(along, second)
@@ -315,8 +321,10 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return barycentric coordinates (n, 3) of the points of triangles (n, 3, 3) nearest to points
-    (n, 3) (Ericson, Real-Time Collision Detection, sec. 5.1.5)."""
+    """Return barycentric coordinates (n, 3) of the points nearest to points (n, 3) in triangles.
+
+    corners (n, 3, 3). Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
+    """
     a = corners[:, 0]
     first, second = corners[:, 1] - a, corners[:, 2] - a
     offset = points - a
@@ -345,12 +353,12 @@ def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
 
 
 class Facets:
-    """Find nearest points on the facets of a mesh."""
+    """Search for the nearest points on the facets of a mesh."""
 
     def __init__(self, vertices: Floats, triangles: Indices) -> None:
         """Build the search tree; raise MeshError for a mesh without triangles."""
         if not len(triangles):
-            raise MeshError("a mesh without triangles has no surface")
+            raise MeshError("the mesh has no triangles")
         self.corners = vertices[triangles]
         self._centre = self.corners.mean(axis=1)
         self._reach = float(np.linalg.norm(self.corners - self._centre[:, None], axis=2).max())
@@ -359,8 +367,7 @@ class Facets:
         self._tree = cKDTree(self._centre)
 
     def nearest(self, points: Floats) -> tuple[Indices, Floats]:
-        """Return the triangles (n,) nearest to points (n, 3), and the nearest points' barycentric
-        coordinates (n, 3)."""
+        """Return the triangles (n,) nearest to points (n, 3) and barycentric coordinates (n, 3)."""
         reach = self._tree.query(points)[0] + self._reach
         lists = self._tree.query_ball_point(points, reach * (1.0 + 1e-12))
         chosen, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))
