@@ -53,12 +53,17 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """Hold the sheet: width_m between the clamps when slack, height_m along them."""
+    """Hold the sheet: width_m between the clamps when slack, height_m along them.
+
+    thickness_gradient: relative change of thickness over the width and over the height; the mean
+    thickness is thickness_m.
+    """
 
     width_m: float
     height_m: float
     thickness_m: float
     young_modulus_pa: float
+    thickness_gradient: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +133,11 @@ class _Mesh:
         )
         dx, dy = np.tile(np.diff(x), rows - 1), np.repeat(np.diff(y), columns - 1)
         self.weight = (dx * dy * rubber.thickness_m / 4.0)[:, None]
+        if any(rubber.thickness_gradient):
+            middle_x = np.tile(0.5 * (x[1:] + x[:-1]), rows - 1) / rubber.width_m - 0.5
+            middle_y = np.repeat(0.5 * (y[1:] + y[:-1]), columns - 1) / rubber.height_m - 0.5
+            along_x, along_y = rubber.thickness_gradient
+            self.weight *= (1.0 + along_x * middle_x + along_y * middle_y)[:, None]
         point = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
         s, t = (values.ravel() for values in np.meshgrid(point, point))
         along_s = np.column_stack([-(1 - t), 1 - t, t, -t])
