@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "bag": ("bag",),
     "arms": ("arms",),
     "experiment": ("experiment",),
+    "apparatus": ("apparatus",),
     "demo": ("demo",),
     "try": ("trying",),
     "chart": ("chart",),

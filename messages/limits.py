@@ -73,6 +73,7 @@ MAX_BY_UNIT = {
     "_per_s3": 1e6,
     "_per_s2": 1e4,
     "_per_s": 1e3,
+    "_ns_per_m": 1e6,
     "_n_per_m": 1e9,
     "_m": MAX_LENGTH_M,
     "_rad": MAX_ANGLE_RAD,

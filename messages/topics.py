@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 
-from flexsheet.messages import scene, types
+from flexsheet.messages import apparatus, scene, types
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.migrations import RENAMED_TOPICS
@@ -101,6 +101,8 @@ _ROWS = (
           "true poses of the arms, from the left arm's computer"),
     Topic("twin/arms_right", types.TwinArms, _EVERY, (50, 1000), True,
           "true poses of the arms, from the right arm's computer"),
+    Topic("twin/apparatus", apparatus.Apparatus, _LATCHED, None, True,
+          "what is true in the simulator; only the simulator and experiments read it"),
     Topic("twin/eye", types.TwinEye, _EVERY, None, True, "image as the user's eye would see it",
           max_bytes=64 << 20),
 )  # fmt: skip

@@ -9,6 +9,7 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.experiment import (
     DEMO_FILE,
+    ApparatusOption,
     LaunchOption,
     OutputOption,
     SettingsOption,
@@ -29,6 +30,7 @@ def demo(
     *,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     finger_path: Annotated[
         str | None,
         typer.Option(
@@ -48,7 +50,9 @@ def demo(
     path = None if finger_path is None else path_of(launch_file, finger_path)
     folder = result_folder(output, "demo")
     with progress_words() as progress:
-        result = run_demo(launch_file, settings or (), folder, progress, path=path)
+        result = run_demo(
+            launch_file, settings or (), folder, progress, path=path, apparatus=apparatus
+        )
     if as_json:
         print_json(
             {

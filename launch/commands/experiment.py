@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
 from flexsheet.launch.commands.output import (
     examples,
     print_json,
@@ -76,10 +76,12 @@ def _record(
     bag: Path,
     procedure: Procedure,
     progress: Progress,
+    *,
+    apparatus: str | None,
 ) -> None:
     from flexsheet.launch.experiments.run import run_experiment
 
-    run_experiment(launch_file, settings or (), bag, procedure, progress)
+    run_experiment(launch_file, settings or (), bag, procedure, progress, apparatus=apparatus)
     progress("reading the bag")
 
 
@@ -96,6 +98,7 @@ def stroke(
     ] = 10.0,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -106,7 +109,7 @@ def stroke(
     bag = result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = stroke_procedure([seconds], progress)
-        _record(launch_file, settings, bag, procedure, progress)
+        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
         result = experiment.stroke_result(recording, errors, seconds, bag)
@@ -123,6 +126,7 @@ def tilt(
     map_file: MapOption = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -130,7 +134,9 @@ def tilt(
     from flexsheet.launch.experiments.image import TILT
 
     bag = result_folder(output, "tilt") / "tilt.mcap"
-    _photograph(TILT, bag, launch_file, settings, map_file=map_file, as_json=as_json)
+    _photograph(
+        TILT, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
+    )
 
 
 @app.command(
@@ -157,6 +163,7 @@ def push(
     map_file: MapOption = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -173,7 +180,9 @@ def push(
         *(settings or ()),
     ]
     bag, series = result_folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
-    _photograph(series, bag, launch_file, settings, map_file=map_file, as_json=as_json)
+    _photograph(
+        series, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
+    )
 
 
 @app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
@@ -181,6 +190,7 @@ def compliance(
     *,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -192,7 +202,7 @@ def compliance(
     bag, picture = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
         procedure = experiment.compliance_procedure(progress)
-        _record(launch_file, settings, bag, procedure, progress)
+        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, picture)
     if as_json:
@@ -221,6 +231,7 @@ def _photograph(
     settings: list[str] | None,
     *,
     map_file: Path | None,
+    apparatus: str | None,
     as_json: bool,
 ) -> None:
     from flexsheet.launch.experiments import image
@@ -232,7 +243,7 @@ def _photograph(
         procedure = picture_procedure(
             series, series.values, image.CORRECTIONS, progress, with_maps=mapped
         )
-        _record(launch_file, settings, bag, procedure, progress)
+        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         pictures = image.read_pictures(bag)
         rows = image.make_rows(pictures, series, with_maps=mapped)
         if map_file is not None:
@@ -266,6 +277,7 @@ def gestures(
     ] = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -276,7 +288,7 @@ def gestures(
     bag = result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.gestures_procedure(wanted, progress)
-        _record(launch_file, settings, bag, procedure, progress)
+        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         result = experiment.gestures_result(bag, wanted)
     if as_json:
         print_json(result)

@@ -26,6 +26,15 @@ RunOption = Annotated[
         autocompletion=complete.runs,
     ),
 ]
+ApparatusOption = Annotated[
+    str | None,
+    typer.Option(
+        "--apparatus",
+        metavar="FILE|seed:N",
+        help="What is true in the simulator: a file, or a draw such as seed:7,paper,calibrated; "
+        "default: the scene.",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -63,6 +63,7 @@ def launch(
             "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
         ),
     ] = None,
+    apparatus: ApparatusOption = None,
     record: Annotated[
         Path | None, typer.Option(metavar="BAG", help="Record the logged topics to this bag.")
     ] = None,
@@ -85,7 +86,9 @@ def launch(
     """
     from flexsheet.launch.plans.plan import load_graph
 
-    plan = load_graph(file, settings=settings or (), record=record, console=console)
+    plan = load_graph(
+        file, settings=settings or (), record=record, console=console, apparatus=apparatus
+    )
     if dry_run:
         if as_json:
             print_json(plan.model_dump(mode="json"))
@@ -214,12 +217,14 @@ def _format_settings(node: ResolvedNode) -> str:
     return " ".join(
         f"{name}={value}"
         for name, value in node.parameters.items()
-        if name not in defaults or value != defaults[name]
+        if name != "apparatus" and (name not in defaults or value != defaults[name])
     )
 
 
 def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
+    if plan.apparatus is not None:
+        words.print(f"apparatus {plan.apparatus['origin']}: differs from the scene")
     print_table(
         (
             "node",

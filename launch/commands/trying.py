@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
 from flexsheet.launch.commands.launching import describe_run, run_graph
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
 from flexsheet.nodes.signals import keyboard_interrupts
@@ -44,6 +44,7 @@ def try_it(
             "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
         ),
     ] = None,
+    apparatus: ApparatusOption = None,
     duration: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="Stop this long after all nodes are ready."),
@@ -59,7 +60,8 @@ def try_it(
     from flexsheet.launch.running.precompute import precompute_graph
 
     page = [f"console.page_port={port}"]
-    plan = load_graph(launch_file, settings=[*page, *(settings or ())], console=True)
+    given = [*page, *(settings or ())]
+    plan = load_graph(launch_file, settings=given, console=True, apparatus=apparatus)
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
     given = plan.nodes["console"].parameters

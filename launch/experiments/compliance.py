@@ -22,6 +22,7 @@ from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
@@ -32,8 +33,10 @@ from flexsheet.nodes.planner.compliance import (
     WEBER_RATIO,
     WEBER_RATIO_BARE,
 )
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.paths import map_to_surface
+from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -147,20 +150,24 @@ class ComplianceRecording:
     edges: tuple[SampledMotion, SampledMotion]
     curve_times_ns: list[int]
     curves: list[Floats]
+    apparatus: Apparatus | None = None
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
     """Read the data from a bag; ExperimentError if it lacks scene or force curve."""
     scene: Scene | None = None
+    apparatus: Apparatus | None = None
     finger: list[tuple[int, Floats]] = []
     windows: dict[str, tuple[int, int]] = {}
     flanges: tuple[list[tuple[int, Floats]], list[tuple[int, Floats]]] = ([], [])
     curves: list[tuple[int, Floats]] = []
-    topics = ["scene", "twin/finger", "twin/arms", "soft_body"]
+    topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body"]
     for _, message, header, _ in BagReader(bag, topics=topics):
         match message:
             case Scene():
                 scene = message
+            case Apparatus():
+                apparatus = message
             case TwinFinger():
                 finger.append((header.source_ns, message.position_world_m))
                 begin_ns = header.source_ns - round(message.path_time_s * 1e9)
@@ -177,6 +184,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
     curves.sort(key=lambda entry: entry[0])
     return ComplianceRecording(
         scene=scene,
+        apparatus=apparatus,
         finger=make_motion(finger, "twin/finger"),
         windows_ns=windows,
         edges=(make_motion(flanges[0], "twin/arms"), make_motion(flanges[1], "twin/arms")),
@@ -204,16 +212,13 @@ class ForceReference:
     """Compute presented forces at instants of a recording by the simulator's membrane."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
-        scene = recorded.scene
-        self._recorded = recorded
+        scene = apply_apparatus(recorded.scene, recorded.apparatus)
+        self._recorded, self._radius_m = recorded, scene.finger.radius_m
         self._clamps = (
             _transform(scene.arms.left.flange_from_edge),
             _transform(scene.arms.right.flange_from_edge),
         )
-        sheet = scene.sheet
-        self._rubber = Rubber(
-            sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa
-        )
+        self._rubber = true_rubber(scene.sheet, recorded.apparatus)
 
     def evaluate(self, at_ns: int, press: Press) -> PresentedForce:
         """Return the forces at an instant; depths count from the pressed position."""
@@ -229,7 +234,7 @@ class ForceReference:
             left,
             right,
             finger_tip=tip,
-            finger_radius_m=recorded.scene.finger.radius_m,
+            finger_radius_m=self._radius_m,
         )
         middle = 0.5 * (left[:3, 3] + right[:3, 3])
         return PresentedForce(

@@ -53,6 +53,7 @@ def run_demo(
     progress: Progress,
     *,
     path: FingerPath | None = None,
+    apparatus: str | None = None,
 ) -> DemoResult:
     """Stroke in 10 s and in 30 s (or follow `path`), then image a tilted and a pushed sheet."""
     bag = folder / "demo.mcap"
@@ -62,7 +63,8 @@ def run_demo(
         picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
     coarse = settings_of_type(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
-    run_experiment(launch_file, [*coarse, *settings], bag, procedure, progress)
+    given = [*coarse, *settings]
+    run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
     progress("reading the bag and drawing")
     if path is None:
         return summarize(bag, folder, strokes=SECONDS)

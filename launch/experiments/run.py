@@ -82,9 +82,14 @@ def run_experiment(
     bag: Path,
     procedure: Procedure,
     progress: Progress,
+    *,
+    apparatus: str | None = None,
 ) -> None:
-    """Run a procedure on a launch file's graph and record it to `bag`."""
-    plan = load_graph(launch_file, settings=settings, record=bag)
+    """Run a procedure on a launch file's graph and record it to `bag`.
+
+    apparatus: file or seed of what is true in the simulator; see `load_apparatus`.
+    """
+    plan = load_graph(launch_file, settings=settings, record=bag, apparatus=apparatus)
     precompute_graph(plan, progress)
     try:
         asyncio.run(_interruptible(drive(plan, procedure, progress)))

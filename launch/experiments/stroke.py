@@ -12,6 +12,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.lag import lag_s
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import ArmSpec, Cylinder, Scene, require_cylinder
@@ -28,6 +29,7 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
+from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
 
@@ -70,6 +72,18 @@ class DrawnFrames:
         if frame.shaped_for_ns:
             age_s = (frame.light_ns - frame.shaped_for_ns) * 1e-9
             self.dented.append((frame.light_ns, np.array([age_s])))
+
+    def shifted(self, late_ns: int) -> DrawnFrames:
+        """Return the contents at the true time of light, `late_ns` after the stated one.
+
+        The stated age of what was drawn grows by as much.
+        """
+        late_s = np.array([late_ns * 1e-9])
+        return DrawnFrames(
+            [(at_ns + late_ns, row) for at_ns, row in self.fingertip],
+            [(at_ns + late_ns, row) for at_ns, row in self.sheet],
+            [(at_ns + late_ns, row + late_s) for at_ns, row in self.dented],
+        )
 
 
 def stroke_label(seconds: float) -> str:
@@ -230,6 +244,7 @@ def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str,
 def read_recording(bag: Path) -> StrokeRecording:
     """Read the data for the stroke's figures from a bag."""
     scene: Scene | None = None
+    apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
     measured: list[tuple[int, Floats]] = []
     finger: list[tuple[int, Floats]] = []
@@ -250,6 +265,8 @@ def read_recording(bag: Path) -> StrokeRecording:
         match message:
             case Scene():
                 scene = message
+            case Apparatus():
+                apparatus = message
             case Fingertip() if message.valid:
                 fingertip.append((header.source_ns, message.position_world_m))
                 measured.append((header.source_ns, message.measured_world_m))
@@ -280,6 +297,9 @@ def read_recording(bag: Path) -> StrokeRecording:
         rows = [(time, edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
         return make_motion(rows, f"arm {key}")
 
+    true_arms = apply_apparatus(scene, apparatus).arms
+    if apparatus is not None:
+        pictures = pictures.shifted(round(1e9 * apparatus.projector.latency_offset_s))
     return StrokeRecording(
         scene=scene,
         fingertip=make_motion(fingertip, "fingertip"),
@@ -287,7 +307,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         finger=make_motion(finger, "twin/finger"),
         windows_ns=_windows_ns(times_by_label),
         measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
-        true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
+        true_edges=(edges("true_left", true_arms.left), edges("true_right", true_arms.right)),
         delays_s=group_by_event(delays),
         drops=sum(losses.values()),
         pictures=pictures,

@@ -16,6 +16,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from flexsheet.launch.objects.meshes import make_scene
+from flexsheet.launch.plans.apparatus import (
+    give_apparatus,
+    load_apparatus,
+    refuse_apparatus_readers,
+)
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -51,6 +56,7 @@ from flexsheet.launch.plans.routing import (
     make_endpoints,
     resolve_further_inputs,
 )
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.node import NodeParameters, find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
@@ -62,12 +68,14 @@ def load_graph(
     settings: Sequence[str] = (),
     record: Path | None = None,
     console: bool = False,
+    apparatus: str | None = None,
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
     settings: "node.parameter=value" each, with a YAML value; they override the file.
     record: bag to record to; it overrides the file.
     console: add a console and a paused recorder, unless the file has them.
+    apparatus: file or "seed:N" of what is true in the simulator; None: the scene is.
     Raises BadInputError with all errors of the file.
     """
     document = read_document(path)
@@ -84,9 +92,19 @@ def load_graph(
     entries = collect_entries(spec, document, problems)
     for entry in entries:
         resolve_entry(entry, document, problems)
-    writers = list_writers(spec, entries, document, problems, has_scene=scene is not None)
+    truth = _load_apparatus(apparatus, scene, problems)
+    give_apparatus(entries, truth, document, problems)
+    writers = list_writers(
+        spec,
+        entries,
+        document,
+        problems,
+        has_scene=scene is not None,
+        has_apparatus=truth is not None,
+    )
     resolve_further_inputs(entries, writers, document, problems)
     check_inputs(entries, writers, document, problems)
+    refuse_apparatus_readers(entries, document, problems)
     check_calibrations(entries, scene, document, problems)
     check_device_hosts(entries, spec, document, problems)
     if problems:
@@ -118,6 +136,7 @@ def load_graph(
         scene_file=None if scene_document is None else str(scene_document.path),
         scene_text="" if scene_document is None else scene_document.text,
         scene=scene_values,
+        apparatus=None if truth is None else truth.model_dump(mode="json"),
         hosts=addresses,
         nodes=nodes,
         writers=endpoints,
@@ -146,6 +165,22 @@ def _load_scene(
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
+
+
+def _load_apparatus(
+    text: str | None, scene: Scene | None, problems: list[Problem]
+) -> Apparatus | None:
+    if text is None:
+        return None
+    if scene is None:
+        what = "an apparatus differs from a scene, and the launch file has none"
+        problems.append(Problem("--apparatus", (), what, 'name a scene file in "scene"'))
+        return None
+    try:
+        return load_apparatus(text, scene)
+    except BadInputError as error:
+        problems.extend(error.problems)
+        return None
 
 
 def load_scene(path: Path) -> Scene:

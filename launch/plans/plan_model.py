@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bus import Source
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
@@ -144,6 +145,9 @@ class ResolvedGraph(StrictModel):
     scene_file: str | None
     scene_text: str
     scene: dict[str, Any] | None
+    apparatus: dict[str, Any] | None = Field(
+        default=None, description="what is true in the simulator; null: the scene is"
+    )
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, ResolvedNode]
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
@@ -183,6 +187,9 @@ class ResolvedGraph(StrictModel):
 
     def scene_message(self) -> Scene | None:
         return None if self.scene is None else Scene.model_validate(self.scene)
+
+    def apparatus_message(self) -> Apparatus | None:
+        return None if self.apparatus is None else Apparatus.model_validate(self.apparatus)
 
 
 def tools_on(host: str) -> str:

@@ -30,12 +30,15 @@ def list_writers(
     problems: list[Problem],
     *,
     has_scene: bool,
+    has_apparatus: bool,
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of every topic, in the order of the file."""
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
     if has_scene and not has_editor:
         writers["scene"] = [(LAUNCHER, MAIN)]
+    if has_apparatus:
+        writers["twin/apparatus"] = [(LAUNCHER, MAIN)]
     for entry in entries:
         for port_name, topic in entry.topics("output"):
             others = [name for name, _ in writers.get(topic.name, [])]

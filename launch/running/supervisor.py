@@ -52,7 +52,7 @@ from flexsheet.launch.running.runs import (
     sweep,
 )
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
-from flexsheet.messages.base import Header
+from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
@@ -393,7 +393,8 @@ class RunningGraph:
         self._write_run_files()
         self._lifeline = os.pipe()
         if self._host in (None, MAIN):
-            self._publish_scene()
+            self._publish_latched("scene", self.plan.scene_message())
+            self._publish_latched("twin/apparatus", self.plan.apparatus_message())
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
@@ -404,13 +405,13 @@ class RunningGraph:
                 self._supervise(node), name=node.name
             )
 
-    def _publish_scene(self) -> None:
-        scene = self.plan.scene_message()
-        writer = self.plan.writer("scene", LAUNCHER)
-        if scene is None or writer is None:
+    def _publish_latched(self, topic: str, message: Message | None) -> None:
+        """Publish a message that all later subscribers get too."""
+        writer = self.plan.writer(topic, LAUNCHER)
+        if message is None or writer is None:
             return
         publisher = Publisher(
-            find_topic("scene"),
+            find_topic(topic),
             local_endpoints(self.run, writer.endpoints),
             keys=self._rings.get(MAIN),
             on_refused=partial(self._report, LAUNCHER),
@@ -419,7 +420,7 @@ class RunningGraph:
         clock = SystemClock()
         now_ns = clock.now_ns()
         publisher.send(
-            scene,
+            message,
             Header(
                 sequence=1,
                 source_ns=now_ns,

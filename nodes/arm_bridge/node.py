@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
@@ -18,6 +19,7 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.path_check import PathChecker
 from flexsheet.nodes.arm_bridge.report import LastExchange, make_arm_state
+from flexsheet.nodes.arm_bridge.target_period import TargetPeriod
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 
@@ -76,6 +78,16 @@ class ArmBridge(Node):
         self._scheduler = CommandScheduler(
             1.0 / given.rate_hz, target_period_s, 1.0 / given.resting_rate_hz
         )
+        self._target_period = TargetPeriod(target_period_s)
+
+    def _measure_target_period(self, source_ns: int) -> None:
+        """Adapt to a camera with another rate than the scene's, unless the period is given."""
+        if self.parameters.target_period_s is not None:
+            return
+        period_s = self._target_period.add(source_ns)
+        if period_s != self._timing.target_period_s:
+            self._timing = replace(self._timing, target_period_s=period_s)
+            self._scheduler = replace(self._scheduler, target_period_s=period_s)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
         stamp_ns, now_ns = header.source_ns, self.clock.now_ns()
@@ -89,6 +101,8 @@ class ArmBridge(Node):
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
         """Use a target when it arrives; the next periodic command would be up to 7 ms later."""
+        if self._geometry is not None:
+            self._measure_target_period(header.source_ns)
         if self._control.is_idle:
             return
         async with self._cycling:

@@ -31,7 +31,8 @@ class ArmBridgeParameters(NodeParameters):
         default=0.03, description="lag of the arm behind a command of constant velocity"
     )
     target_period_s: Positive | None = Field(
-        default=None, description="period of the targets; null: the period of the scene's camera"
+        default=None,
+        description="period of the targets; null: measured, at first the scene's camera's",
     )
     hold_after_s: Positive = Field(
         default=0.02,

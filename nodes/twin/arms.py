@@ -58,6 +58,9 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
 
+JITTER_STREAM = 1
+"""Number of the random stream of cycles; the noise of measured joints has the seed itself."""
+
 
 def check_loopback(address: str) -> str:
     """Return an address that only this computer reaches; ValueError otherwise, since an arm obeys
@@ -214,6 +217,8 @@ class Controller:
     command clears a fault and may restart the sequence.
 
     cycle_s: a set-point takes effect at the controller's next cycle; 0: at once.
+    cycle_jitter_s: standard deviation of each cycle's begin.
+    latency_s: time from the arrival of a set-point until the controller considers it.
     """
 
     def __init__(
@@ -225,6 +230,8 @@ class Controller:
         watchdog_s: float,
         backlash_rad: float = 0.0,
         cycle_s: float = 0.0,
+        cycle_jitter_s: float = 0.0,
+        latency_s: float = 0.0,
         max_step_rad: float = 0.15,
         seed: int = 0,
     ) -> None:
@@ -242,6 +249,8 @@ class Controller:
         self._command_at_s = 0.0
         self._watchdog_s = watchdog_s
         self._cycle_s = cycle_s
+        self._cycle_jitter_s, self._latency_s = cycle_jitter_s, latency_s
+        self._jitter = np.random.default_rng((seed, JITTER_STREAM))
         self._max_step_rad = max_step_rad
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
@@ -304,8 +313,16 @@ class Controller:
 
     def _due_s(self) -> float:
         """Return the time at which a set-point that arrives now takes effect."""
-        due_s = self._time_s + (LATE_S if self.fault == "lagging" else 0.0)
-        return math.ceil(due_s / self._cycle_s) * self._cycle_s if self._cycle_s else due_s
+        due_s = self._time_s + self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
+        if not self._cycle_s:
+            return due_s
+        due_s = math.ceil(due_s / self._cycle_s) * self._cycle_s
+        if not self._cycle_jitter_s:
+            return due_s
+        # A set-point never takes effect before the one before it.
+        late_s = self._cycle_jitter_s * float(self._jitter.standard_normal())
+        last_s = self._pending[-1][0] if self._pending else self._time_s
+        return max(due_s + late_s, last_s)
 
     def _fail(self, bit: int) -> None:
         self._pending.clear()

@@ -9,13 +9,15 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from flexsheet.messages.apparatus import ArmTruth
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
+    CONTROLLER_CYCLE_S,
     RANGE_RAD,
     ArmServer,
     Controller,
@@ -26,13 +28,15 @@ from flexsheet.nodes.twin.arms import (
     solve_inverse_kinematics,
 )
 from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
+from flexsheet.nodes.twin.sheet_pull import SheetPull
+from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
-class TwinArmsParameters(NodeParameters):
+class TwinArmsParameters(SimulatorParameters):
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(default=5020, description="0: any free one")
     right_port: ListenPort = 5021
@@ -95,6 +99,8 @@ class TwinArmsNode(Node):
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}
         self._world_from_base: dict[str, Floats] = {}
+        self._flange_from_edge: dict[str, Floats] = {}
+        self._pull: SheetPull | None = None
         self._moved_ns: dict[str, int] = {}
         self._started_ns = 0
         self._stored_joints = open_joints_file(self.parameters.joints_file)
@@ -104,10 +110,14 @@ class TwinArmsNode(Node):
             await server.stop()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
+        truth = self.parameters.apparatus
+        scene = apply_apparatus(scene, truth)
         arms = {"left": scene.arms.left, "right": scene.arms.right}
         for side, spec in arms.items():
-            base = spec.world_from_base
+            base, clamp = spec.world_from_base, spec.flange_from_edge
             self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
+            self._flange_from_edge[side] = transform_from_rpy(clamp.position_m, clamp.rpy_rad)
+        self._pull = None if truth is None else SheetPull.of(scene.sheet, truth)
         if len(self.servers) == len(arms):
             return
         self._started_ns = self.clock.now_ns()
@@ -126,28 +136,46 @@ class TwinArmsNode(Node):
     def _server(self, side: str, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
         """Start an arm at those joints, behind a server of the protocol."""
         given, before = self.parameters, partial(self._advance, side)
+        truth = self._truth(side)
+        lag_s = given.servo_lag_s if truth.servo_lag_s is None else truth.servo_lag_s
+        backlash_rad = given.backlash_rad if truth.backlash_rad is None else truth.backlash_rad
+        period_s = truth.controller_period_s
         if given.protocol == "mxt":
             mxt = MxtController(
                 joints_rad,
-                servo_lag_s=max(given.servo_lag_s - FILTER_S, 1e-3),
+                servo_lag_s=max(lag_s - FILTER_S, 1e-3),
                 filter_s=FILTER_S,
                 noise_rad=given.noise_rad,
                 timeout_s=given.watchdog_s,
-                backlash_rad=given.backlash_rad,
+                backlash_rad=backlash_rad,
                 restart_after_s=given.restart_after_s,
+                cycle_s=CONTROLLER_CYCLE_S if period_s is None else period_s,
+                cycle_jitter_s=truth.controller_jitter_s,
+                latency_s=truth.command_latency_s,
                 seed=seed,
             )
             return MxtServer(mxt, host=given.host, port=port, before=before)
         controller = Controller(
             joints_rad,
-            servo_lag_s=given.servo_lag_s,
+            servo_lag_s=lag_s,
             noise_rad=given.noise_rad,
             watchdog_s=given.watchdog_s,
-            backlash_rad=given.backlash_rad,
-            cycle_s=given.cycle_s,
+            backlash_rad=backlash_rad,
+            cycle_s=given.cycle_s if period_s is None else period_s,
+            cycle_jitter_s=truth.controller_jitter_s,
+            latency_s=truth.command_latency_s,
             seed=seed,
         )
         return ArmServer(controller, host=given.host, port=port, before=before)
+
+    def _truth(self, side: str) -> ArmTruth:
+        given = self.parameters.apparatus
+        return ArmTruth() if given is None else getattr(given.arms, side)
+
+    def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
+        """Return the true joint angles (6,) behind gears at angles of the encoders (6,)."""
+        offsets_rad = self._truth(side).joint_offsets_rad
+        return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
         """Return joints that hold the sheet in the screen plane, just stretched."""
@@ -155,9 +183,10 @@ class TwinArmsNode(Node):
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
         clamp = spec.flange_from_edge
         flange = edge @ inverse(transform_from_rpy(clamp.position_m, clamp.rpy_rad))
-        return solve_inverse_kinematics(
+        joints_rad = solve_inverse_kinematics(
             inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD
         )
+        return np.asarray(joints_rad - np.array(self._truth(side).joint_offsets_rad))
 
     def _advance(self, side: str) -> None:
         """Advance an arm to the present time."""
@@ -179,13 +208,20 @@ class TwinArmsNode(Node):
         given, since_ns = self.parameters, self.clock.now_ns() - self._started_ns
         if given.fault != "none" and since_ns > given.fault_after_s * 1e9:
             self.servers[given.fault_side].controller.fault = given.fault
-        joints = {side: server.controller.servo.driven_rad for side, server in self.servers.items()}
+        joints = {
+            side: self._true_joints(side, server.controller.servo.driven_rad)
+            for side, server in self.servers.items()
+        }
+        left, right = (self._world_from_base[side] @ forward(joints[side]) for side in joints)
+        if self._pull is not None:
+            clamps = self._flange_from_edge
+            left, right = self._pull.displace(left, right, clamps["left"], clamps["right"])
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],
                 joints_right_rad=joints["right"],
-                world_from_flange_left=self._world_from_base["left"] @ forward(joints["left"]),
-                world_from_flange_right=self._world_from_base["right"] @ forward(joints["right"]),
+                world_from_flange_left=left,
+                world_from_flange_right=right,
             )
         )
         self.note = ", ".join(

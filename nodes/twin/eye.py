@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
@@ -25,6 +26,7 @@ from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
+from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 
 Floats = NDArray[np.float64]
@@ -460,26 +462,6 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
     return (bottom - top) * metres_per_px, (right - left) * metres_per_px
 
 
-def _sheet_between(
-    scene: Scene, left_edge: Floats, right_edge: Floats, finger_tip: Floats | None
-) -> DeformedSheet:
-    sheet = scene.sheet
-    rubber = Rubber(
-        sheet.width_m,
-        sheet.height_m,
-        sheet.thickness_m,
-        sheet.young_modulus_pa,
-        sheet.density_kg_per_m3,
-    )
-    return solve(
-        rubber,
-        left_edge,
-        right_edge,
-        finger_tip=finger_tip,
-        finger_radius_m=scene.finger.radius_m,
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
     """Hold the true state at which a frame was shown.
@@ -491,6 +473,7 @@ class EyeSituation:
     """
 
     scene: Scene
+    rubber: Rubber
     world_from_flange_left: Floats
     world_from_flange_right: Floats
     finger_tip: Floats | None
@@ -511,12 +494,17 @@ class EyeSituation:
         skin: Skin | None,
         display: Display | None,
         metres_per_px: float,
+        apparatus: Apparatus | None = None,
     ) -> Self:
-        """Combine the latest messages; a skin and an answer of different meshes are not used."""
+        """Combine the latest messages; a skin and an answer of different meshes are not used.
+
+        scene: the true one.
+        """
         moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
         shown = skin if moved is not None else None
         return cls(
             scene=scene,
+            rubber=true_rubber(scene.sheet, apparatus),
             world_from_flange_left=arms.world_from_flange_left,
             world_from_flange_right=arms.world_from_flange_right,
             finger_tip=None if finger is None else finger.position_world_m,
@@ -533,9 +521,14 @@ def true_sheet(
     world_from_flange_left: Floats,
     world_from_flange_right: Floats,
     finger_tip: Floats | None,
+    *,
+    rubber: Rubber,
 ) -> DeformedSheet:
     """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or
-    None."""
+    None.
+
+    scene: the true one.
+    """
     arms = scene.arms
     edges = [
         world_from_flange
@@ -545,7 +538,13 @@ def true_sheet(
             (world_from_flange_right, arms.right),
         )
     ]
-    return _sheet_between(scene, edges[0], edges[1], finger_tip)
+    return solve(
+        rubber,
+        edges[0],
+        edges[1],
+        finger_tip=finger_tip,
+        finger_radius_m=scene.finger.radius_m,
+    )
 
 
 class EyeCamera:
@@ -569,6 +568,7 @@ class EyeCamera:
             situation.world_from_flange_left,
             situation.world_from_flange_right,
             situation.finger_tip,
+            rubber=situation.rubber,
         )
         scale = situation.metres_per_px
         return (

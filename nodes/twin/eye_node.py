@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
@@ -20,14 +22,16 @@ from flexsheet.messages.types import (
     TwinEye,
     TwinFinger,
 )
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
+from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.render_queue import RenderQueue
+from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 Job = tuple[EyeSituation, Floats, Frame, Header]
 
 
-class TwinEyeParameters(NodeParameters):
+class TwinEyeParameters(SimulatorParameters):
     metres_per_px: Positive = Field(
         default=METRES_PER_PX, description="size of a pixel on the screen plane"
     )
@@ -44,6 +48,10 @@ class TwinEyeParameters(NodeParameters):
     min_interval_s: Positive = Field(
         default=5.0, description="minimum time before the same label is rendered again"
     )
+    viewpoint: Literal["centre", "left", "right"] = Field(
+        default="centre", description="where the measuring camera stands: an eye, or midway"
+    )
+    seed: int = Field(default=2026, description="of the head's motion")
 
 
 class TwinEyeNode(Node):
@@ -73,6 +81,9 @@ class TwinEyeNode(Node):
         self._queue = RenderQueue[Job](given.max_queue, given.min_interval_s)
         self._before_light: tuple[Frame, Header] | None = None
         self._task: asyncio.Task[None] | None = None
+        self._scenes: tuple[Scene, Scene] | None = None
+        truth = given.apparatus
+        self._sway = None if truth is None else HeadSway.drawn(truth.eyes, given.seed)
 
     async def close(self) -> None:
         self._queue.clear()
@@ -103,18 +114,33 @@ class TwinEyeNode(Node):
         if self._before_light is None or scene is None:
             return
         frame, frame_header = self._before_light
-        if header.clock_id == frame_header.clock_id and header.source_ns < frame.predicted_to_ns:
+        light_ns = frame.predicted_to_ns + self._late_light_ns
+        if header.clock_id == frame_header.clock_id and header.source_ns < light_ns:
             return
         self._before_light = None
-        situation = self._situation(scene, arms)
-        eye = self._true_eye(scene)
+        true_scene = self._true_scene(scene)
+        situation = self._situation(true_scene, arms)
+        eye = self._true_eye(true_scene, light_ns * 1e-9)
         self._queue.add((frame.label, frame.correction), (situation, eye, frame, frame_header))
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
+    @property
+    def _late_light_ns(self) -> int:
+        """How much later than the renderer believes the projector's light comes."""
+        truth = self.parameters.apparatus
+        return 0 if truth is None else round(1e9 * truth.projector.latency_offset_s)
+
+    def _true_scene(self, scene: Scene) -> Scene:
+        """Return the scene with the true devices; the same object for the same scene."""
+        if self._scenes is None or self._scenes[0] is not scene:
+            true = apply_apparatus(scene, self.parameters.apparatus)
+            if self.parameters.projector is not None:
+                true = true.model_copy(update={"projector": self.parameters.projector})
+            self._scenes = scene, true
+        return self._scenes[1]
+
     def _situation(self, scene: Scene, arms: TwinArms) -> EyeSituation:
-        if self.parameters.projector is not None:
-            scene = scene.model_copy(update={"projector": self.parameters.projector})
         return EyeSituation.from_messages(
             scene,
             arms,
@@ -123,13 +149,28 @@ class TwinEyeNode(Node):
             skin=self.skin.message,
             display=self.display.message,
             metres_per_px=self.parameters.metres_per_px,
+            apparatus=self.parameters.apparatus,
         )
 
-    def _true_eye(self, scene: Scene) -> Floats:
-        """Return the present eye position (3,): the tracked one, else the scene's."""
-        tracked = self.eye.message if self.eye.age_s() <= self.parameters.eye_stale_s else None
-        seen = tracked is not None and tracked.valid
-        return tracked.centre_world_m if tracked and seen else scene.eyes.centre_world_m
+    def _true_eye(self, true_scene: Scene, at_s: float) -> Floats:
+        """Return the true position (3,) of the measuring camera.
+
+        The apparatus's offset counts from the tracked eyes, or else from the scene's.
+        """
+        given = self.parameters
+        tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None
+        centre, right = true_scene.eyes.centre_world_m, np.array([1.0, 0.0, 0.0])
+        if tracked is not None and tracked.valid:
+            centre = tracked.centre_world_m
+            right = tracked.right_world / np.linalg.norm(tracked.right_world)
+            if given.apparatus is not None:
+                centre = centre + np.array(given.apparatus.eyes.centre_offset_m)
+        if self._sway is not None:
+            centre = centre + self._sway.at(at_s)
+        if given.viewpoint == "centre":
+            return centre
+        aside_m = 0.5 * true_scene.eyes.interocular_m
+        return np.asarray(centre + (aside_m if given.viewpoint == "right" else -aside_m) * right)
 
     async def _picture_all(self) -> None:
         while self._queue:

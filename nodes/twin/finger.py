@@ -247,8 +247,14 @@ class FingerMotion:
     tremor: SineSum = field(repr=False)
 
     @staticmethod
-    def resting(position: Floats, *, seed: int) -> FingerMotion:
-        """Make a finger that rests at `position`."""
+    def resting(
+        position: Floats,
+        *,
+        seed: int,
+        wander_band_hz: tuple[float, float] = WANDER_BAND_HZ,
+        tremor_band_hz: tuple[float, float] = TREMOR_BAND_HZ,
+    ) -> FingerMotion:
+        """Make a finger that rests at `position`, with the bands of its unsteadiness."""
         generator = np.random.default_rng(seed)
         return FingerMotion(
             path=RoundedLines.through(np.zeros(1), position[None]),
@@ -258,8 +264,8 @@ class FingerMotion:
             amplitudes_before_m=(0.0, 0.0),
             amplitudes_m=(0.0, 0.0),
             age_s=0.0,
-            wander=SineSum.drawn(WANDER_BAND_HZ, generator),
-            tremor=SineSum.drawn(TREMOR_BAND_HZ, generator),
+            wander=SineSum.drawn(wander_band_hz, generator),
+            tremor=SineSum.drawn(tremor_band_hz, generator),
         )
 
     def followed_by(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -13,14 +14,19 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import NonNegative, Scene
 from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
-from flexsheet.nodes.twin.finger import FingerMotion, FingerState
+from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState, Floats
+from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
+
+JITTER_STREAM = 1
+"""Number of the random stream of exposure times; the noise of images has the seed itself."""
 
 
-class TwinFingerParameters(NodeParameters):
+class TwinFingerParameters(SimulatorParameters):
     """Hold the parameters; `seed` determines the finger's unsteadiness and the camera's noise."""
 
     seed: int = 1
@@ -62,6 +68,7 @@ class TwinFingerNode(Node):
         return "it takes images by its own clock; its motion is in the bag as twin/finger"
 
     async def setup(self) -> None:
+        self._jitter = np.random.default_rng((self.parameters.seed, JITTER_STREAM))
         self.filming = asyncio.create_task(self._film())
 
     async def close(self) -> None:
@@ -70,20 +77,41 @@ class TwinFingerNode(Node):
             await asyncio.gather(self.filming, return_exceptions=True)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
+        truth = self.parameters.apparatus
+        true_scene = apply_apparatus(scene, truth)
         first = self.camera is None
         if first:
             rest = np.array(self.parameters.rest_world_m)
-            self.motion = FingerMotion.resting(rest, seed=self.parameters.seed)
+            self.motion = self._make_resting(rest)
             self.motion_from_ns = self.clock.now_ns()
-        rig, clutter = make_true_camera(scene.camera), CLUTTER[self.parameters.clutter]
-        radius_m, seed = scene.finger.radius_m, self.parameters.seed
-        self.camera = TwinCamera(rig, finger_radius_m=radius_m, seed=seed, clutter=clutter)
-        self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
-        self.period_ns = round(1e9 / scene.camera.rate_hz)
-        self.exposure_ns = round(1e9 * scene.camera.exposure_s)
+        self.camera = TwinCamera(
+            make_true_camera(true_scene.camera),
+            finger_radius_m=true_scene.finger.radius_m,
+            seed=self.parameters.seed,
+            clutter=CLUTTER[self.parameters.clutter],
+            nail=None if truth is None else Nail.of(truth.finger),
+            skew_s=0.0 if truth is None else truth.camera.skew_s,
+        )
+        self.max_speed_m_per_s = true_scene.finger.max_speed_m_per_s
+        self.period_ns = round(1e9 / true_scene.camera.rate_hz)
+        self.exposure_ns = round(1e9 * true_scene.camera.exposure_s)
         self.has_scene.set()
         if first and self.twin__finger_path.message is not None:
             self._follow(self.twin__finger_path.message)
+
+    def _make_resting(self, rest: Floats) -> FingerMotion:
+        """Make the finger at rest, with the unsteadiness of the apparatus."""
+        given = self.parameters
+        if given.apparatus is None:
+            return FingerMotion.resting(rest, seed=given.seed)
+        finger = given.apparatus.finger
+        middle_hz, half_hz = finger.tremor_frequency_hz, 0.5 * finger.tremor_width_hz
+        return FingerMotion.resting(
+            rest,
+            seed=given.seed,
+            wander_band_hz=(WANDER_BAND_HZ[0], finger.voluntary_bandwidth_hz),
+            tremor_band_hz=(middle_hz - half_hz, middle_hz + half_hz),
+        )
 
     def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
         if self.camera is not None:
@@ -98,23 +126,31 @@ class TwinFingerNode(Node):
             times_s=path.times_s,
             points=path.positions_world_m,
             wander_m=path.wander_m,
-            tremor_m=path.tremor_m,
+            tremor_m=self._tremor_m(path),
             max_speed_m_per_s=self.max_speed_m_per_s,
             joined_by=path.joined_by,
         )
         self.motion_from_ns, self.path_label = now_ns, path.label
         self.path_stroke_s = path.stroke_s
 
+    def _tremor_m(self, path: FingerPath) -> float:
+        """Return the tremor's amplitude on a path; one without tremor stays without."""
+        given = self.parameters.apparatus
+        if given is None or given.finger.tremor_rms_m is None or not path.tremor_m:
+            return path.tremor_m
+        return math.sqrt(2.0) * given.finger.tremor_rms_m
+
     def truth(self, at_ns: int) -> FingerState:
         """Return the fingertip at a time of this node's clock."""
         return self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
 
     def expose(self, middle_ns: int) -> StereoPair:
-        """Render the image pair whose exposure is centred at `middle_ns`, and publish the truth.
+        """Render the image pair with the stamp `middle_ns`, and publish the truth at that time.
 
-        Needs a scene.
+        The true exposure differs from the stamp as the apparatus says.  Needs a scene.
         """
         assert self.camera is not None
+        exposed_ns = middle_ns + self._stamp_error_ns()
         state = self.truth(middle_ns)
         self.twin__finger.publish(
             TwinFinger(
@@ -128,9 +164,9 @@ class TwinFingerNode(Node):
             source_ns=middle_ns,
         )
         left, right = self.camera.picture(
-            lambda offset_s: self.truth(middle_ns + round(offset_s * 1e9)).position,
+            lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position,
             exposure_s=self.exposure_ns * 1e-9,
-            time_s=middle_ns * 1e-9,
+            time_s=exposed_ns * 1e-9,
         )
         return StereoPair(
             device=self.camera.camera.device,
@@ -139,6 +175,22 @@ class TwinFingerNode(Node):
             left=left,
             right=right,
         )
+
+    def _stamp_error_ns(self) -> int:
+        """Draw the true time of an exposure minus its stamp."""
+        if self.parameters.apparatus is None:
+            return 0
+        camera = self.parameters.apparatus.camera
+        if not camera.exposure_jitter_s:
+            return round(1e9 * camera.stamp_offset_s)
+        jitter_s = camera.exposure_jitter_s * float(self._jitter.standard_normal())
+        return round(1e9 * (camera.stamp_offset_s + jitter_s))
+
+    @property
+    def _read_out_s(self) -> float:
+        given = self.parameters
+        true_s = None if given.apparatus is None else given.apparatus.camera.read_out_s
+        return given.transfer_s if true_s is None else true_s
 
     async def _film(self) -> None:
         """Simulate the exposures on a fixed time grid.
@@ -161,7 +213,7 @@ class TwinFingerNode(Node):
         """Process one frame from the start of its exposure until it is read out."""
         middle_ns = start_ns + self.exposure_ns // 2
         pair = self.expose(middle_ns)
-        read_out_ns = start_ns + self.exposure_ns + round(1e9 * self.parameters.transfer_s)
+        read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
         self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'

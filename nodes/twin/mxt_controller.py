@@ -18,6 +18,7 @@ from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
+    JITTER_STREAM,
     LATE_S,
     RANGE_RAD,
     SPEED_RAD_PER_S,
@@ -62,6 +63,8 @@ class MxtController:
     are a move without a first packet that only asks, a type of data that cannot be obeyed, numbers
     that are no pose in range, a first set-point away from the arm, a leap, and `timeout_s` without
     a packet.  filter_s: the low-pass that set-points go through ahead of the servos.
+    cycle_s, cycle_jitter_s: mean and standard deviation of a cycle.  latency_s: time from a
+    set-point to its effect.
     """
 
     def __init__(
@@ -74,6 +77,9 @@ class MxtController:
         timeout_s: float,
         backlash_rad: float = 0.0,
         restart_after_s: float = math.inf,
+        cycle_s: float = CONTROLLER_CYCLE_S,
+        cycle_jitter_s: float = 0.0,
+        latency_s: float = 0.0,
         seed: int = 0,
     ) -> None:
         self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
@@ -84,10 +90,14 @@ class MxtController:
         self.wanted_rad = self.servo.joints_rad.copy()
         self.answers: list[tuple[bytes, Address]] = []
         self._filtered_rad = self.wanted_rad
-        self._filter_share = 1.0 - math.exp(-CONTROLLER_CYCLE_S / filter_s) if filter_s else 1.0
-        self._max_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * CONTROLLER_CYCLE_S
-        self._timeout_cycles = round(timeout_s / CONTROLLER_CYCLE_S)
-        self._restart_cycles = restart_after_s / CONTROLLER_CYCLE_S
+        self._cycle_s, self._cycle_jitter_s, self._latency_s = cycle_s, cycle_jitter_s, latency_s
+        self._next_cycle_s = cycle_s
+        self._jitter = np.random.default_rng((seed, JITTER_STREAM))
+        self._filter_share = 1.0 - math.exp(-cycle_s / filter_s) if filter_s else 1.0
+        # Clients send at the protocol's period even where the controller's cycle is shorter.
+        self._max_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * max(cycle_s, CONTROLLER_CYCLE_S)
+        self._timeout_cycles = round(timeout_s / cycle_s)
+        self._restart_cycles = restart_after_s / cycle_s
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
         self._into_cycle_s = 0.0
@@ -120,7 +130,7 @@ class MxtController:
 
     def until_cycle_s(self) -> float:
         """How long until the next cycle."""
-        return CONTROLLER_CYCLE_S - self._into_cycle_s
+        return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
         """Let `duration_s` pass, cycle by cycle; what they answer is put into `answers`."""
@@ -128,6 +138,9 @@ class MxtController:
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
             self._into_cycle_s = 0.0
+            if self._cycle_jitter_s:
+                late_s = self._cycle_jitter_s * float(self._jitter.standard_normal())
+                self._next_cycle_s = max(self._cycle_s + late_s, 0.1 * self._cycle_s)
             self._cycle()
         self._move_on(duration_s)
         self._into_cycle_s += duration_s
@@ -155,13 +168,12 @@ class MxtController:
 
     def _acting(self) -> Floats:
         """The set-point in force: the newest, unless the arm lags."""
-        if self.fault != "lagging":
+        late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
+        if not late_s:
             self._late.clear()
             return self.wanted_rad
         self._late.append((self._cycles, self.wanted_rad))
-        while (
-            len(self._late) > 1 and self._late[1][0] <= self._cycles - LATE_S / CONTROLLER_CYCLE_S
-        ):
+        while len(self._late) > 1 and self._late[1][0] <= self._cycles - late_s / self._cycle_s:
             self._late.pop(0)
         return self._late[0][1]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -25,7 +25,6 @@ from flexsheet.messages.types import Side
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin.clutter import (
     CLUTTER,
-    FINGER_DIRECTION,
     FINGER_LENGTH_M,
     MARKER_RADIUS_M,
     Clutter,
@@ -34,7 +33,8 @@ from flexsheet.nodes.twin.clutter import (
     SecondMarker,
     Sheet,
 )
-from flexsheet.nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
+from flexsheet.nodes.twin.nail import Nail
+from flexsheet.nodes.twin.rig import pixel_of, pixels_of, pixels_per_slope, slopes_of
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -66,6 +66,11 @@ ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 
 EMPTY_FRACTION = 1.2
 """Maximum area of joined windows over the sum of theirs."""
+
+SPOTS = 61
+"""Number of Gaussian spots that make up a flat marker."""
+
+GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 GRAIN = 1 << 21
 """Number of normal deviates from which images take their noise, at random offsets."""
@@ -171,11 +176,19 @@ class TwinCamera:
         seed: int,
         sensor: Sensor | None = None,
         clutter: Clutter | None = None,
+        nail: Nail | None = None,
+        skew_s: float = 0.0,
     ) -> None:
+        """nail: where the marker is, and how the finger is held; None: a ball at the fingertip.
+
+        skew_s: exposure of the right image minus that of the left one.
+        """
         self.camera = camera
+        self.skew_s = skew_s
+        self.nail = Nail() if nail is None else nail
         self.finger_radius_m = finger_radius_m
         self.marker_radius_m = MARKER_RADIUS_M
-        self.marker_offset_m = np.zeros(3)
+        self.marker_offset_m = self.nail.marker_offset_m
         self.sensor = Sensor() if sensor is None else sensor
         self.clutter = CLUTTER["none"] if clutter is None else clutter
         self._random = np.random.default_rng(seed)
@@ -215,10 +228,9 @@ class TwinCamera:
         mark: whether the finger wears a marker.
         time_s: time at mid-exposure of the clutter that moves.
         """
-        instants_s, tips = self._instants(position, exposure_s)
         left, right = (
             self._exposed(eye, self._draw(eye, tips, time_s + instants_s, marker=marker))
-            for eye in self.eyes
+            for eye, instants_s, tips in self._views(position, exposure_s)
         )
         return left, right
 
@@ -226,13 +238,22 @@ class TwinCamera:
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
         """Return both images (height, width) as light: before noise, saturation and rounding."""
-        instants_s, tips = self._instants(position, exposure_s)
         pictures = []
-        for eye in self.eyes:
+        for eye, instants_s, tips in self._views(position, exposure_s):
             windows = self._draw(eye, tips, time_s + instants_s, marker=marker)
             pictures.append(eye.canvas.copy())
             _wipe(eye, windows)
         return pictures[0], pictures[1]
+
+    def _views(self, position: Position, exposure_s: float) -> Iterator[tuple[Eye, Floats, Floats]]:
+        """Return each camera with its instants (n,) and the fingertips (n, 3) at them."""
+        instants_s, tips = self._instants(position, exposure_s)
+        left, right = self.eyes
+        yield left, instants_s, tips
+        if self.skew_s:
+            instants_s = instants_s + self.skew_s
+            tips = np.stack([position(float(instant)) for instant in instants_s])
+        yield right, instants_s, tips
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
         """Return times (n,) from mid-exposure and fingertips (n, 3), dense enough to sum motion."""
@@ -271,16 +292,19 @@ class TwinCamera:
         for limb in clutter.limbs:
             ends = np.stack([limb.start.at(time_s), limb.end.at(time_s)])
             if limb.carried:
-                ends += tip
+                ends += tip + self.nail.knuckle_shift_m
             radii_m = (limb.start_radius_m, limb.end_radius_m)
             moved = way if limb.carried else np.zeros(3)
             windows.append(self._limb(eye, ends, radii_m, limb.level, moved, lit=True))
-        ends = np.stack([tip, tip + FINGER_LENGTH_M * np.array(FINGER_DIRECTION)])
+        ends = np.stack([tip, tip + FINGER_LENGTH_M * self.nail.direction])
         radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
         windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
         if marker:
             at = tips + self.marker_offset_m
-            windows.append(self._disc(eye, at, self.marker_radius_m, sensor.marker_level))
+            if self.nail.marker_normal is None:
+                windows.append(self._disc(eye, at, self.marker_radius_m, sensor.marker_level))
+            else:
+                windows.append(self._flat_disc(eye, at, self.nail.marker_normal))
         for thing in _spots(clutter, eye.side):
             if not _is_static(thing):
                 places = np.stack([thing.path.at(float(instant)) for instant in times_s])
@@ -377,6 +401,40 @@ class TwinCamera:
         canvas += cover * (light if adds else light - canvas)
         return window
 
+    def _flat_disc(self, eye: Eye, places: Floats, normal: Floats) -> Window | None:
+        """Draw the marker as a flat disc at world points (n, 3), seen as an ellipse; None if it is
+        not visible, or seen from behind.
+
+        The disc is a sum of Gaussian spots, which is exact up to their overlap: within 1 % of the
+        light of a disc that is larger than the blur.
+        """
+        in_camera = apply(eye.camera_from_world, places)
+        middle = in_camera.mean(axis=0)
+        towards = float(-(eye.camera_from_world[:3, :3] @ normal) @ middle)
+        x, y, z = middle.tolist()
+        if in_camera[:, 2].min() <= MIN_DEPTH_M or towards <= 0.0:
+            return None
+        per_slope = pixels_per_slope(eye.lens, x / z, y / z)
+        area_px = math.pi * (self.marker_radius_m * per_slope) ** 2 * towards / z**3 / SPOTS
+        spread_px = math.hypot(
+            self.sensor.spread_px(z, eye.lens.fx_px), math.sqrt(area_px / (4.0 * math.pi))
+        )
+        spots = _disc_points(normal) * self.marker_radius_m
+        local = apply(eye.camera_from_world, (places[:, None] + spots).reshape(-1, 3))
+        pixels = pixels_of(eye.lens, local[:, :2] / local[:, 2:])
+        corners = [pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()]
+        window = eye.window([(u, v) for u, v in corners], 4.0 * spread_px)
+        if window is None:
+            return None
+        rows, columns = (np.arange(part.start, part.stop)[:, None] for part in window)
+        across = np.exp(-0.5 * ((columns - pixels[:, 0]) / spread_px) ** 2)
+        down = np.exp(-0.5 * ((rows - pixels[:, 1]) / spread_px) ** 2)
+        weight = area_px / (2.0 * math.pi * spread_px**2 * len(places))
+        cover = np.minimum(weight * (down @ across.T), 1.0).astype(np.float32)
+        canvas = eye.canvas[window]
+        canvas += cover * (np.float32(self.sensor.marker_level * self.sensor.exposure) - canvas)
+        return window
+
     def _eye(self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None) -> Eye:
         """Return one camera with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
@@ -442,6 +500,18 @@ class TwinCamera:
         inside_m = (half - np.abs(place)).min(axis=-1)
         cover = before * np.clip(0.5 + inside_m / px_m, 0.0, 1.0)
         canvas += (cover * (level - canvas)).astype(np.float32)
+
+
+def _disc_points(normal: Floats) -> Floats:
+    """Return SPOTS points (n, 3) spread evenly over the unit disc with that normal."""
+    number = np.arange(SPOTS) + 0.5
+    radius, angle = np.sqrt(number / SPOTS), GOLDEN_ANGLE_RAD * number
+    aside = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    aside /= np.linalg.norm(aside)
+    other = np.cross(normal, aside)
+    return np.asarray(
+        (radius * np.cos(angle))[:, None] * aside + (radius * np.sin(angle))[:, None] * other
+    )
 
 
 @lru_cache(maxsize=4)

@@ -25,18 +25,28 @@ from flexsheet.launch.experiments.stroke import (
     sheet_errors,
     stroke_window_s,
 )
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
 
 BLOCK = 2000
 """Number of finger samples that are processed together."""
 
-TOPICS_READ = ("scene", "sheet_target", "twin/finger", "arm_left", "arm_right", "twin/arms")
+TOPICS_READ = (
+    "scene",
+    "twin/apparatus",
+    "sheet_target",
+    "twin/finger",
+    "arm_left",
+    "arm_right",
+    "twin/arms",
+)
 """Topics needed for the errors against the true finger; a simulator's bag has them on one
 clock."""
 
@@ -109,7 +119,9 @@ class SheetErrors:
         self._grid = grid
         self._scene: Scene | None = None
         self._shape: Shape | None = None
+        self._apparatus: Apparatus | None = None
         self._edge_poses: dict[str, Floats] = {}
+        self._true_edge_poses: dict[str, Floats] = {}
         self.measured, self.true = MotionBuffer(), MotionBuffer()
         self._contact: list[tuple[int, Floats]] = []
         self._following: list[tuple[int, Floats]] = []
@@ -128,8 +140,12 @@ class SheetErrors:
                 self._scene, self._shape = message, make_shape(dict(message.object.geometry))
                 arms = message.arms
                 self._edge_poses = {"left": _edge(arms.left), "right": _edge(arms.right)}
+                self._set_true_edges()
                 self.measured, self.true = MotionBuffer(), MotionBuffer()
                 self._contact, self._following = [], []
+            case Apparatus():
+                self._apparatus = message
+                self._set_true_edges()
             case SheetTarget():
                 touches = float(message.phase == "contact")
                 self._contact.append(
@@ -151,9 +167,15 @@ class SheetErrors:
         if max(len(self.measured.finger), len(self.true.finger)) >= BLOCK:
             self.finish()
 
+    def _set_true_edges(self) -> None:
+        if self._scene is not None:
+            arms = apply_apparatus(self._scene, self._apparatus).arms
+            self._true_edge_poses = {"left": _edge(arms.left), "right": _edge(arms.right)}
+
     def _add_edge(self, side: MotionBuffer, name: str, flange: Floats, source_ns: int) -> None:
         if self._scene is not None:
-            row = edge_row(flange, self._edge_poses[name])
+            poses = self._true_edge_poses if side is self.true else self._edge_poses
+            row = edge_row(flange, poses[name])
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:

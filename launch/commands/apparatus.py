@@ -1,0 +1,142 @@
+"""`flexsheet apparatus`: draw what is true in the simulator, and show how it differs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_json,
+    print_table,
+    words,
+)
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="What is true in the simulator, as differences from the scene.",
+)
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
+PROFILES = ("modern", "paper")
+
+SceneOption = Annotated[
+    Path,
+    typer.Option("--scene", metavar="FILE", help="Scene file.", autocompletion=complete.yaml_files),
+]
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet apparatus sample --seed 7 -o apparatus.yaml",
+        "flexsheet apparatus sample --seed 7 --profile paper --calibrated -o apparatus.yaml",
+    )
+)
+def sample(
+    *,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Seed of the draw; 0 to 99 are for development, others for evaluation."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="New file.")],
+    profile: Annotated[
+        str,
+        typer.Option(
+            metavar="|".join(PROFILES),
+            help="modern: 60 Hz camera; paper: the equipment of the paper.",
+        ),
+    ] = "modern",
+    calibrated: Annotated[
+        bool,
+        typer.Option("--calibrated", help="Draw what remains after the laboratory has calibrated."),
+    ] = False,
+    scene: SceneOption = SCENE_FILE,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw an apparatus from the table of tolerances, and write it to a file."""
+    from flexsheet.launch.plans.apparatus import format_apparatus
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.files import write_file
+    from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
+
+    if profile not in PROFILES:
+        raise CommandError(
+            f'--profile: unknown profile "{profile}"; write {" or ".join(PROFILES)}', BAD_INPUT
+        )
+    drawn = sample_apparatus(
+        load_scene(scene), seed, profile=Profile(profile), calibrated=calibrated
+    )
+    write_file(output, format_apparatus(drawn))
+    if as_json:
+        print_json({"file": str(output), "origin": drawn.origin, "scene": drawn.scene})
+    else:
+        words.print(f"{drawn.origin}: written to {output}")
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet apparatus show apparatus.yaml",
+        "flexsheet apparatus show seed:7,paper --json",
+    )
+)
+def show(
+    *,
+    apparatus: Annotated[
+        str, typer.Argument(metavar="FILE|seed:N", help="Apparatus file, or a draw.")
+    ],
+    scene: SceneOption = SCENE_FILE,
+    as_json: JsonOption = False,
+) -> None:
+    """Check an apparatus, and list how it differs from its scene.
+
+    Exit code 2: the file has unknown keys or impossible values, or belongs to another scene.
+    """
+    from flexsheet.launch.plans.apparatus import load_apparatus
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.nodes.twin.tolerance_table import NOT_SIMULATED, list_differences
+
+    loaded = load_apparatus(apparatus, load_scene(scene))
+    rows: list[dict[str, Any]] = [
+        {
+            "parameter": path,
+            "value": value,
+            "nominal": nominal,
+            "unit": unit,
+            "simulated": path not in NOT_SIMULATED,
+        }
+        for path, value, nominal, unit in list_differences(loaded)
+    ]
+    if as_json:
+        print_json({"scene": loaded.scene, "origin": loaded.origin, "differences": rows})
+        return
+    words.print(f"scene {loaded.scene}, {loaded.origin}: {len(rows)} differences")
+    print_table(
+        ("parameter", "value", "nominal", "unit", ""),
+        [
+            (
+                row["parameter"],
+                _format(row["value"]),
+                "as the scene or node has it"
+                if row["nominal"] is None
+                else _format(row["nominal"]),
+                row["unit"],
+                "" if row["simulated"] else "not simulated",
+            )
+            for row in rows
+        ],
+    )
+
+
+def _format(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_format, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

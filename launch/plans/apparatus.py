@@ -1,0 +1,150 @@
+"""Read the apparatus that `--apparatus` names, and hand it to the simulator nodes of a graph."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Problem,
+    read_document,
+    validate,
+)
+from flexsheet.launch.plans.resolve_nodes import NodeEntry
+from flexsheet.messages.apparatus import Apparatus, identify_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import NodeRole
+from flexsheet.nodes.node import role_of
+from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
+from flexsheet.nodes.twin.truth import SimulatorParameters, check_truth
+
+TOPIC = "twin/apparatus"
+_SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
+CALIBRATED = "calibrated"
+PROFILES = tuple(one.value for one in Profile)
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Hold the parts of `seed:N[,modern|paper][,calibrated]`."""
+
+    seed: int
+    profile: Profile
+    calibrated: bool
+
+
+def parse_draw(text: str) -> Draw | None:
+    """Parse the value of `--apparatus`; None if it names a file.  Raises BadInputError."""
+    if not text.startswith("seed:"):
+        return None
+    match = _SEED.fullmatch(text)
+    words = [] if match is None else match["words"].split(",")[1:]
+    profiles = [Profile(word) for word in words if word in PROFILES]
+    known = len(profiles) + words.count(CALIBRATED) == len(words) == len(set(words))
+    if match is None or not known or len(profiles) > 1:
+        remedy = "write seed:N, seed:N,paper or seed:N,paper,calibrated, N a whole number"
+        raise BadInputError(
+            [Problem("--apparatus", (), f'"{text}" is not a draw', f"{remedy}; or name a file")]
+        )
+    profile = profiles[0] if profiles else Profile.MODERN
+    return Draw(int(match["seed"]), profile, CALIBRATED in words)
+
+
+def load_apparatus(text: str, scene: Scene) -> Apparatus:
+    """Return the apparatus of a file or of a seed.
+
+    Raises BadInputError for a file that cannot be read, has unknown keys or impossible values, or
+    belongs to another scene.
+    """
+    draw = parse_draw(text)
+    if draw is not None:
+        return sample_apparatus(scene, draw.seed, profile=draw.profile, calibrated=draw.calibrated)
+    document = read_document(Path(text))
+    apparatus = validate(Apparatus, document)
+    problems = _compare_scenes(apparatus, scene, document)
+    problems += [
+        document.problem(key, f"{value} {what}", remedy)
+        for key, value, what, remedy in check_truth(scene, apparatus)
+    ]
+    if problems:
+        raise BadInputError(problems)
+    return apparatus
+
+
+def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> list[Problem]:
+    remedy = "name the apparatus of this scene; flexsheet apparatus sample --scene FILE makes one"
+    if apparatus.scene != scene.name:
+        what = f'"{apparatus.scene}" is another scene than "{scene.name}"'
+        return [document.problem(("scene",), what, remedy)]
+    if apparatus.scene_id not in (None, identify_scene(scene)):
+        what = (
+            f'"{apparatus.scene_id}" belongs to another object or to other devices than '
+            f'"{identify_scene(scene)}" of scene "{scene.name}"'
+        )
+        return [document.problem(("scene_id",), what, remedy)]
+    return []
+
+
+def format_apparatus(apparatus: Apparatus) -> str:
+    """Return the text of an apparatus file."""
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 4096
+    text = io.StringIO()
+    text.write(
+        f"# Apparatus of scene {apparatus.scene}, {apparatus.origin}: what is true in the\n"
+        "# simulator, as differences from `nominal`. See docs/apparatus.md.\n"
+    )
+    yaml.dump(apparatus.model_dump(mode="json", exclude_none=True), text)
+    return text.getvalue()
+
+
+def give_apparatus(
+    entries: list[NodeEntry],
+    apparatus: Apparatus | None,
+    document: Document,
+    problems: list[Problem],
+) -> None:
+    """Set the apparatus as a parameter of all simulator nodes, and of no other node."""
+    simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
+    for entry in simulators:
+        if "apparatus" in entry.spec.parameters:
+            problems.append(
+                document.problem(
+                    (*entry.key, "parameters", "apparatus"),
+                    "is given in the launch file",
+                    "remove it, and use the option --apparatus: all nodes need the same",
+                )
+            )
+        elif apparatus is not None and entry.parameters is not None:
+            entry.parameters = entry.parameters.model_copy(update={"apparatus": apparatus})
+    if apparatus is not None and not simulators:
+        problems.append(
+            Problem("--apparatus", (), "the graph has no simulator node", "start a simulated graph")
+        )
+
+
+def refuse_apparatus_readers(
+    entries: list[NodeEntry], document: Document, problems: list[Problem]
+) -> None:
+    """Check that only simulator nodes and the recorder read the apparatus."""
+    for entry in entries:
+        if entry.type is None or role_of(entry.type) is NodeRole.RECORDER:
+            continue
+        if isinstance(entry.parameters, SimulatorParameters):
+            continue
+        for port, topic in entry.topics("input"):
+            if topic.name == TOPIC:
+                problems.append(
+                    document.problem(
+                        (*entry.key, "topics", port),
+                        f'"{entry.name}" would read the truth of the simulator',
+                        "disconnect the port: only the simulator and experiments may know it",
+                    )
+                )

@@ -1,0 +1,37 @@
+"""Simulate the slow motion of a person's head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.apparatus import EyesTruth
+from flexsheet.nodes.twin.finger import SineSum
+
+Floats = NDArray[np.float64]
+
+MIN_SWAY_FREQUENCY_RATIO = 0.1
+"""Lowest frequency of the sway, relative to the highest."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadSway:
+    """Hold a motion of standard deviation `sway_m` per axis, a function of time."""
+
+    sway_m: float
+    noise: SineSum
+
+    @classmethod
+    def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
+        """Draw the motion; None for a head at rest."""
+        if not eyes.sway_m:
+            return None
+        band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
+        return cls(eyes.sway_m, SineSum.drawn(band_hz, np.random.default_rng(seed)))
+
+    def at(self, time_s: float) -> Floats:
+        """Return the displacement (3,) m of the eyes."""
+        return np.asarray(self.sway_m * self.noise.at(time_s)[0])

@@ -1,0 +1,85 @@
+"""Displace the flanges by the sheet's pull on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.twin.membrane import Rubber, solve
+
+Floats = NDArray[np.float64]
+
+CELLS = 8
+"""Elements per side: the force of an unpushed sheet then differs by 1 % from that of 32."""
+
+STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
+
+
+def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> Rubber:
+    """Return the simulator's sheet; sheet: the true one."""
+    gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
+    return Rubber(
+        sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa, gradient
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SheetPull:
+    """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
+
+    A finger's push on the sheet is not part of the pull: it is small beside the tension.
+    """
+
+    distances_m: Floats
+    forces_n: Floats
+    compliances_m_per_n: tuple[float, float]
+
+    @classmethod
+    def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
+        """Compute the pull of the true sheet with the simulator's membrane; None if both arms are
+        rigid.
+        """
+        arms = apparatus.arms
+        compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
+        if not any(compliances):
+            return None
+        rubber = true_rubber(sheet, apparatus)
+        distances_m = rubber.width_m * np.array(STRETCHES)
+        forces_n = [0.0]
+        for distance_m in distances_m[1:]:
+            edges = [transform(np.eye(3), [0.5 * side * distance_m, 0.0, 0.0]) for side in (-1, 1)]
+            forces_n.append(float(solve(rubber, *edges, cells=CELLS).left_force_n[0]))
+        return cls(distances_m, np.array(forces_n), compliances)
+
+    def force_n(self, distance_m: float) -> float:
+        """Return the pull between the arms at a distance of the rigid arms' edges.
+
+        The flanges give way until compliance and sheet are in equilibrium.
+        """
+        rigid_m = self.distances_m + sum(self.compliances_m_per_n) * self.forces_n
+        return float(np.interp(distance_m, rigid_m, self.forces_n))
+
+    def displace(
+        self,
+        world_from_left_flange: Floats,
+        world_from_right_flange: Floats,
+        left_flange_from_edge: Floats,
+        right_flange_from_edge: Floats,
+    ) -> tuple[Floats, Floats]:
+        """Return both flange poses (4, 4) under the sheet's pull; they move, but do not turn."""
+        left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
+        right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]
+        distance_m = float(np.linalg.norm(right_m - left_m))
+        if distance_m <= 0.0:
+            return world_from_left_flange, world_from_right_flange
+        pull = self.force_n(distance_m) * (right_m - left_m) / distance_m
+        left, right = world_from_left_flange.copy(), world_from_right_flange.copy()
+        left[:3, 3] += self.compliances_m_per_n[0] * pull
+        right[:3, 3] -= self.compliances_m_per_n[1] * pull
+        return left, right

@@ -1,0 +1,177 @@
+"""Apply an apparatus to a scene: what is true instead of what the nodes believe."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flexsheet.messages.apparatus import Apparatus, ArmTruth, LensTruth
+from flexsheet.messages.scene import ArmSpec, Lens, Pose, Scene, StereoCamera
+from flexsheet.nodes.models.rigid import (
+    rotation_from_rpy,
+    rotation_from_vector,
+    rpy_from_rotation,
+    transform,
+)
+from flexsheet.nodes.node import NodeParameters
+
+Floats = NDArray[np.float64]
+
+
+class SimulatorParameters(NodeParameters):
+    """Hold the parameters of a simulator node; only these contain the apparatus."""
+
+    apparatus: Apparatus | None = Field(
+        default=None, description="what is true; null: the scene is. `--apparatus` sets it"
+    )
+
+
+def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
+    """Return the scene with the true devices; the scene itself for None.
+
+    The object and everything that is not a device stay as they are: they are virtual, or are
+    requirements. The camera's true lenses follow from its result by `make_true_camera`, since the
+    scene states a data sheet there.
+    """
+    if apparatus is None:
+        return scene
+    base = scene
+    if apparatus.nominal is not None:
+        names = type(apparatus.nominal).model_fields
+        base = scene.model_copy(update={name: getattr(apparatus.nominal, name) for name in names})
+    sheet, eyes, projector = apparatus.sheet, apparatus.eyes, apparatus.projector
+    slip_m = sum(apparatus.sheet.clamp_slip_m)
+    return base.model_copy(
+        update={
+            "camera": _true_camera(base.camera, apparatus),
+            "arms": base.arms.model_copy(
+                update={
+                    "left": _true_arm(base.arms.left, apparatus.arms.left),
+                    "right": _true_arm(base.arms.right, apparatus.arms.right),
+                }
+            ),
+            "sheet": base.sheet.model_copy(
+                update={
+                    "young_modulus_pa": base.sheet.young_modulus_pa * sheet.modulus_ratio,
+                    "thickness_m": base.sheet.thickness_m * sheet.thickness_ratio,
+                    "width_m": base.sheet.width_m + sheet.slack_width_offset_m + slip_m,
+                }
+            ),
+            "finger": base.finger.model_copy(
+                update={"radius_m": base.finger.radius_m + apparatus.finger.radius_offset_m}
+            ),
+            "eyes": base.eyes.model_copy(
+                update={
+                    "centre_world_m": base.eyes.centre_world_m + np.array(eyes.centre_offset_m),
+                    "interocular_m": base.eyes.interocular_m + eyes.interocular_offset_m,
+                }
+            ),
+            "projector": base.projector.model_copy(
+                update={
+                    "lens": _true_lens(base.projector.lens, projector.lens),
+                    "world_from_projector": _shifted_pose(
+                        base.projector.world_from_projector,
+                        projector.position_offset_m,
+                        projector.rotation_offset_rad,
+                    ),
+                }
+            ),
+        }
+    )
+
+
+def _true_camera(camera: StereoCamera, apparatus: Apparatus) -> StereoCamera:
+    truth = apparatus.camera
+    right = camera.right_from_left
+    turn, shift = truth.right_rotation_offset_rad, truth.right_position_offset_m
+    if any((*turn, *shift)):
+        # A camera that moves by a shift sees everything move by its inverse.
+        right = transform(rotation_from_vector(turn), -np.array(shift)) @ right
+    return camera.model_copy(
+        update={
+            "left": _true_lens(camera.left, truth.left),
+            "right": _true_lens(camera.right, truth.right),
+            "right_from_left": right,
+            "world_from_left": _shifted_pose(
+                camera.world_from_left, truth.position_offset_m, truth.rotation_offset_rad
+            ),
+            "rate_hz": camera.rate_hz if truth.rate_hz is None else truth.rate_hz,
+        }
+    )
+
+
+def _true_lens(lens: Lens, truth: LensTruth) -> Lens:
+    k1, k2, *others = lens.distortion
+    return lens.model_copy(
+        update={
+            "fx_px": lens.fx_px * truth.focal_ratio,
+            "fy_px": lens.fy_px * truth.focal_ratio,
+            "cx_px": lens.cx_px + truth.centre_offset_px[0],
+            "cy_px": lens.cy_px + truth.centre_offset_px[1],
+            "distortion": (k1 + truth.radial_offset[0], k2 + truth.radial_offset[1], *others),
+        }
+    )
+
+
+def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
+    return arm.model_copy(
+        update={
+            "world_from_base": _shifted_pose(
+                arm.world_from_base, truth.base_position_offset_m, truth.base_rotation_offset_rad
+            ),
+            "flange_from_edge": _shifted_pose(
+                arm.flange_from_edge, truth.edge_position_offset_m, truth.edge_rotation_offset_rad
+            ),
+        }
+    )
+
+
+def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
+    """Return a pose moved in its outer frame and turned about its own origin.
+
+    Without a rotation the angles keep all digits.
+    """
+    rpy_rad = pose.rpy_rad
+    if any(rotation_rad):
+        turned = rotation_from_vector(rotation_rad) @ rotation_from_rpy(rpy_rad)
+        rpy_rad = rpy_from_rotation(turned)
+    return Pose(position_m=pose.position_m + np.array(shift_m), rpy_rad=rpy_rad)
+
+
+def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
+    """Return what is impossible of an apparatus in its scene: (key, value, what, remedy)."""
+    base = apparatus.nominal or scene
+    found: list[tuple[tuple[str, ...], Any, str, str]] = []
+    radius_m = base.finger.radius_m + apparatus.finger.radius_offset_m
+    if radius_m <= 0.0:
+        found.append(
+            (("finger", "radius_offset_m"), apparatus.finger.radius_offset_m,
+             f"makes the radius {radius_m:g} m", "give more than minus the scene's radius")
+        )  # fmt: skip
+    width_m = base.sheet.width_m + apparatus.sheet.slack_width_offset_m
+    if width_m <= 0.0:
+        found.append(
+            (("sheet", "slack_width_offset_m"), apparatus.sheet.slack_width_offset_m,
+             f"makes the width {width_m:g} m", "give more than minus the scene's width")
+        )  # fmt: skip
+    if base.eyes.interocular_m + apparatus.eyes.interocular_offset_m < 0.0:
+        found.append(
+            (("eyes", "interocular_offset_m"), apparatus.eyes.interocular_offset_m,
+             "makes the distance of the eyes negative", "give at least minus the scene's distance")
+        )  # fmt: skip
+    hand = apparatus.finger
+    given = [hand.hand_mass_kg, hand.hand_damping_ns_per_m, hand.hand_stiffness_n_per_m]
+    if any(one is None for one in given) and any(one is not None for one in given):
+        found.append(
+            (("finger", "hand_mass_kg"), hand.hand_mass_kg,
+             "mass, damping and stiffness of the hand belong together", "give all three or none")
+        )  # fmt: skip
+    if hand.tremor_frequency_hz <= 0.5 * hand.tremor_width_hz:
+        found.append(
+            (("finger", "tremor_width_hz"), hand.tremor_width_hz,
+             "makes the band begin below 0 Hz", "give less than twice tremor_frequency_hz")
+        )  # fmt: skip
+    return found
