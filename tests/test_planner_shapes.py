@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -37,6 +37,7 @@ from flexsheet.nodes.planner.contact_state import (
     UnpresentableError,
 )
 from flexsheet.nodes.planner.trajectory import PlannedStep
+from tests.examples import examples
 from tests.plans import STEP_S, STILL, Desk, scene_with
 
 Floats = NDArray[np.float64]
@@ -337,7 +338,7 @@ moves = st.lists(
 
 @pytest.mark.parametrize("name", ANYWHERE)
 @given(moves=moves)
-@settings(max_examples=8, deadline=None)
+@examples(4)
 def test_no_transition_is_a_step_wherever_the_finger_goes(
     name: str, moves: list[tuple[tuple[float, float, float], int, str]]
 ) -> None:

@@ -35,8 +35,6 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 from tests.node_harness import NodeHarness
 from tests.waiting import DEADLINE_S
 
-pytestmark = pytest.mark.alone
-
 ROOT = Path(__file__).resolve().parent.parent
 
 
