@@ -318,6 +318,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.alone
 def test_a_reader_that_is_behind_outlives_its_writer(runs_root: Path) -> None:
     """libzmq's heartbeat once aborted the recorder when the camera ended before it."""
     done = subprocess.run(
