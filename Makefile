@@ -6,11 +6,13 @@ STAMP := $(VENV)/.installed
 DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
+# Of the tests: one more than cores, because some tests wait for other processes.
+WORKERS = $$(($$(nproc) + 1))
 SKIPPED := $(CURDIR)/build/skipped.txt
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test lint cached bench bench-peers faults deploy-trial soak fuzz limits pages charts \
+.PHONY: setup demo try test test-long lint cached bench bench-peers faults deploy-trial soak fuzz limits pages charts \
 	docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
@@ -71,11 +73,23 @@ test: $(DEV_STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint cached
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
-	$(BIN)/pytest -m "not alone" --durations=25 --numprocesses auto --dist worksteal || status=$$?; \
-	$(BIN)/pytest -m alone --durations=15 $$(grep -l mark.alone tests/test_*.py) || status=$$?; \
+	$(BIN)/pytest -m "not alone and not long" --durations=25 --numprocesses $(WORKERS) --dist worksteal \
+		|| status=$$?; \
+	$(BIN)/pytest -m "alone and not long" --durations=15 $$(grep -l mark.alone tests/test_*.py) \
+		|| status=$$?; \
 	{ set +x; } 2> /dev/null; \
 	if [ -s $(SKIPPED) ]; then echo "skipped tests:"; sort $(SKIPPED) | uniq -c; \
 	else echo "no test was skipped"; fi; \
+	exit $$status
+
+# What is too long for `make test`: studies, and property tests with more examples, drawn at
+# random.
+test-long: $(DEV_STAMP) cached
+	@status=0; \
+	export OPENBLAS_NUM_THREADS=1; set -x; \
+	$(BIN)/pytest -m long --durations=15 || status=$$?; \
+	$(BIN)/pytest -m "not alone and not long" --hypothesis-profile long --timeout=3600 \
+		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
 # Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tests.shared import FOLDER_VARIABLE
 
 # Node processes import test nodes ("tests.launch_nodes:Beacon") from the repository's root.
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,13 +22,31 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 # each run, so that a failure is due to a change: `--hypothesis-profile random` draws others.
 settings.register_profile("fixed", deadline=None, derandomize=True, database=None)
 settings.register_profile("random", deadline=None, print_blob=True)
+settings.register_profile("long", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("fixed")
 
-LONGEST = ("test_three_hosts", "test_console_page", "test_console_browser")
+LONGEST = (
+    "test_three_hosts",
+    "test_console_page",
+    "test_console_browser",
+    "test_graph_interrupted",
+)
 """Files with the longest tests, which begin first: none is then left for the end."""
 
 SKIPPED_FILE = "SKIPPED_FILE"
 """Environment variable: the file that gets a line for each skipped test.  `make test` prints it."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Create the folder that the processes of this run share, for `tests/shared.py`."""
+    if not hasattr(config, "workerinput"):
+        os.environ[FOLDER_VARIABLE] = tempfile.mkdtemp(prefix="flexsheet-tests-")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove that folder."""
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ.pop(FOLDER_VARIABLE))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,4 +1,4 @@
-"""Dent shapes for tests: fewer nodes than the renderer's, over less, solved once."""
+"""Dent shapes for tests: fewer nodes than the renderer's, over less, solved once per run."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from flexsheet.nodes.models.sheet.indentation import (
     solve_indentation_basis,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
+from tests.shared import compute_once
 
 RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
 RADIUS_M = 0.007
@@ -28,4 +29,7 @@ def few_dents() -> IndentationBasis:
         depth_nodes=6,
         element_cells=ELEMENT_CELLS,
     )
-    return solve_indentation_basis(RUBBER, within=within, finger_radius_m=RADIUS_M)
+    return compute_once(
+        "few_dents",
+        lambda: solve_indentation_basis(RUBBER, within=within, finger_radius_m=RADIUS_M),
+    )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
@@ -20,6 +20,7 @@ from flexsheet.nodes.arm_bridge.goal import Goal
 from flexsheet.nodes.arm_bridge.link import ArmFault, ArmStatus, Floats
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
+from tests.examples import examples
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
 from tests.test_arm_loop import SCENE_FILE
 
@@ -200,7 +201,7 @@ def test_told_to_stand_down_both_stop_and_let_go() -> None:
 EVENTS = ("no target", "silent", "lost", "watchdog", "estop", "reset", "fault", "go", "well")
 
 
-@settings(max_examples=20, deadline=None)
+@examples(8)
 @given(st.lists(st.sampled_from(EVENTS), min_size=1, max_size=12))
 def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list[str]) -> None:
     """Once at rest with a slack sheet or isolated, it rests until it is armed."""

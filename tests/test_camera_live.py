@@ -35,8 +35,6 @@ from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import MAX_IMPLAUSIBLE, SLACK, Pairing, StampCheck
 from tests.waiting import DEADLINE_S
 
-pytestmark = pytest.mark.alone
-
 MS = 1_000_000
 PERIOD_NS = round(1e9 / 60)
 PAIR = {"kind": "opencv", "left": 0, "right": 2}
@@ -389,8 +387,8 @@ async def test_a_camera_is_unplugged_and_comes_back(
         assert all(capture.released.is_set() for capture in right.captures)
         tried = len(left.captures)
         await bench.until(lambda: len(left.captures) > tried)
-        right.plugged = True
         opened = len(right.captures)
+        right.plugged = True
         await bench.until(lambda: len(right.captures) > opened)
         left.shoot(10 * PERIOD_NS, number=3)
         right.shoot(10 * PERIOD_NS, number=3, side=1)
@@ -399,6 +397,7 @@ async def test_a_camera_is_unplugged_and_comes_back(
         bag.empty()
 
 
+@pytest.mark.alone
 def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
@@ -417,6 +416,7 @@ def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
         assert right.captures[0].released.wait(DEADLINE_S)
 
 
+@pytest.mark.alone
 def test_two_cameras_that_never_meet_are_told_of(
     bag: CameraBag,
     cameras: tuple[FakeCamera, FakeCamera],

@@ -53,6 +53,7 @@ from flexsheet.nodes.fem_solver.mesh.quality import (
 from flexsheet.nodes.fem_solver.mesh.smoothing import _distortion
 from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
 from flexsheet.nodes.models.shapes import make_shape
+from tests.examples import examples
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -347,7 +348,7 @@ def test_a_key_stands_for_all_that_a_mesh_depends_on() -> None:
     rpy=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
     shape=st.sampled_from(["sphere", "ellipsoid", "rounded_box"]),
 )
-@settings(max_examples=15, deadline=None)
+@examples(6)
 def test_any_measures_and_any_side_to_the_user_give_a_sound_mesh(
     sizes: tuple[float, float, float],
     rounding: float,

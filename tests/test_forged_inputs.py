@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -31,6 +31,7 @@ from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S, forward
+from tests.examples import examples
 from tests.fingertips import fingertip
 from tests.test_arm_loop import paper_scene
 from tests.test_faults_storm import MAX_LENGTH_M, SIDES, Bench
@@ -131,10 +132,18 @@ class ForgedBench(Bench):
         length_m = edge_distance_m({side: servo.joints_rad for side, servo in servos.items()})
         self.max_length_m = max(self.max_length_m, length_m)
 
-    async def point(self, seconds: float, tip: Callable[[], tuple[Fingertip, Header]]) -> None:
+    async def point(
+        self,
+        seconds: float,
+        tip: Callable[[], tuple[Fingertip, Header]],
+        *,
+        at_most_until: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Let time pass while the planner gets these fingertips."""
         begin_ns, told = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
+            if at_most_until():
+                return
             if passed_s * FINGER_HZ >= told:
                 told += 1
                 await self.planner.step("fingertip", *tip())
@@ -229,7 +238,7 @@ def run_bench(test: Callable[[ForgedBench], Awaitable[None]]) -> None:
 seeds = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=5, deadline=None)
+@examples(3)
 @given(kinds=st.lists(st.sampled_from(FINGERTIPS), min_size=1, max_size=4), seed=seeds)
 def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: int) -> None:
     async def test(bench: ForgedBench) -> None:
@@ -330,7 +339,7 @@ def forger(
     return forge
 
 
-@settings(max_examples=5, deadline=None)
+@examples(3)
 @example(kinds=["not rigid"], seed=0, share=0.05)
 @given(
     kinds=st.lists(st.sampled_from([*STATES, "future"]), min_size=1, max_size=3),
@@ -371,7 +380,7 @@ def test_an_invalid_state_of_the_other_arm_stops_and_is_named(kind: str, words: 
             assert bench.states[side][-1].mode in STOPPED
             assert words in bench.states[side][-1].reason
         bench.forge_state = None
-        await bench.point(1.5, bench.honest)
+        await bench.point(1.5, bench.honest, at_most_until=lambda: bench.modes() == {"follow"})
         assert bench.modes() == {"follow"}
         bench.assert_within_limits()
 

@@ -174,12 +174,12 @@ def test_the_errors_are_within_the_stated_uncertainty(
 
 def test_the_arms_own_error_is_told_from_the_cameras() -> None:
     place = Workplace(7)
-    fit = calibrate_base(place.detections(40, noise_px=0.05, joint_noise_rad=1e-3), RIG)
+    fit = calibrate_base(place.detections(25, noise_px=0.05, joint_noise_rad=1e-3), RIG)
     # Three wrist joints and what the others add: somewhat more than one joint's deviation.
     assert 0.8e-3 < fit.arm_sigma_rad < 2.5e-3
     assert 1e-4 < fit.arm_sigma_m < 1e-3
     assert fit.corner_sigma_px == pytest.approx(0.05, rel=0.1)
-    quiet = calibrate_base(Workplace(7).detections(40, noise_px=0.05), RIG)
+    quiet = calibrate_base(Workplace(7).detections(25, noise_px=0.05), RIG)
     assert quiet.arm_sigma_rad < 1e-4
     assert quiet.std_at(np.zeros(3))[0] < 0.2 * fit.std_at(np.zeros(3))[0]
 
@@ -187,7 +187,7 @@ def test_the_arms_own_error_is_told_from_the_cameras() -> None:
 def test_more_places_make_it_more_certain() -> None:
     few, many = (
         calibrate_base(Workplace(3).detections(n, noise_px=0.1, joint_noise_rad=5e-4), RIG)
-        for n in (8, 40)
+        for n in (8, 30)
     )
     assert many.std_at(np.zeros(3))[0] < 0.6 * few.std_at(np.zeros(3))[0]
 

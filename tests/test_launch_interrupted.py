@@ -54,7 +54,10 @@ def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
         shutil.rmtree(folder)
 
 
-FRACTIONS = [*(0.1 * i for i in range(1, 11)), None]
+FRACTIONS = [
+    *(pytest.param(0.1 * i, marks=pytest.mark.long if i % 2 else ()) for i in range(1, 11)),
+    None,
+]
 
 
 @pytest.mark.parametrize("fraction", FRACTIONS)

@@ -32,10 +32,11 @@ from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
 from tests.waiting import DEADLINE_S, wait_until
 
-pytestmark = pytest.mark.alone
-
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, "-m", "flexsheet"]
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+HOSTS = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 
 
 @pytest.fixture(autouse=True)
@@ -201,8 +202,12 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
     assert_nothing_left(runs_root)
 
 
-async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: Path) -> None:
+@pytest.mark.alone
+async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One stands still as a whole, the loop of the other does not turn; the third is well."""
+    monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)  # of the deaf node, at the end
     quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
     plan = plan_of(
         tmp_path,
@@ -229,6 +234,7 @@ def any_has(lines: list[str], words: str) -> bool:
     return any(words in line for line in lines)
 
 
+@pytest.mark.alone
 async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,6 +299,7 @@ def test_what_counts_as_starved_in_half_a_second(
     assert compute_starved_s(earlier, later, 0.5) == pytest.approx(starved)
 
 
+@pytest.mark.alone
 async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
     async with RunningGraph(plan) as graph:
@@ -348,11 +355,10 @@ async def test_a_port_in_use_is_named_before_anything_starts(
     tmp_path: Path, runs_root: Path
 ) -> None:
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
-    hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
-    plan = load_graph(write(tmp_path, nodes, hosts=hosts))
+    plan = load_graph(write(tmp_path, nodes, hosts=HOSTS))
     endpoint = plan.writers["twin/finger"][0].tcp
     assert endpoint is not None
-    with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
+    with socket.create_server((HOSTS["left"]["address"], int(endpoint.rpartition(":")[2]))):
         with pytest.raises(BadInputError, match="stop the other program"):
             await RunningGraph(plan).__aenter__()
         # The other host's launcher does not bind it.
@@ -368,8 +374,7 @@ def heard_estop(bag: Path) -> bool:
 
 async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None:
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
-    hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
-    plan = load_graph(write(tmp_path, nodes, hosts=hosts), record=tmp_path / "a.mcap")
+    plan = load_graph(write(tmp_path, nodes, hosts=HOSTS), record=tmp_path / "a.mcap")
     async with RunningGraph(plan, host="main") as main:
         await main.wait_ready(DEADLINE_S)
         async with RunningGraph(plan, host="left") as left:
@@ -485,9 +490,14 @@ def test_an_interrupt_that_is_ignored_by_inheritance_ends_a_graph(
     assert_nothing_left(runs_root)
 
 
+@pytest.mark.alone
 def test_a_killed_launcher_leaves_no_node_behind(
-    tmp_path: Path, runs_root: Path, started: list[subprocess.Popen[str]]
+    tmp_path: Path,
+    runs_root: Path,
+    started: list[subprocess.Popen[str]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(runs, "ORPHAN_GRACE_S", 0.2)
     nodes = {
         "beacon": beacon(parameters={"with_child": True}),
         "listener": LISTENER,
@@ -511,6 +521,7 @@ def test_a_killed_launcher_leaves_no_node_behind(
     assert_nothing_left(runs_root)
 
 
+@pytest.mark.alone
 def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
     """An orphan that neither signal nor lifeline reached; a live launcher's; one without a tag."""
     dead = subprocess.Popen([sys.executable, "-c", ""])

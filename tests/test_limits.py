@@ -24,6 +24,7 @@ from flexsheet.messages.limits import LimitedModel, find_max_magnitude
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import NodeParameters, find_parameters_type
+from tests.examples import examples
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted((ROOT / "launch" / "scenes").glob("*.yaml"))
@@ -73,14 +74,11 @@ ABSURD = st.one_of(
     st.floats(min_value=1e20),
     st.floats(max_value=-1e20),
 )
-quick = settings(
-    max_examples=60,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+UNUSUAL = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+quick = settings(max_examples=60, suppress_health_check=UNUSUAL)
 
 
-@quick
+@settings(examples(25), suppress_health_check=UNUSUAL)
 @given(where=st.sampled_from(SCENE_NUMBERS), value=ABSURD)
 def test_an_absurd_number_in_a_scene_is_refused_by_its_key(
     tmp_path: Path, where: tuple[str, Key], value: float

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -29,7 +29,7 @@ from flexsheet.nodes.models.shapes import (
     SmoothMeshShape,
     make_shape,
 )
-from flexsheet.nodes.planner import contact_state
+from flexsheet.nodes.planner import contact_state, trajectory
 from flexsheet.nodes.planner.contact_state import (
     ContactCommand,
     ContactLimits,
@@ -37,7 +37,9 @@ from flexsheet.nodes.planner.contact_state import (
     UnpresentableError,
 )
 from flexsheet.nodes.planner.trajectory import PlannedStep
+from tests.examples import examples
 from tests.plans import STEP_S, STILL, Desk, scene_with
+from tests.shared import compute_once
 
 Floats = NDArray[np.float64]
 LIVER = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "mesh" / "liver.obj"
@@ -141,11 +143,14 @@ DOME_UP = (0.5 * math.pi, 0.0, 0.0)
 def desk_about(name: str) -> tuple[Desk, Shape]:
     geometry = SOLIDS[name] if name in SOLIDS else MESHES[name]()
     rpy_rad = DOME_UP if name == "liver" else (0.0, 0.0, 0.0)
-    return Desk(scene_with(geometry, rpy_rad=rpy_rad)), make_shape(geometry)
+    shape = compute_once(f"shape-{name}", lambda: make_shape(geometry))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trajectory, "make_shape", lambda _: shape)
+        return Desk(scene_with(geometry, rpy_rad=rpy_rad)), shape
 
 
 def fresh(name: str) -> tuple[Desk, Shape]:
-    """A desk as new, and the shape: a mesh's is made once, which takes a second."""
+    """A desk as new, and the shape: a mesh's is made once per run, which takes a second."""
     desk, shape = desk_about(name)
     new = copy.copy(desk)
     new.plan, new.seen = copy.copy(desk.plan), []
@@ -337,7 +342,7 @@ moves = st.lists(
 
 @pytest.mark.parametrize("name", ANYWHERE)
 @given(moves=moves)
-@settings(max_examples=8, deadline=None)
+@examples(8)
 def test_no_transition_is_a_step_wherever_the_finger_goes(
     name: str, moves: list[tuple[tuple[float, float, float], int, str]]
 ) -> None:

@@ -35,8 +35,6 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 from tests.node_harness import NodeHarness
 from tests.waiting import DEADLINE_S
 
-pytestmark = pytest.mark.alone
-
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -320,6 +318,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.alone
 def test_a_reader_that_is_behind_outlives_its_writer(runs_root: Path) -> None:
     """libzmq's heartbeat once aborted the recorder when the camera ended before it."""
     done = subprocess.run(

@@ -18,7 +18,7 @@ import pytest
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, Lab
-from tests.lab_bags import Span, gaps, held, read_arm, wanted
+from tests.lab_bags import Arm, Span, gaps, held, read_arm, wanted
 from tests.waiting import DEADLINE_S
 
 SIDES = ("left", "right")
@@ -65,21 +65,26 @@ def judge_words(lab: Lab) -> None:
     assert {fault for fault in said if not fault.startswith("e-stop")} == set()
 
 
+def judge_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
+    """An arm's true joints: it turned the sheet with the finger while it followed, and stood
+    whenever it said so."""
+    assert np.isfinite(arm.joints_rad).all()
+    assert arm.fastest() <= 1.0
+    assert not arm.leaves_range()
+    assert max(map(arm.turned_rad, arm.spans("follow"))) > TURNED_RAD
+    for mode in stood_modes:
+        stood = [(begin + STOPPED_NS, end) for begin, end in arm.spans(mode)]
+        assert any(len(arm.between(span)) > 50 for span in stood)
+        assert all(arm.turned_rad(span) < STANDS_RAD for span in stood)
+
+
 def judge_bags(lab: Lab, troubles: Troubles) -> None:
     """The same by the arms' true joints, and by what came of the strokes."""
     scene = lab.plan().scene_message()
     assert scene is not None
     arms = read_arm(lab.folder, "left", scene), read_arm(lab.folder, "right", scene)
     for arm in arms:
-        assert np.isfinite(arm.joints_rad).all()
-        assert arm.fastest() <= 1.0
-        assert not arm.leaves_range()
-        # It turned the sheet with the finger while it followed, and stood whenever it said so.
-        assert max(map(arm.turned_rad, arm.spans("follow"))) > TURNED_RAD
-        for mode in ("idle", "estop"):
-            stood = [(begin + STOPPED_NS, end) for begin, end in arm.spans(mode)]
-            assert any(len(arm.between(span)) > 50 for span in stood)
-            assert all(arm.turned_rad(span) < STANDS_RAD for span in stood)
+        judge_arm(arm, ("idle", "estop"))
     lossy = troubles.spans["loss and jitter"]
     sheet = held(arms, wanted(lab.folder), lossy)
     assert sheet.followed > 0.5
@@ -106,6 +111,23 @@ async def next_states(lab: Lab, side: str, count: int) -> list[ArmState]:
     return found()
 
 
+async def test_arms_that_stroke_stop_at_a_cut_cable_and_move_when_told_so() -> None:
+    """One failure; the next test adds a bad network, killed nodes, the doctor and killed hosts."""
+    async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
+        await lab.start_all()
+        lab.stroke()
+        await lab.until(lambda: lab.modes() == {"idle"}, "both arms to stand")
+        await told_to_move(lab)
+        await a_cable_is_cut(lab)
+        judge_words(lab)
+        scene = lab.plan().scene_message()
+        assert scene is not None
+        await end_launchers(lab)
+        for side in SIDES:
+            judge_arm(read_arm(lab.folder, side, scene), ("idle",))
+
+
+@pytest.mark.long
 async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> None:
     troubles = Troubles()
     async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
@@ -128,11 +150,15 @@ async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> 
         await the_doctor_asks_all(lab)
         with troubles.trouble("all launchers killed"):
             await a_stop_outlives_all_launchers(lab)
-        for host in HOSTS:
-            lab.launchers[host].send_signal(signal.SIGINT)
-        codes = [await asyncio.to_thread(lab.launchers[host].wait, DEADLINE_S) for host in HOSTS]
-        assert codes == [0, 0, 0]
+        await end_launchers(lab)
         judge_bags(lab, troubles)
+
+
+async def end_launchers(lab: Lab) -> None:
+    for host in HOSTS:
+        lab.launchers[host].send_signal(signal.SIGINT)
+    codes = [await asyncio.to_thread(lab.launchers[host].wait, DEADLINE_S) for host in HOSTS]
+    assert codes == [0, 0, 0]
 
 
 async def last_weeks_plan_is_refused(lab: Lab) -> None:

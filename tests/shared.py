@@ -1,0 +1,34 @@
+"""Results that are expensive to compute: once per run of the tests, for all its processes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
+
+FOLDER_VARIABLE = "FLEXSHEET_TESTS_SHARED"
+"""Environment variable: the folder of this run's results.  `tests/conftest.py` sets it."""
+
+
+def compute_once(name: str, compute: Callable[[], T]) -> T:
+    """Return what `compute` returns, from the process of this run that computed it first.
+
+    name: of the result; the same name must mean the same computation.
+    """
+    folder = os.environ.get(FOLDER_VARIABLE)
+    if folder is None:
+        return compute()
+    path = Path(folder, f"{name}.pickle")
+    with Path(folder, f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.exists():
+            result: T = pickle.loads(path.read_bytes())
+            return result
+        result = compute()
+        path.write_bytes(pickle.dumps(result))
+        return result
