@@ -152,6 +152,7 @@ async def stop_and_reset(lab: Lab, host: str, span: Span) -> None:
 
 async def refuse_writing(lab: Lab, seconds: float, span: Span) -> None:
     """Make each write of the main recorder fail, as with a full disk."""
+    await lab.until(lambda: lab.restarts("main", "recorder") >= 0, "the recorder to be ready")
     process = lab.pid_of("main", "recorder")
     before = len(bags(lab.folder, "main"))
     _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
@@ -159,7 +160,10 @@ async def refuse_writing(lab: Lab, seconds: float, span: Span) -> None:
     resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
     # The recorder notices at its next write, at the latest after a flush period.
     await asyncio.sleep(max(seconds, 2.0 * FLUSH_PERIOD_S))
-    resource.prlimit(process, resource.RLIMIT_FSIZE, (hard, hard))
+    try:
+        resource.prlimit(process, resource.RLIMIT_FSIZE, (hard, hard))
+    except ProcessLookupError as error:
+        raise AssertionError("the recorder ended while its disk was full") from error
     span.end()
     await lab.until(lambda: len(bags(lab.folder, "main")) > before, "the next bag")
     newest = bags(lab.folder, "main")[-1]
