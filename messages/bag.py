@@ -418,7 +418,7 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """The recorded topics and the names of their types."""
+        """Return the names of the recorded topics and of their types."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
@@ -558,7 +558,7 @@ class BagReader:
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks of a truncated bag whose channels or message times are unknown.
 
-        The message indexes after the last chunk may be truncated.  A damaged chunk is kept, and
+        The message indexes after the last chunk may be truncated.  A damaged chunk
         raises an error when its messages are read.
         """
         for chunk in self.chunks:

@@ -48,7 +48,7 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return what converts a stamp near `at_ns` to the local clock by addition; None: unknown.
+        """Return the shift of a stamp near `at_ns` to the local clock, ns; None: unknown.
 
         at_ns: publication time of the message on that clock.  One shift for all stamps of a message
         preserves their differences.

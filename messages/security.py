@@ -3,7 +3,7 @@
 Every host has one CURVE key pair.  The secret key is in a file that only its owner may read; the
 public keys of all hosts are in the launch file.  A bound socket accepts only the keys of hosts of
 the plan; ZeroMQ requests that decision by ZAP, in the event loop.  A connecting socket requires the
-key of one host.  Each end of a connection therefore knows the host of the other end.
+key of one host.  Each end of a connection can therefore identify the host of the other end.
 
 Keys are written in Z85, 40 characters.
 """

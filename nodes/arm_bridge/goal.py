@@ -44,7 +44,7 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the target by `ahead_s` (of either sign), at most by `max_extrapolation_s`.
+    """Extrapolate the target by `ahead_s` (positive or negative), limited to `max_extrapolation_s`.
 
     overdue_s: time since the next target was due.  A target that needs a longer extrapolation is
     overdue by the rest, whenever it has arrived.  So is one too far in the future, whose clock

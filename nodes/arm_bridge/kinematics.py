@@ -3,7 +3,7 @@
 Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.
 
 The chain follows two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube
-`mrv1a.urdf`).  At zero the arm stands upright, and every frame is parallel to the base.  J1, J4, J6
+`mrv1a.urdf`).  At zero the arm is upright, and every frame is parallel to the base.  J1, J4, J6
 rotate about z; J2, J3, J5 about y.  Shoulder height 300 mm, upper arm 250 mm, elbow shift 90 mm
 backwards, forearm 160 mm, flange 72 mm beyond the wrist centre.
 """
@@ -95,7 +95,7 @@ BRANCHES = tuple(
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """No joint angles within the ranges give the flange pose.
+    """A flange pose without joint angles within the ranges.
 
     limit: "reach", or the joint that the nearest branch has out of range.
     """
@@ -139,7 +139,7 @@ def forward(joints_rad: ArrayLike) -> Floats:
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
     """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
 
-    The order is that of `BRANCHES`.  A joint that a singularity leaves free is taken from
+    The order is that of `BRANCHES`.  A joint that a singularity leaves undefined equals that of
     `present_rad` (6,).  Angles are within a revolution of zero.  The list is empty when the wrist
     centre is too far or too near.
     """

@@ -145,7 +145,7 @@ class ArmLink(Protocol):
     """Interface for the exchange of commands and answers with one arm, one exchange at a time.
 
     Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
-    joints), `hold` and `stop` (stay).
+    joints), `hold` and `stop` (no motion).
     """
 
     def due(self, now_ns: int) -> bool:

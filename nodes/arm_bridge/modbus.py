@@ -1,7 +1,7 @@
 """Exchange commands by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
 
 `COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
-docs/modbus.md from them.  Numbers of 32 bits take two registers, high word first.  The
+docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one first.  The
 CRC-32 (zlib's) covers every register before it in its block, high byte first.
 """
 
@@ -139,7 +139,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 
 
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
-    """Decode a status block; raises ArmAnswerError with what is wrong."""
+    """Decode a status block; raises ArmAnswerError if it is invalid."""
     if len(registers) != _STATUS_REGISTERS:
         raise ArmAnswerError(f"status of {len(registers)} registers, expected {_STATUS_REGISTERS}")
     whole = struct.pack(f">{len(registers)}H", *registers)
@@ -201,7 +201,7 @@ class ModbusLink:
     """`ArmLink` by one Modbus TCP connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
-    hand a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
+    pass a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
     connection reopens at once after a first failure, then after pauses that double up to
     `max_pause_s`.
     """

@@ -151,7 +151,7 @@ def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
-    """Decode an answer; raises ArmAnswerError with what is wrong."""
+    """Decode an answer; raises ArmAnswerError if it is invalid."""
     if len(packet) != PACKET_BYTES:
         raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
     command, send_type, receive_type, *data, _, _, _, _, _, _, _, timeouts, count = _PACKET.unpack(
@@ -208,7 +208,7 @@ class MxtLink:
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
         """Send one command and return the status that answers it; raises ArmLinkError.
 
-        The controller answers in its own cycle, so this takes up to CONTROLLER_CYCLE_S.
+        The controller answers in its own cycle, after up to CONTROLLER_CYCLE_S.
         """
         if mode == "idle":
             self._count, self._unanswered = None, 0

@@ -1,7 +1,7 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
 Each bridge receives both arms' joints.  It simulates the sheet's motion and checks at each pose
-whether both arms are within their limits.  A check takes some milliseconds and therefore runs
+whether both arms are within their limits.  A check needs some milliseconds and therefore runs
 outside the cycle that sends commands.
 """
 
@@ -52,10 +52,10 @@ CORNER_EVERY = 4
 """Steps between two corners of the checked path; it deviates by less than 1 mm between them."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""Distance of a target from the checked one up to which the check still holds."""
+"""Distance of a target from the checked one up to which the check remains valid."""
 
 MAX_START_MOTION_RAD = 0.002
-"""Joint motion since the check up to which the check still holds."""
+"""Joint motion since the check up to which it remains valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Fractions of the path at which the arms may align to the sheet; the first feasible one is used.

@@ -366,7 +366,7 @@ def plan_path(
 
     The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If that
     is blocked, the path goes through start and goal shifted by one of the detours.  Raises
-    PathError with what blocks the straight path.
+    PathError with the limit that blocks the straight path.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None

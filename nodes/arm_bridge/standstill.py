@@ -1,4 +1,4 @@
-"""Detect that an arm stands still, from fresh and plausible measurements."""
+"""Detect the standstill of an arm from fresh and plausible measurements."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class StandstillMonitor:
         self._lowest_rad, self._highest_rad = np.full(6, np.inf), np.full(6, -np.inf)
 
     def is_standing(self, *, at_command: bool) -> bool:
-        """Return whether the arm stands still; at_command: whether at its last command."""
+        """Return whether the arm is at rest; at_command: whether it is at its last command."""
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
     @property

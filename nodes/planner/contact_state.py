@@ -39,7 +39,7 @@ MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
 """Limits of plausible fingers, in the object's frame."""
 
 MAX_TILT_RAD = 1.4
-"""Maximum tilt of the sheet, whatever the scene.  Two normals within it are never opposite, so
+"""Maximum tilt of the sheet in any scene.  Two normals within it are never opposite, so
 that the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
@@ -155,8 +155,8 @@ class ContactStateMachine:
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
         """Return the contact on the sheet at its current pose.
 
-        The finger touches a moving sheet at its current point and rotation; then the sheet neither
-        slips nor spins.
+        The finger touches a moving sheet at its current point and rotation; then the sheet
+        rolls without slip and spin.
         """
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
