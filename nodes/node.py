@@ -406,7 +406,7 @@ class Node:
         return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
-        """Call the method of one of `find_timers` the node."""
+        """Call the method of one timer."""
         if not self.opens_devices:
             self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
