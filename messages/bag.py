@@ -117,7 +117,9 @@ class BagWriter:
         try:
             self._file: IO[bytes] = self.path.open("xb")
         except FileExistsError:
-            raise BagError(f"{self.path}: exists already; bags are not overwritten") from None
+            raise BagError(
+                f"{self.path}: the file exists already; a bag cannot be overwritten"
+            ) from None
         except OSError as error:
             raise BagError(str(write_error(self.path, error))) from error
         self._writer: Any = Writer(  # mcap's types are incomplete
@@ -738,7 +740,9 @@ def recover(
                     messages += 1
             writer.finish()
     except FileExistsError:
-        raise BagError(f"{path_out}: exists already; bags are not overwritten") from None
+        raise BagError(
+            f"{path_out}: the file exists already; a bag cannot be overwritten"
+        ) from None
     except OSError as error:
         with suppress(OSError):
             path_out.unlink(missing_ok=True)
