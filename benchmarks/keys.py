@@ -31,7 +31,7 @@ from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, p
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
-from flexsheet.messages.security import KeyRing, new_key_pair, write_ring, write_secret
+from flexsheet.messages.security import KeyRing, make_key_pair, write_ring, write_secret
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.wire import encode, read_envelope
 
@@ -88,7 +88,7 @@ def ring_of_two(folder: Path) -> Iterator[KeyRing]:
     """Keys of two hosts; the other's ring is what children read."""
     public = {}
     for host in ("main", "left"):
-        public[host], secret = new_key_pair()
+        public[host], secret = make_key_pair()
         write_secret(folder / f"{host}.secret", secret)
     for host in public:
         write_ring(

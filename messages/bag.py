@@ -38,9 +38,9 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import write_error
+from flexsheet.messages.files import make_write_error
 from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, find_migration
 from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, find_topic
 from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
@@ -121,7 +121,7 @@ class BagWriter:
                 f"{self.path}: the file exists already; a bag cannot be overwritten"
             ) from None
         except OSError as error:
-            raise BagError(str(write_error(self.path, error))) from error
+            raise BagError(str(make_write_error(self.path, error))) from error
         self._writer: Any = Writer(  # mcap's types are incomplete
             self._file,
             chunk_size=CHUNK_BYTES,
@@ -182,7 +182,7 @@ class BagWriter:
             os.fsync(self._file.fileno())
         except OSError as error:
             self._failure = error
-            raise BagError(str(write_error(self.path, error))) from error
+            raise BagError(str(make_write_error(self.path, error))) from error
 
     def close(self) -> None:
         """Write the index and close the file; raises BagError if any data could not be written."""
@@ -201,7 +201,7 @@ class BagWriter:
             with suppress(OSError):
                 self._file.close()
         if self._failure is not None:
-            raise BagError(str(write_error(self.path, self._failure))) from self._failure
+            raise BagError(str(make_write_error(self.path, self._failure))) from self._failure
 
     def __enter__(self) -> BagWriter:
         return self
@@ -233,7 +233,7 @@ class BagWriter:
                 yield
             except OSError as error:
                 self._failure = error
-                raise BagError(str(write_error(self.path, error))) from error
+                raise BagError(str(make_write_error(self.path, error))) from error
 
     def _register(self, topic: Topic) -> int:
         kind = topic.message
@@ -246,7 +246,7 @@ class BagWriter:
             self._schemas[kind],
             {
                 "type": kind.__name__,
-                "fingerprint": schema_fingerprint(kind).hex(),
+                "fingerprint": compute_fingerprint(kind).hex(),
                 "delivery": topic.delivery.value,
             },
         )
@@ -746,7 +746,7 @@ def recover(
     except OSError as error:
         with suppress(OSError):
             path_out.unlink(missing_ok=True)
-        raise BagError(str(write_error(path_out, error))) from error
+        raise BagError(str(make_write_error(path_out, error))) from error
     if not BagReader(path_out).complete:
         raise BagError(f"{path_out}: the recovered bag cannot be read back; is the disk full?")
     return RecoverReport(

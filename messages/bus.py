@@ -115,7 +115,7 @@ class Counts(Protocol):
     rejected: int
 
 
-def queue_length(topic: Topic) -> int:
+def compute_queue_length(topic: Topic) -> int:
     """Return the length of the queue at each end of a connection.
 
     A full queue drops the newest message.  On `latest` topics the queue therefore lasts for half a
@@ -678,7 +678,7 @@ class _HostConnection:
 
 def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
     opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
-    length = queue_length(topic)
+    length = compute_queue_length(topic)
     options = {
         zmq.SNDHWM: length,
         zmq.RCVHWM: length,

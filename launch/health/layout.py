@@ -37,9 +37,9 @@ from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
+    compute_rolling_twist,
     make_tangent_contact,
     roll_contact,
-    rolling_twist,
 )
 
 Floats = NDArray[np.float64]
@@ -175,7 +175,10 @@ def touches(scene: Scene) -> list[Touch]:
                     world_from_sheet=world_from_object @ contact.object_from_sheet,
                     twists_world=np.array(
                         [
-                            turn @ rolling_twist(contact, scene.working_range.speed_m_per_s * way)
+                            turn
+                            @ compute_rolling_twist(
+                                contact, scene.working_range.speed_m_per_s * way
+                            )
                             for way in (contact.axes[:, 0], contact.axes[:, 1])
                         ]
                     ),

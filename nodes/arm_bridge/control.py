@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, scale_speeds, sync_factor
+from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, scale_speeds
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
@@ -41,7 +41,7 @@ from flexsheet.nodes.arm_bridge.path_check import (
 from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     StandstillMonitor,
-    edge_shift_m,
+    bound_edge_shift_m,
 )
 from flexsheet.nodes.arm_bridge.state_machine import (
     CHECKING_STATES,
@@ -532,7 +532,7 @@ class ArmControl:
         if is_late:
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
-            speed_factor = sync_factor(
+            speed_factor = compute_sync_factor(
                 geometry.world_from_edge(self.commanded_rad),
                 other.world_from_flange_commanded @ geometry.other_flange_from_edge,
                 goal.motion.world_from_sheet,
@@ -849,7 +849,7 @@ class ArmControl:
 
     def _is_at_command(self, measured: Floats) -> bool:
         """Return whether the arm is so near to its last command that it may restart there."""
-        return edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
+        return bound_edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))

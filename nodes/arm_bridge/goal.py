@@ -88,7 +88,9 @@ def make_goal(
     )
 
 
-def sync_factor(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) -> float:
+def compute_sync_factor(
+    own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool
+) -> float:
     """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
 
     own_edge, other_edge: world poses of the commanded edges; left: whether the own edge is the

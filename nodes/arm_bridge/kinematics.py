@@ -194,7 +194,7 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
     return np.array(nearest)
 
 
-def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
+def solve_next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     """Return joints (6,) rad for the next step of a motion, on the present branch without jumps.
 
     The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
@@ -348,7 +348,7 @@ def find_branch(joints_rad: ArrayLike) -> Branch:
     )
 
 
-def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
+def solve_joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
     """Return joints (n, 6) rad of flange poses (n, 4, 4) on one branch, in or out of range.
 
     NaN where the wrist centre is out of reach.  J4 and J6 are the nearest to `near_rad` (6,) of

@@ -29,6 +29,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
+    BlockField,
     CounterMonitor,
     propagate_cancellation,
     validate_joints,
@@ -41,46 +42,35 @@ VERSION = 1
 COMMAND_ADDRESS = 0
 STATUS_ADDRESS = 100
 
-
-@dataclass(frozen=True, slots=True)
-class RegisterField:
-    """Field of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
-
-    name: str
-    kind: str
-    count: int
-    about: str
-
-
 COMMAND = (
-    RegisterField("magic", "H", 1, "0x4653, the letters FS"),
-    RegisterField("version", "H", 1, "version of this map: 1"),
-    RegisterField(
+    BlockField("magic", "H", 1, "0x4653, the letters FS"),
+    BlockField("version", "H", 1, "version of this map: 1"),
+    BlockField(
         "sequence", "I", 1, "increases with every command; an `idle` command may restart it"
     ),
-    RegisterField("time_us", "I", 1, "time of the command, sender's clock, wraps after 71 minutes"),
-    RegisterField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
-    RegisterField("reserved", "H", 1, "0"),
-    RegisterField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
-    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    BlockField("time_us", "I", 1, "time of the command, sender's clock, wraps after 71 minutes"),
+    BlockField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
+    BlockField("reserved", "H", 1, "0"),
+    BlockField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
+    BlockField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 STATUS = (
-    RegisterField("magic", "H", 1, "0x4653"),
-    RegisterField("version", "H", 1, "version of this map: 1"),
-    RegisterField("accepted", "I", 1, "sequence of the last accepted command"),
-    RegisterField("cycle", "I", 1, "the controller's cycles since its start"),
-    RegisterField("time_us", "I", 1, "time of the joint measurement, controller's clock"),
-    RegisterField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
-    RegisterField(
+    BlockField("magic", "H", 1, "0x4653"),
+    BlockField("version", "H", 1, "version of this map: 1"),
+    BlockField("accepted", "I", 1, "sequence of the last accepted command"),
+    BlockField("cycle", "I", 1, "the controller's cycles since its start"),
+    BlockField("time_us", "I", 1, "time of the joint measurement, controller's clock"),
+    BlockField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
+    BlockField(
         "faults",
         "H",
         1,
         "bits: 1 joint out of range, 2 step too large, 4 not finite, 8 watchdog, 16 servo",
     ),
-    RegisterField("joints_rad", "f", 6, "measured J1 to J6"),
-    RegisterField("refused", "I", 1, "commands refused since the controller's start"),
-    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    BlockField("joints_rad", "f", 6, "measured J1 to J6"),
+    BlockField("refused", "I", 1, "commands refused since the controller's start"),
+    BlockField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 COMMAND_MODES = {"idle": 0, "move": 1, "hold": 2, "stop": 3}
@@ -94,21 +84,21 @@ FAULT_BITS = {
 }
 
 
-def struct_format(block: Sequence[RegisterField]) -> str:
+def make_struct_format(block: Sequence[BlockField]) -> str:
     """Return the struct format of a block, big-endian."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
-def register_count(block: Sequence[RegisterField]) -> int:
+def count_registers(block: Sequence[BlockField]) -> int:
     """Return the number of 16-bit registers of a block."""
-    return struct.calcsize(struct_format(block)) // 2
+    return struct.calcsize(make_struct_format(block)) // 2
 
 
 # Every failure is raised as ArmLinkError; the library's log would repeat it with hex dumps.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
-_COMMAND_FORMAT, _STATUS_FORMAT = struct_format(COMMAND), struct_format(STATUS)
-_STATUS_REGISTERS = register_count(STATUS)
+_COMMAND_FORMAT, _STATUS_FORMAT = make_struct_format(COMMAND), make_struct_format(STATUS)
+_STATUS_REGISTERS = count_registers(STATUS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from flexsheet.nodes.arm_bridge.reach import (
     plan_path_through,
     solve_step,
 )
-from flexsheet.nodes.arm_bridge.standstill import edge_shift_m
+from flexsheet.nodes.arm_bridge.standstill import bound_edge_shift_m
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
@@ -227,7 +227,7 @@ def _find_duration_s(begin: PathStep, there: PathStep) -> float:
         (begin.left_rad, there.left_rad),
         (begin.right_rad, there.right_rad),
     ):
-        travel_m = edge_shift_m(start, end)
+        travel_m = bound_edge_shift_m(start, end)
         change_rad = float(np.abs(end - start).max())
         duration_s = max(
             duration_s, travel_m / ALIGN_SPEED_M_PER_S, change_rad / ALIGN_SPEED_RAD_PER_S

@@ -41,7 +41,7 @@ ON_PATH_RAD = 0.005
 """Distance from the recently commanded joints within which any measurement is plausible."""
 
 
-def edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
+def bound_edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
     """Return an upper bound of the distance (m) of an edge between two sets of joints (6,) rad."""
     return float(JOINT_LEVER_M @ np.abs(joints_rad - other_rad))
 

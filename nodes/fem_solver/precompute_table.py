@@ -133,7 +133,7 @@ def code_version() -> str:
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
-def table_cache(spec: TableSpec) -> Specification[Table]:
+def make_table_cache(spec: TableSpec) -> Specification[Table]:
     """Describe the cache file of a nonlinear table."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
@@ -155,7 +155,7 @@ def compute_table(
     MemoryError, before anything is solved, if the machine has too little memory for so many
     workers. Other errors as `cached` and `solve_all`.
     """
-    entry = table_cache(spec)
+    entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
     return cached(
         entry,

@@ -511,7 +511,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
             f"{rendered.object_force_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; "
             f"{cause}; users notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
         )
-    uncertainty = force_uncertainty_ratio(rendered, position_error_m)
+    uncertainty = compute_force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
             f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
@@ -522,7 +522,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
     return ""
 
 
-def force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
+def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
     """Return the relative change of the force at maximum depth by an error of the position."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
@@ -536,7 +536,7 @@ class StretchChoice:
     note: str
 
 
-def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
+def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     """Return minimum and maximum stretch: the scene's, within the usable edge force."""
     at_max_force = stretch_for_edge_force(
         USABLE_FRACTION * sheet.max_edge_force_n,
@@ -554,7 +554,7 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
 
     It follows from the linear model, which ignores the object's curve and the fingertip.
     """
-    least, largest = stretch_range(sheet)
+    least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(
         edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
         young_modulus_pa=sheet.young_modulus_pa,

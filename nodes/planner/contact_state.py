@@ -15,12 +15,12 @@ from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, t
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
     compute_rim_lift_m,
+    compute_rolling_twist,
+    compute_tangent_twist,
     limit_tilt,
     make_tangent_contact,
     measure_spin_rad,
     roll_contact,
-    rolling_twist,
-    tangent_twist,
     transport_axes,
 )
 
@@ -141,7 +141,7 @@ class ContactStateMachine:
         twist = (
             np.zeros(6)
             if limited
-            else tangent_twist(self.contact, rate, self._home, limits.half_width_m)
+            else compute_tangent_twist(self.contact, rate, self._home, limits.half_width_m)
         )
         reason: SheetReason = (
             "beyond_tilt"
@@ -186,7 +186,7 @@ class ContactStateMachine:
             return self._hold(past or "beyond_tilt", depth)
         # Deep inside, where the nearest point is arbitrary, stay on the sheet's side.
         self._nearest_point = self.contact.point
-        twist = rolling_twist(self.contact, rate)
+        twist = compute_rolling_twist(self.contact, rate)
         return ContactCommand("contact", self._concavity_reason(), self.contact, twist, depth)
 
     def _blend_contact(

@@ -114,7 +114,7 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
     return SheetContact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
 
 
-def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
+def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
     Without spin the sheet rotates by n x dn; without slip its point in contact is at rest.
@@ -126,7 +126,9 @@ def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     return np.concatenate([cross(angular, to_centre), angular])
 
 
-def tangent_twist(contact: SheetContact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
+def compute_tangent_twist(
+    contact: SheetContact, rate: Floats, home: Floats, half_width_m: float
+) -> Floats:
     """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
 
     Its axes follow from `home` by the smallest rotation.  With h, the third axis of home, they
