@@ -37,9 +37,13 @@ from flexsheet.nodes.planner.compliance import (
     WEBER_RATIO_BARE,
     ObjectCurve,
     choose_stretch,
-    force_uncertainty_ratio,
+    compute_force_uncertainty_ratio,
 )
-from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber, membrane_table
+from flexsheet.nodes.planner.sheet_force import (
+    compute_membrane_table,
+    make_force_model,
+    make_rubber,
+)
 
 Floats = NDArray[np.float64]
 
@@ -132,7 +136,8 @@ def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
     def sure(modulus: float) -> bool:
         shown = compute_compliance(scene, law, curve_of(modulus), max_depth_m=max_depth_m)
         return (
-            force_uncertainty_ratio(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
+            compute_force_uncertainty_ratio(shown.centre, scene.tolerances.sheet_position_m)
+            <= WEBER_RATIO
         )
 
     def border(holds: Callable[[float], bool], inside: float, outside: float) -> float:
@@ -160,7 +165,7 @@ def main() -> None:
     law = make_force_model(scene.sheet)
     if asked.table:
         sheet = scene.sheet
-        law = membrane_table(
+        law = compute_membrane_table(
             make_rubber(sheet),
             stretches=np.linspace(sheet.min_stretch_ratio, sheet.max_stretch_ratio, 3),
             xs_m=sheet.width_m * np.array([0.0, 0.13, 0.25]),

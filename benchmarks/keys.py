@@ -32,7 +32,7 @@ from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, p
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
-from flexsheet.messages.security import KeyRing, new_key_pair, write_ring, write_secret
+from flexsheet.messages.security import KeyRing, make_key_pair, write_ring, write_secret
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.wire import encode, read_envelope
 
@@ -89,7 +89,7 @@ def create_two_rings(folder: Path) -> Iterator[KeyRing]:
     """Create the keys of two hosts; child processes read the other's ring."""
     public = {}
     for host in ("main", "left"):
-        public[host], secret = new_key_pair()
+        public[host], secret = make_key_pair()
         write_secret(folder / f"{host}.secret", secret)
     for host in public:
         write_ring(

@@ -125,7 +125,7 @@ class Tally:
         self.worst[name] = max(self.worst[name], float(np.where(free, 0.0, shares).max()))
 
 
-def flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
+def compute_flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
     """Return rotations (n, 3, 3) and positions (n, 3) m of flanges in the base, of joints (n, 6).
 
     Multiplies the joints of the simulated arm, for many arms at once.
@@ -149,7 +149,7 @@ def flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
 
 def points_on_tool(joints_rad: Floats, tool: Floats) -> Floats:
     """Return the tool's points (n, points, 3) in the base, from (points, 3) in the flange."""
-    turns, places = flange_poses(joints_rad)
+    turns, places = compute_flange_poses(joints_rad)
     found: Floats = np.einsum("nij,pj->npi", turns, tool) + places[:, None, :]
     return found
 
@@ -319,7 +319,7 @@ def pushes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Fl
     while True:
         direction = random.normal(0.0, 1.0, 3)
         nudged = lane.joints_rad + np.vstack([np.zeros(6), 1e-4 * np.eye(6)])
-        turns, places = flange_poses(nudged)
+        turns, places = compute_flange_poses(nudged)
         tips = places + 0.12 * turns[:, :, 1]
         way = np.sign((tips[1:] - tips[0]) @ direction)
         for sign in (1.0, -1.0):
@@ -884,7 +884,7 @@ def run(commands: int, seed: int, *, searching: bool = True) -> dict[str, Any]:
     began_s = time.perf_counter()
     scene, random = load_scene(SCENE_FILE), np.random.default_rng(seed)
     check = random.uniform(-1.0, 1.0, (5, 6))
-    for joints, turn, place in zip(check, *flange_poses(check), strict=True):
+    for joints, turn, place in zip(check, *compute_flange_poses(check), strict=True):
         assert np.allclose(forward(joints), transform(turn, place), atol=1e-12)
     joints_tally, sheets_tally = Tally(), Tally()
     found_sequences = search_sequences(scene) if searching else []

@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, examples, words
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import DISK_ERRORS, FileWriteError, write_error
+from flexsheet.messages.files import DISK_ERRORS, FileWriteError, make_write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "launch": ("launching",),
@@ -150,7 +150,7 @@ def error_text(error: Exception) -> str:
     """The sentence about an error; for one of the disk, with path and remedy."""
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
-    return str(write_error(Path(error.filename or "standard output"), error))
+    return str(make_write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:

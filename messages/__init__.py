@@ -1,1 +1,1 @@
-"""What nodes say to one another: typed messages, the topic table, the wire, the bus, the bag."""
+"""Define the messages between nodes, the table of topics, and the scene and calibration files."""

@@ -141,7 +141,6 @@ def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinit
 Vector2 = Annotated[NDArray[np.float64], ArraySpec("<f8", (2,))]
 Vector3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Vector6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6,))]
-Matrix3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3, 3))]
 Matrix6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 Transform = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 """Homogeneous rigid transform ``a_from_b``: metres, row-major."""

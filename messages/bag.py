@@ -38,9 +38,9 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import write_error
+from flexsheet.messages.files import make_write_error
 from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, find_migration
 from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, find_topic
 from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
@@ -117,9 +117,11 @@ class BagWriter:
         try:
             self._file: IO[bytes] = self.path.open("xb")
         except FileExistsError:
-            raise BagError(f"{self.path}: exists already; bags are not overwritten") from None
+            raise BagError(
+                f"{self.path}: the file exists already; a bag cannot be overwritten"
+            ) from None
         except OSError as error:
-            raise BagError(str(write_error(self.path, error))) from error
+            raise BagError(str(make_write_error(self.path, error))) from error
         self._writer: Any = Writer(  # mcap's types are incomplete
             self._file,
             chunk_size=CHUNK_BYTES,
@@ -180,7 +182,7 @@ class BagWriter:
             os.fsync(self._file.fileno())
         except OSError as error:
             self._failure = error
-            raise BagError(str(write_error(self.path, error))) from error
+            raise BagError(str(make_write_error(self.path, error))) from error
 
     def close(self) -> None:
         """Write the index and close the file; raises BagError if any data could not be written."""
@@ -199,7 +201,7 @@ class BagWriter:
             with suppress(OSError):
                 self._file.close()
         if self._failure is not None:
-            raise BagError(str(write_error(self.path, self._failure))) from self._failure
+            raise BagError(str(make_write_error(self.path, self._failure))) from self._failure
 
     def __enter__(self) -> BagWriter:
         return self
@@ -231,7 +233,7 @@ class BagWriter:
                 yield
             except OSError as error:
                 self._failure = error
-                raise BagError(str(write_error(self.path, error))) from error
+                raise BagError(str(make_write_error(self.path, error))) from error
 
     def _register(self, topic: Topic) -> int:
         kind = topic.message
@@ -244,7 +246,7 @@ class BagWriter:
             self._schemas[kind],
             {
                 "type": kind.__name__,
-                "fingerprint": schema_fingerprint(kind).hex(),
+                "fingerprint": compute_fingerprint(kind).hex(),
                 "delivery": topic.delivery.value,
             },
         )
@@ -418,7 +420,7 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """The recorded topics and the names of their types."""
+        """Return the names of the recorded topics and of their types."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
@@ -558,7 +560,7 @@ class BagReader:
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks of a truncated bag whose channels or message times are unknown.
 
-        The message indexes after the last chunk may be truncated.  A damaged chunk is kept, and
+        The message indexes after the last chunk may be truncated.  A damaged chunk
         raises an error when its messages are read.
         """
         for chunk in self.chunks:
@@ -738,11 +740,13 @@ def recover(
                     messages += 1
             writer.finish()
     except FileExistsError:
-        raise BagError(f"{path_out}: exists already; bags are not overwritten") from None
+        raise BagError(
+            f"{path_out}: the file exists already; a bag cannot be overwritten"
+        ) from None
     except OSError as error:
         with suppress(OSError):
             path_out.unlink(missing_ok=True)
-        raise BagError(str(write_error(path_out, error))) from error
+        raise BagError(str(make_write_error(path_out, error))) from error
     if not BagReader(path_out).complete:
         raise BagError(f"{path_out}: the recovered bag cannot be read back; is the disk full?")
     return RecoverReport(

@@ -64,7 +64,7 @@ class Header:
 
 
 @cache
-def stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
+def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
     """Return the names of the message's fields of type `Stamp`."""
     return tuple(
         name
@@ -74,7 +74,7 @@ def stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
 
 
 @cache
-def schema_fingerprint(message_type: type[Message]) -> bytes:
+def compute_fingerprint(message_type: type[Message]) -> bytes:
     """Return the first 8 bytes of the SHA-256 of the type's JSON Schema without descriptions.
 
     It changes with the names, types, ranges, dtypes and shapes of the fields.

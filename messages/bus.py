@@ -115,7 +115,7 @@ class Counts(Protocol):
     rejected: int
 
 
-def queue_length(topic: Topic) -> int:
+def compute_queue_length(topic: Topic) -> int:
     """Return the length of the queue at each end of a connection.
 
     A full queue drops the newest message.  On `latest` topics the queue therefore lasts for half a
@@ -145,7 +145,7 @@ class Publisher:
 
     A latched topic and keys need a running loop.
 
-    bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
+    bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" is a free port).
     keys: only hosts of this ring may connect by tcp; None: tcp is bound to loopback only.
     on_refused: called with a text for each connection that was refused or closed; without a
         running loop, on a separate thread.
@@ -300,8 +300,8 @@ class Subscriber:
         which may lose messages), and for the first rejection of each cause.  Also called for an
         exception in `on_message`, after which the subscriber continues.
     on_handshake_failed: called with the problem of each failed handshake; None: `on_problem`.
-    raw: call `on_message(frames, header)` with every message, whatever the topic's
-        delivery; the fields are not validated.
+    raw: call `on_message(frames, header)` with every message, independent of the
+        topic's delivery; the fields are not validated.
     keys: keys of this host and the others; None: tcp connects to loopback only.
     plan: accept only messages of this plan; None: of any plan.
     message_filter: called with each valid message before `on_message`.
@@ -678,7 +678,7 @@ class _HostConnection:
 
 def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
     opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
-    length = queue_length(topic)
+    length = compute_queue_length(topic)
     options = {
         zmq.SNDHWM: length,
         zmq.RCVHWM: length,
@@ -751,7 +751,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for a tcp endpoint beyond loopback; called where there are no keys."""
+    """Raise BusError for a tcp endpoint beyond loopback; called without keys."""
     transport, _, address = endpoint.partition("://")
     if transport != "tcp":
         return

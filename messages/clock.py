@@ -19,7 +19,7 @@ class Clock(Protocol):
 
 def read_boot_id() -> str:
     """Return the kernel's random identifier of this boot; CLOCK_MONOTONIC starts with the boot."""
-    return Path("/proc/sys/kernel/random/read_boot_id").read_text().strip()
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def read_namespace_offset() -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypeVar
 
-from flexsheet.messages.base import Header, Message, stamp_fields
+from flexsheet.messages.base import Header, Message, find_stamp_fields
 from flexsheet.messages.types import ClockOffset, Clocks
 
 M = TypeVar("M", bound=Message)
@@ -48,7 +48,7 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return what converts a stamp near `at_ns` to the local clock by addition; None: unknown.
+        """Return the shift of a stamp near `at_ns` to the local clock, ns; None: unknown.
 
         at_ns: publication time of the message on that clock.  One shift for all stamps of a message
         preserves their differences.
@@ -87,7 +87,7 @@ def shift_stamps(message: M, shift_ns: int) -> M:
     """Return the message with its `Stamp` fields shifted; a stamp of 0 means none and remains."""
     moved = {
         name: max(1, value + shift_ns)
-        for name in stamp_fields(type(message))
+        for name in find_stamp_fields(type(message))
         if (value := getattr(message, name))
     }
     return message.model_copy(update=moved) if moved else message

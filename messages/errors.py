@@ -8,7 +8,7 @@ from typing import ClassVar
 class FlexsheetError(Exception):
     """Base class of errors that a user can correct.
 
-    code: name of the error for `flexsheet explain`.  remedy: what the user should do.
+    code: name of the error for `flexsheet explain`.  remedy: action for the user.
     exit_code: exit status of a command that ends with this error.
     """
 

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from flexsheet.messages.arrays import ArraySpec
 
 
-def field_type(field: FieldInfo) -> str:
+def describe_field_type(field: FieldInfo) -> str:
     """Return a field's type as text; models are links to their sections."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):

@@ -42,10 +42,12 @@ def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> 
                 part.unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise write_error(path, error, needed_bytes=len(data)) from error
+        raise make_write_error(path, error, needed_bytes=len(data)) from error
 
 
-def write_error(path: Path, error: OSError, *, needed_bytes: int | None = None) -> FileWriteError:
+def make_write_error(
+    path: Path, error: OSError, *, needed_bytes: int | None = None
+) -> FileWriteError:
     """Return the error for a file that could not be written."""
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
 A field's name ends in its unit, and each unit has a limit.  A few names have a limit of their own.
-The limits are wide: they exclude numbers that no such apparatus has, and that would break the
-nodes' arithmetic.
+The limits are wide: they exclude only numbers that no apparatus of this kind has, and that would
+break the nodes' arithmetic.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from flexsheet.messages.base import Message, schema_fingerprint
+from flexsheet.messages.base import Message, compute_fingerprint
 
 Fields = dict[str, Any]
 Migration = Callable[[Fields], Fields]
@@ -119,7 +119,7 @@ def find_migration(
 
     fingerprint: of the recorded type, hexadecimal.  recorded_schema: JSON Schema from the bag.
     """
-    if fingerprint == schema_fingerprint(message_type).hex():
+    if fingerprint == compute_fingerprint(message_type).hex():
         return _unchanged
     if (message_type.__name__, fingerprint) in MIGRATIONS:
         return MIGRATIONS[message_type.__name__, fingerprint]

@@ -223,7 +223,7 @@ class VirtualObject(Part):
 
     @property
     def support_angle_rad(self) -> float:
-        """Angle of the fixed strip; raises UnfitGeometryError for another support."""
+        """Return the angle of the fixed strip; raises UnfitGeometryError for another support."""
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
                 f'object.support.kind: expected "strip", found "{self.support.kind}"'
@@ -355,7 +355,7 @@ class Tolerances(Part):
 
 
 class Scene(Message):
-    """Scene: everything that all nodes must know in common."""
+    """Scene that all nodes of a graph share."""
 
     name: str
     object: VirtualObject

@@ -3,7 +3,7 @@
 Every host has one CURVE key pair.  The secret key is in a file that only its owner may read; the
 public keys of all hosts are in the launch file.  A bound socket accepts only the keys of hosts of
 the plan; ZeroMQ requests that decision by ZAP, in the event loop.  A connecting socket requires the
-key of one host.  Each end of a connection therefore knows the host of the other end.
+key of one host.  Each end of a connection can therefore identify the host of the other end.
 
 Keys are written in Z85, 40 characters.
 """
@@ -25,7 +25,7 @@ import zmq
 from zmq.utils import z85
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import write_error, write_file
+from flexsheet.messages.files import make_write_error, write_file
 
 KEY_LENGTH = 40
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"
@@ -46,7 +46,7 @@ class SecurityError(FlexsheetError, RuntimeError):
     )
 
 
-def new_key_pair() -> tuple[str, str]:
+def make_key_pair() -> tuple[str, str]:
     """Return a new (public, secret) key pair; the public key does not begin with a hyphen."""
     while True:
         public, secret = zmq.curve_keypair()
@@ -91,7 +91,7 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
             "launch file on every host"
         ) from error
     except OSError as error:
-        raise SecurityError(str(write_error(path, error))) from error
+        raise SecurityError(str(make_write_error(path, error))) from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -145,7 +145,7 @@ class SheetTarget(Message):
     push_depth_m: NonNegative = Field(description="depth of the finger in the undeformed object")
     normal_offset_m: Finite = Field(
         default=0.0,
-        description="distance of the sheet behind the object's tangent plane, where it gives the "
+        description="distance of the sheet behind the object's tangent plane, where it has the "
         "object's force; negative: in front of it",
     )
 
@@ -299,7 +299,8 @@ class Frame(Message):
         description="predicted finger at `predicted_to_ns`, m; no row: unknown",
     )
     occluded_fraction: NonNegative = Field(
-        default=0.0, description="fraction of the sheet's visible area that folds keep unlit"
+        default=0.0,
+        description="fraction of the sheet's visible area that is unlit because of folds",
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, or one (mono or packed stereo)"
@@ -507,7 +508,7 @@ class TwinFinger(Message):
     path_label: str
     path_done: bool
     path_time_s: Finite = Field(
-        description="time since the start of the path; negative on the way to it"
+        description="time since the start of the path; negative before the first point"
     )
     path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
     position_world_m: Vector3

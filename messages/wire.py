@@ -4,7 +4,7 @@ The header frame is one msgpack array of eleven elements:
 
     protocol     "flexsheet/2"
     type         name of the message's class
-    fingerprint  8 bytes of its JSON Schema's hash, see `flexsheet.messages.base.schema_fingerprint`
+    fingerprint  8 bytes of the hash of its JSON Schema, see `messages.base.compute_fingerprint`
     sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
     fields       a map; nested parts are maps, tuples arrays, numpy arrays extension types:
                  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
@@ -34,7 +34,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.topics import Topic
 
@@ -87,7 +87,7 @@ class Codec:
     def __init__(self, message_type: type[Message]) -> None:
         self.type = message_type
         self.name = message_type.__name__
-        self.fingerprint = schema_fingerprint(message_type)
+        self.fingerprint = compute_fingerprint(message_type)
         self.validate = message_type.__pydantic_validator__.validate_python
 
 

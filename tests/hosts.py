@@ -11,7 +11,7 @@ from pathlib import Path
 from flexsheet.messages.security import (
     KeyRing,
     derive_public_key,
-    new_key_pair,
+    make_key_pair,
     read_secret,
     write_ring,
     write_secret,
@@ -34,7 +34,7 @@ class Hosts:
         return derive_public_key(read_secret(self.secret_file(name)))
 
     def make_key(self, name: str) -> str:
-        public, secret = new_key_pair()
+        public, secret = make_key_pair()
         write_secret(self.secret_file(name), secret, replace=True)
         return public
 

@@ -33,7 +33,7 @@ from flexsheet.launch.running.tools import GraphWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.scene import Scene, require_cylinder
-from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.security import make_key_pair, write_secret
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, FingerPath, HostStatus, TwinFinger
 from flexsheet.nodes.models.rigid import apply
@@ -184,7 +184,7 @@ class Lab:
             }
         values["record"] = {"bag": str(self.bag("main"))}
         for host in HOSTS:
-            public, secret = new_key_pair()
+            public, secret = make_key_pair()
             write_secret(self.folder / host / "keys" / f"{host}.secret", secret)
             values["hosts"][host]["key"] = SingleQuotedScalarString(public)
         yaml.dump(values, self.launch_file)

@@ -18,7 +18,7 @@ from flexsheet.messages.types import ArmState, EStop, Side
 from flexsheet.nodes.arm_bridge import other_arm
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, extrapolate_goal, sync_factor
+from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, extrapolate_goal
 from flexsheet.nodes.arm_bridge.kinematics import forward
 from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
@@ -177,7 +177,10 @@ poses = st.builds(
 @given(one=poses, other=poses, target=poses)
 @settings(max_examples=200, deadline=None)
 def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> None:
-    shares = sync_factor(one, other, target, left=True), sync_factor(other, one, target, left=False)
+    shares = (
+        compute_sync_factor(one, other, target, left=True),
+        compute_sync_factor(other, one, target, left=False),
+    )
     assert max(shares) == 1.0
 
 
@@ -188,8 +191,8 @@ def test_arms_that_are_together_do_not_wait_wherever_they_go(
 ) -> None:
     left, right = edge_poses(sheet, 0.24 * stretch)
     assert (
-        sync_factor(left, right, target, left=True)
-        == sync_factor(right, left, target, left=False)
+        compute_sync_factor(left, right, target, left=True)
+        == compute_sync_factor(right, left, target, left=False)
         == 1.0
     )
 
@@ -199,8 +202,8 @@ def test_the_leading_arm_slows_by_its_lead_and_the_other_not(lead: float, share:
     target = transform_from_rpy([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     ahead = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + lead, 0.0, 0.0])
     behind = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
-    assert sync_factor(ahead, behind, target, left=True) == pytest.approx(share)
-    assert sync_factor(behind, ahead, target, left=False) == 1.0
+    assert compute_sync_factor(ahead, behind, target, left=True) == pytest.approx(share)
+    assert compute_sync_factor(behind, ahead, target, left=False) == 1.0
 
 
 def test_a_moving_target_is_followed_without_lag() -> None:

@@ -27,7 +27,7 @@ from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     STANDSTILL_COUNT,
     StandstillMonitor,
-    edge_shift_m,
+    bound_edge_shift_m,
 )
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
@@ -382,7 +382,7 @@ LIMITS: JointLimits = GEOMETRY.joint_limits
 def test_the_edge_shifts_by_no_more_than_the_bound(joints: Floats, step: tuple[float, ...]) -> None:
     moved = joints + np.array(step)
     shift = np.linalg.norm(GEOMETRY.tool_points(moved) - GEOMETRY.tool_points(joints), axis=1)
-    assert shift.max() <= edge_shift_m(joints, moved) + 1e-12
+    assert shift.max() <= bound_edge_shift_m(joints, moved) + 1e-12
 
 
 def test_a_restart_within_its_tolerance_is_slower_than_the_tool_may_be() -> None:

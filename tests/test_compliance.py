@@ -29,9 +29,9 @@ from flexsheet.nodes.planner.compliance import (
     ObjectCurve,
     StretchLimits,
     UnfitCurveError,
+    compute_force_uncertainty_ratio,
     fit_at_stretch,
     fit_compliance,
-    force_uncertainty_ratio,
     make_stretch_limits,
     render_force,
 )
@@ -158,8 +158,8 @@ def test_what_keeps_it_from_a_stiffer_object_is_named() -> None:
 def test_a_softer_object_than_the_sheet_is_sure_of_is_said_to_be() -> None:
     shown = compliance(soft_curve(0.02), 0.01)
     assert "too soft for the position tolerance" in shown.note
-    assert force_uncertainty_ratio(shown.centre, 0.0005) > 0.15
-    assert force_uncertainty_ratio(shown.centre, 0.0) == 0.0
+    assert compute_force_uncertainty_ratio(shown.centre, 0.0005) > 0.15
+    assert compute_force_uncertainty_ratio(shown.centre, 0.0) == 0.0
 
 
 def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> None:

@@ -33,7 +33,7 @@ from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, secret_file
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bus import Publisher
-from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.security import make_key_pair, write_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
@@ -69,7 +69,7 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def three() -> ResolvedGraph:
     plan = load_graph(ROOT / "launch" / "three.yaml")
-    keys = {name: new_key_pair()[0] for name in NAMES}
+    keys = {name: make_key_pair()[0] for name in NAMES}
     return plan.model_copy(update={"keys": keys})
 
 
@@ -341,7 +341,7 @@ def plan_of(folder: Path, **values: Any) -> ResolvedGraph:
 async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
     addresses: dict[str, dict[str, str]] = {}
     for name, host in ADDRESSES.items():
-        public, secret = new_key_pair()
+        public, secret = make_key_pair()
         write_secret(secret_file(name), secret)
         addresses[name] = host | {"key": public}
     plan = plan_of(folder, hosts=addresses)
@@ -368,7 +368,7 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
 ) -> None:
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
     assert "does not exist; create a key" in (find_key_problem(three, "main") or "")
-    public, secret = new_key_pair()
+    public, secret = make_key_pair()
     write_secret(secret_file("main"), secret)
     assert "does not match hosts.main.key" in (find_key_problem(three, "main") or "")
     fitting = three.model_copy(update={"keys": three.keys | {"main": public}})

@@ -47,7 +47,7 @@ def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
         ("handler failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),
-        ("a.mcap: exists already; bags are not overwritten", "bag"),
+        ("a.mcap: the file exists already; a bag cannot be overwritten", "bag"),
         ("no graph is running; start one with: flexsheet launch FILE", "no-graph"),
     ],
 )

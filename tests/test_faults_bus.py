@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from benchmarks.fuzz_targets import TARGETS, wire_frames, wire_seeds
-from flexsheet.messages.bus import queue_length
+from flexsheet.messages.bus import compute_queue_length
 from flexsheet.messages.topics import TOPICS, Delivery
 from flexsheet.messages.types import StereoPair
 from flexsheet.messages.wire import decode, encode
@@ -30,7 +30,7 @@ async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Roo
     ear.extra = lambda _: ear.heard.append((None, ear.heard.pop()[1]))  # pictures are not kept
     stuck: Any = zmq.Context.instance().socket(zmq.SUB)
     stuck.setsockopt(zmq.SUBSCRIBE, b"")
-    stuck.setsockopt(zmq.RCVHWM, queue_length(topic))
+    stuck.setsockopt(zmq.RCVHWM, compute_queue_length(topic))
     stuck.connect(room.endpoint())
     room.closers.append(lambda: stuck.close(linger=0))
     last = await connected(publisher, ear, large_pictures)

@@ -25,7 +25,7 @@ from flexsheet.nodes.fem_solver.benchmarks import (
     SoftBodyBenchmark,
 )
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
-from flexsheet.nodes.fem_solver.precompute_table import table_cache
+from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
 from tests.soft_bodies import Here
@@ -117,7 +117,7 @@ def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> No
         force_n=100.0 * pascals * depths[:, None] * response.normals[:, None],
         reach_m=np.full(count, 0.02),
     )
-    save_cached(table_cache(make_table_spec(scene, spec)), tmp_path, table)
+    save_cached(make_table_cache(make_table_spec(scene, spec)), tmp_path, table)
     by_table = compute_front_curve(scene, tmp_path)
     assert by_table[:, 1] == pytest.approx(100.0 * by_table[:, 0], rel=1e-3, abs=1e-9)
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)

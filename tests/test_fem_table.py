@@ -24,8 +24,8 @@ from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,
     compute_table,
     local_processes,
+    make_table_cache,
     solve_all,
-    table_cache,
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator, minimal_rotation
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, solve_snapshot
@@ -68,7 +68,7 @@ def model() -> SoftBodyModel:
 def table(model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory) -> Table:
     folder = tmp_path_factory.mktemp("table")
     made = compute_table(SPEC, model, folder, Here(), lambda done, total, need: None)
-    assert [path.name for path in folder.iterdir()] == [table_cache(SPEC).path(folder).name]
+    assert [path.name for path in folder.iterdir()] == [make_table_cache(SPEC).path(folder).name]
     return made
 
 
@@ -250,14 +250,14 @@ def test_levels_that_turn_triangles_over_are_left_out() -> None:
 
 
 def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> None:
-    assert load_cached(table_cache(SPEC), tmp_path) is None
-    save_cached(table_cache(SPEC), tmp_path, table)
-    kept = load_cached(table_cache(SPEC), tmp_path)
+    assert load_cached(make_table_cache(SPEC), tmp_path) is None
+    save_cached(make_table_cache(SPEC), tmp_path, table)
+    kept = load_cached(make_table_cache(SPEC), tmp_path)
     assert kept is not None
     assert np.array_equal(kept.fields, table.fields)
-    path = table_cache(SPEC).path(tmp_path)
+    path = make_table_cache(SPEC).path(tmp_path)
     path.write_bytes(path.read_bytes()[:-1000])
-    assert load_cached(table_cache(SPEC), tmp_path) is None
+    assert load_cached(make_table_cache(SPEC), tmp_path) is None
 
 
 def test_an_interrupted_table_goes_on_where_it_stopped(
@@ -269,13 +269,13 @@ def test_an_interrupted_table_goes_on_where_it_stopped(
 
     with pytest.raises(Interrupted):
         compute_table(SPEC, model, tmp_path, Here(), stop)
-    assert load_cached(table_cache(SPEC), tmp_path) is None
-    kept = len(list(table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
+    assert load_cached(make_table_cache(SPEC), tmp_path) is None
+    kept = len(list(make_table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
     assert kept >= 2
     seen: list[int] = []
     compute_table(SPEC, model, tmp_path, Here(), lambda done, *_: seen.append(done))
     assert seen[1] == precompute_table.SNAPSHOT_STEPS * kept
-    again = load_cached(table_cache(SPEC), tmp_path)
+    again = load_cached(make_table_cache(SPEC), tmp_path)
     assert again is not None
     assert np.allclose(again.fields, table.fields, atol=1e-9)
 

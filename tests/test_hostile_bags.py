@@ -13,7 +13,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from flexsheet.messages.bag import PROFILE, BagReader
-from flexsheet.messages.base import schema_fingerprint
+from flexsheet.messages.base import compute_fingerprint
 from flexsheet.messages.types import EStop
 from flexsheet.messages.wire import PROTOCOL
 from tests.sessions import write_session
@@ -112,7 +112,7 @@ def made(write: Callable[[Writer], None]) -> Callable[[bytes], bytes]:
 
 def channel(writer: Writer, number: int = 0, schema: bytes = b"{}", topic: str = "estop") -> int:
     kind = writer.register_schema("EStop", "jsonschema", schema)
-    fingerprint = schema_fingerprint(EStop).hex()
+    fingerprint = compute_fingerprint(EStop).hex()
     known = {"type": "EStop", "fingerprint": fingerprint, "n": str(number)}
     return writer.register_channel(topic, PROTOCOL, kind, known)
 

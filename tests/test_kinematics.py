@@ -29,9 +29,9 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     find_branch,
     forward,
     inverse_kinematics,
-    joints_on_branch,
-    next_joints,
     singularities,
+    solve_joints_on_branch,
+    solve_next_joints,
 )
 from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
 from flexsheet.nodes.twin.arms import forward as twin_forward
@@ -118,7 +118,7 @@ def test_many_poses_at_once_give_what_one_by_one_gives(
 ) -> None:
     away = singularities(several)
     assume(min(away.shoulder_m.min(), away.wrist_rad.min()) > 1e-6)
-    found = joints_on_branch(np.array([forward(one) for one in several]), branch, CENTRE_RAD)
+    found = solve_joints_on_branch(np.array([forward(one) for one in several]), branch, CENTRE_RAD)
     for joints, one in zip(several, found, strict=True):
         expected = np.array(branches(forward(joints), CENTRE_RAD)[BRANCHES.index(branch)])
         assert np.abs(np.exp(1j * one) - np.exp(1j * expected)).max() < 1e-7
@@ -131,7 +131,7 @@ def test_many_poses_at_once_give_what_one_by_one_gives(
 def test_poses_out_of_reach_have_no_joints_on_any_branch() -> None:
     poses = np.array([forward(CENTRE_RAD), transform(np.eye(3), [0.9, 0.0, 0.3])])
     for branch in BRANCHES:
-        found = joints_on_branch(poses, branch, CENTRE_RAD)
+        found = solve_joints_on_branch(poses, branch, CENTRE_RAD)
         assert np.isfinite(found[0]).all()
         assert np.isnan(found[1, 1:3]).all()
 
@@ -186,7 +186,7 @@ def test_unreachable_poses_say_what_binds(
     position: tuple[float, float, float], limit: str, words: str
 ) -> None:
     pose = transform(rotation_from_rpy([0.0, np.pi / 2, 0.0]), position)
-    for solve in (inverse_kinematics, next_joints):
+    for solve in (inverse_kinematics, solve_next_joints):
         with pytest.raises(UnreachableError, match=words) as caught:
             solve(pose, CENTRE_RAD)
         assert caught.value.limit == limit
@@ -199,11 +199,11 @@ def test_the_elbow_never_comes_near_its_singularity() -> None:
     rotation = rotation_from_rpy([0.0, np.pi / 2, 0.0])
     joints = inverse_kinematics(transform(rotation, [0.42, 0.0, 0.3]), CENTRE_RAD)
     for out in np.arange(0.42, MAX_WRIST_M + FLANGE_M - 1e-6, 0.0005):
-        before, joints = joints, next_joints(transform(rotation, [out, 0.0, 0.3]), joints)
+        before, joints = joints, solve_next_joints(transform(rotation, [out, 0.0, 0.3]), joints)
         assert np.abs(joints - before).max() < 0.02
     assert np.degrees(joints[2]) == pytest.approx(60.0, abs=0.5)
     with pytest.raises(UnreachableError) as caught:
-        next_joints(transform(rotation, [MAX_WRIST_M + FLANGE_M + 1e-5, 0.0, 0.3]), joints)
+        solve_next_joints(transform(rotation, [MAX_WRIST_M + FLANGE_M + 1e-5, 0.0, 0.3]), joints)
     assert caught.value.limit == "J3"
 
 
@@ -242,7 +242,7 @@ def test_away_from_singularities_the_next_joints_are_exact(joints: Floats, step:
     target = np.clip(joints + step, JOINT_MIN_RAD + 1e-6, JOINT_MAX_RAD - 1e-6)
     near = [singularities(one) for one in (joints, target)]
     assume(all(one.wrist_rad > WRIST_NEAR_RAD and one.shoulder_m > 0.03 for one in near))
-    assert next_joints(forward(target), joints) == pytest.approx(target, abs=1e-8)
+    assert solve_next_joints(forward(target), joints) == pytest.approx(target, abs=1e-8)
 
 
 def wrist_path(past_rad: float, step_rad: float, bend_rad: float = 0.0) -> list[Floats]:
@@ -267,7 +267,7 @@ def follow(poses: list[Floats]) -> tuple[Floats, Floats]:
     present = inverse_kinematics(poses[0], CENTRE_RAD)
     joints, errors = [present], [0.0]
     for pose in poses[1:]:
-        present = next_joints(pose, present)
+        present = solve_next_joints(pose, present)
         found = forward(present)
         wrist, wanted = (one[:3, 3] - FLANGE_M * one[:3, 2] for one in (found, pose))
         assert wrist == pytest.approx(wanted, abs=1e-9)
@@ -323,7 +323,7 @@ def test_a_path_past_the_shoulders_singularity_goes_straight_over(past_m: float)
         pose = transform(over[:3, :3], over[:3, 3] + along * ahead + past_m * aside)
         if present is None:
             present = inverse_kinematics(pose, joints)
-        before, present = present, next_joints(pose, present)
+        before, present = present, solve_next_joints(pose, present)
         assert np.abs(present - before).max() < 0.1
         found = forward(present)
         off = float(np.linalg.norm(found[:3, 3] - pose[:3, 3]))
@@ -337,7 +337,7 @@ def test_held_still_at_a_singularity_the_arm_stays() -> None:
     joints = np.radians([10.0, 20.0, 100.0, 40.0, 0.0, -30.0])
     pose, present = forward(joints), joints
     for _ in range(200):
-        present = next_joints(pose, present)
+        present = solve_next_joints(pose, present)
     assert present == pytest.approx(joints, abs=1e-6)
 
 
@@ -345,7 +345,7 @@ def test_where_a_branch_ends_another_is_taken_or_the_range_is_named() -> None:
     # J4 at the end of its range: the flipped wrist has the same pose.
     joints = np.radians([0.0, 25.0, 110.0, 159.9, 40.0, 10.0])
     beyond = joints + np.radians([0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
-    found = next_joints(forward(beyond), joints)
+    found = solve_next_joints(forward(beyond), joints)
     assert find_branch(found).wrist != find_branch(joints).wrist
     assert forward(found) == pytest.approx(forward(beyond), abs=1e-9)
 
@@ -358,7 +358,7 @@ weird = st.floats(allow_nan=True, allow_infinity=True, width=64)
 def test_whatever_is_asked_joints_are_in_range_or_the_error_says_so(
     pose: Floats, present: Floats
 ) -> None:
-    for solve in (next_joints, inverse_kinematics):
+    for solve in (solve_next_joints, inverse_kinematics):
         try:
             with np.errstate(all="ignore"):
                 found = solve(pose, present)

@@ -13,7 +13,7 @@ from flexsheet.launch.bags.player import shift_stamps
 from flexsheet.launch.bags.replay import field_differences, replay, verify
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagError, BagWriter
-from flexsheet.messages.base import Header, Message, Stamp, stamp_fields
+from flexsheet.messages.base import Header, Message, Stamp, find_stamp_fields
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, SheetTarget, TwinFinger
 from flexsheet.messages.wire import decode
@@ -142,4 +142,4 @@ def test_a_duration_is_no_instant() -> None:
 @pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)
 def test_every_instant_of_a_message_is_marked(topic: Topic) -> None:
     named = {name for name in topic.message.model_fields if name.endswith("_ns")}
-    assert named == set(stamp_fields(topic.message))
+    assert named == set(find_stamp_fields(topic.message))

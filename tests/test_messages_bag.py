@@ -320,7 +320,7 @@ def test_foreign_files(tmp_path_factory: pytest.TempPathFactory, data: bytes) ->
 def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("no bag at all\n")
-    with pytest.raises(BagError, match="no MCAP file"):
+    with pytest.raises(BagError, match="not an MCAP file"):
         info(text)
     (tmp_path / "empty").touch()
     with pytest.raises(BagError, match="is empty"):
@@ -340,9 +340,9 @@ def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
 
 def test_existing_files_are_not_overwritten(whole: Path, tmp_path: Path) -> None:
     before = whole.read_bytes()
-    with pytest.raises(BagError, match="not overwritten"):
+    with pytest.raises(BagError, match="cannot be overwritten"):
         BagWriter(whole)
-    with pytest.raises(BagError, match="not overwritten"):
+    with pytest.raises(BagError, match="cannot be overwritten"):
         recover(whole, whole)
     assert whole.read_bytes() == before
     with pytest.raises(BagError, match="cannot be written"):

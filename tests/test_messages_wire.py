@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, create_model
 from ruamel.yaml import YAML
 
 from flexsheet.messages.arrays import ArraySpec
-from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
@@ -362,14 +362,14 @@ def test_a_better_sentence_does_not_change_the_fingerprint_but_a_field_does() ->
     reworded = example("Another.", title=(str, Field(description="what it is called")))
     widened = example("One.", title=(str | None, Field(description="of the example")))
     renamed = example("One.", name=(str, Field(description="of the example")))
-    fingerprints = [schema_fingerprint(kind) for kind in (plain, reworded, widened, renamed)]
+    fingerprints = [compute_fingerprint(kind) for kind in (plain, reworded, widened, renamed)]
     assert fingerprints[0] == fingerprints[1]
     assert len(set(fingerprints)) == 3
 
 
 def test_every_topic_type_has_a_fingerprint_of_its_own() -> None:
     types = {topic.message for topic in TOPICS.values()}
-    assert len({schema_fingerprint(message_type) for message_type in types}) == len(types)
+    assert len({compute_fingerprint(message_type) for message_type in types}) == len(types)
 
 
 def test_every_array_field_has_a_dtype_of_the_wire() -> None:

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from flexsheet.messages import migrations
 from flexsheet.messages.bag import BagError, BagReader, BagWriter, info
-from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.migrations import find_migration, is_compatible
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
@@ -147,7 +147,7 @@ def test_gains_need_nothing(today: type[Message]) -> None:
 @pytest.mark.parametrize("today", [Renamed, Demanding, Narrower, Poorer, Retyped])
 def test_anything_else_does(today: type[Message]) -> None:
     assert not is_compatible(Before.model_json_schema(), today.model_json_schema())
-    fingerprint = schema_fingerprint(Before).hex()
+    fingerprint = compute_fingerprint(Before).hex()
     assert find_migration(today, fingerprint, Before.model_json_schema()) is None
 
 
@@ -180,7 +180,7 @@ def renamed() -> type[Message]:
     return Before
 
 
-KEY = ("Before", schema_fingerprint(Before).hex())
+KEY = ("Before", compute_fingerprint(Before).hex())
 
 
 def test_a_renamed_field_is_followed_by_a_migration(

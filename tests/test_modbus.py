@@ -28,9 +28,9 @@ from flexsheet.nodes.arm_bridge.modbus import (
     STATUS_ADDRESS,
     VERSION,
     ModbusLink,
+    count_registers,
     decode_status,
     encode_command,
-    register_count,
 )
 from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
@@ -104,7 +104,7 @@ def test_a_command_is_taken_by_the_arm_and_no_damaged_one(sequence: int, time_us
     controller = quiet_controller()
     controller.accepted = (sequence - 1) % 2**32
     registers = encode_command(sequence=sequence, time_us=time_us, mode="move", joints_rad=JOINTS)
-    assert len(registers) == register_count(COMMAND)
+    assert len(registers) == count_registers(COMMAND)
     damaged = registers.copy()
     damaged[10] ^= 1
     assert not controller.receive_command(damaged)
@@ -244,7 +244,7 @@ def test_the_map_is_frozen() -> None:
     )
     assert VERSION == 1
     assert (COMMAND_ADDRESS, STATUS_ADDRESS) == (0, 100)
-    assert (register_count(COMMAND), register_count(STATUS)) == (22, 26)
+    assert (count_registers(COMMAND), count_registers(STATUS)) == (22, 26)
     assert struct.pack(">22H", *command).hex() == (
         "46530001" "01020304" "0a0b0c0d" "00010000"
         "3f000000" "be800000" "3fc00000" "40000000" "bf800000" "00000000" "ae302983"
@@ -294,7 +294,7 @@ async def test_the_librarys_fault_that_the_link_guards_against_is_there(
         async def ask(sequence: int) -> int:
             answer = await client.readwrite_registers(
                 read_address=STATUS_ADDRESS,
-                read_count=register_count(STATUS),
+                read_count=count_registers(STATUS),
                 write_address=COMMAND_ADDRESS,
                 values=encode_command(sequence=sequence, time_us=0, mode="move", joints_rad=JOINTS),
             )

@@ -24,6 +24,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ArmLinkError,
     ArmRefusedError,
     ArmSilentError,
+    BlockField,
 )
 from flexsheet.nodes.arm_bridge.mxt import (
     COMMAND_END,
@@ -34,7 +35,6 @@ from flexsheet.nodes.arm_bridge.mxt import (
     TYPE_JOINTS,
     TYPE_POSE,
     MxtLink,
-    PacketField,
     decode_answer,
     encode,
     encode_joints,
@@ -51,7 +51,7 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "mxt.md"
 ME = ("127.0.0.1", 4711)
 
 
-def offsets() -> Iterator[tuple[int, PacketField]]:
+def offsets() -> Iterator[tuple[int, BlockField]]:
     at = 0
     for field in PACKET:
         yield at, field

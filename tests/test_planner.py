@@ -22,7 +22,11 @@ from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
 from flexsheet.nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from flexsheet.nodes.models.shapes import CylinderShape
 from flexsheet.nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
-from flexsheet.nodes.planner.compliance import USABLE_FRACTION, choose_stretch, stretch_range
+from flexsheet.nodes.planner.compliance import (
+    USABLE_FRACTION,
+    choose_stretch,
+    compute_stretch_range,
+)
 from flexsheet.nodes.planner.contact_state import ContactCommand, ContactLimits, ContactStateMachine
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
@@ -470,14 +474,14 @@ async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: st
     desk = await table(compliance_mode="stiffness")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
     assert words in desk.planner.note
-    least, largest = stretch_range(SCENE.sheet)
+    least, largest = compute_stretch_range(SCENE.sheet)
     target = await desk.rest_at(in_world(on_cylinder(0.0, -0.001)), 300)
     assert target.stretch_ratio == pytest.approx(least if words == "softer" else largest)
 
 
 def test_the_arms_pull_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
-    _, largest = stretch_range(weak)
+    _, largest = compute_stretch_range(weak)
     force = edge_force_n(
         choose_stretch(1e4, weak).stretch_ratio,
         young_modulus_pa=weak.young_modulus_pa,

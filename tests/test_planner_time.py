@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from flexsheet.nodes.arm_bridge.goal import extrapolate_goal
 from flexsheet.nodes.models.motion import SheetMotion
-from flexsheet.nodes.planner.timing import RESTART_COUNT, MonotonicTimestampFilter, next_horizon_s
+from flexsheet.nodes.planner.timing import RESTART_COUNT, MonotonicTimestampFilter, update_horizon_s
 
 FRAME_NS = 16_666_667
 
@@ -51,10 +51,10 @@ def test_every_step_is_positive_whatever_the_stamps(stamps_ns: list[int]) -> Non
 def test_the_horizon_changes_slowly_and_ends_with_the_predicted_path(
     horizon_s: float, wanted_s: float, max_s: float
 ) -> None:
-    later = next_horizon_s(horizon_s, wanted_s, max_s)
+    later = update_horizon_s(horizon_s, wanted_s, max_s)
     assert abs(later - horizon_s) < 0.5 * FRAME_NS * 1e-9
     for _ in range(400):
-        later = next_horizon_s(later, wanted_s, max_s)
+        later = update_horizon_s(later, wanted_s, max_s)
     assert later == pytest.approx(min(max(wanted_s, 0.0), max_s), abs=1e-6)
 
 

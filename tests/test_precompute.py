@@ -71,7 +71,7 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
     assert "100 % (" in said
     scene = load_scene(scene_file)
     spec = body.make_table_spec(scene, body.make_soft_body_spec(scene, SPACING_M))
-    path = precompute_table.table_cache(spec).path(tmp_path / "cache")
+    path = precompute_table.make_table_cache(spec).path(tmp_path / "cache")
     assert path.exists()
     assert path.name in said.replace(" ", "")
     made = path.stat().st_mtime_ns

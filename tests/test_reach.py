@@ -30,7 +30,7 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     CENTRE_RAD,
     WRIST_NEAR_RAD,
     find_branch,
-    next_joints,
+    solve_next_joints,
 )
 from flexsheet.nodes.arm_bridge.reach import (
     LIMITS,
@@ -38,9 +38,9 @@ from flexsheet.nodes.arm_bridge.reach import (
     SPEED_LIMITS,
     PathError,
     SheetPoses,
+    compute_flange_poses,
     compute_reach,
     find_best_reach,
-    flange_poses,
     plan_path,
 )
 from flexsheet.nodes.models.motion import SheetMotion
@@ -114,7 +114,7 @@ def test_speeds_are_those_of_the_jacobian(y: float, z: float, roll: float, twist
     where = places(sheet((0.0, y, z), (roll, 0.0, 0.0)), twists=np.array(twist).reshape(1, 1, 6))
     reach = compute_reach(LEFT, RIGHT, where, FRONT)
     assume(reach.margins["wrist singularity"][0] > 0.0)
-    flange = flange_poses(LEFT, where)[0]
+    flange = compute_flange_poses(LEFT, where)[0]
     linear, angular = np.split(np.array(twist), 2)
     at_flange = linear + np.cross(angular, flange[:3, 3] - where.world_from_sheet[0, :3, 3])
     turn = LEFT.base_from_world[:3, :3]
@@ -259,8 +259,8 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
     present = find_best_reach(LEFT, RIGHT, places(turned_about_the_left_edge(0.0))).joints_rad[0]
     signs = []
     for yaw in np.linspace(0.0, -0.9, 200):
-        pose = flange_poses(LEFT, places(turned_about_the_left_edge(yaw)))[0]
-        before, present = present, next_joints(LEFT.base_from_world @ pose, present)
+        pose = compute_flange_poses(LEFT, places(turned_about_the_left_edge(yaw)))[0]
+        before, present = present, solve_next_joints(LEFT.base_from_world @ pose, present)
         assert np.abs(present - before).max() < 0.02
         signs.append(np.sign(present[4]))
     assert signs[0] == -signs[-1]

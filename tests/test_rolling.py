@@ -25,12 +25,12 @@ from flexsheet.nodes.planner.contact_state import ContactLimits, ContactStateMac
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
     compute_rim_lift_m,
+    compute_rolling_twist,
+    compute_tangent_twist,
     limit_tilt,
     make_tangent_contact,
     measure_spin_rad,
     roll_contact,
-    rolling_twist,
-    tangent_twist,
     transport_axes,
 )
 
@@ -130,7 +130,7 @@ def test_on_a_plane_the_sheet_rests_and_the_finger_goes_over_it() -> None:
     contact = rolled_along(shape, np.zeros(3), np.array([[0.01, 0.0, 0.0], [0.01, 0.02, 0.0]]))
     assert contact.position_sheet_m == pytest.approx([0.01, 0.02])
     assert contact.object_from_sheet == pytest.approx(np.eye(4))
-    assert rolling_twist(contact, np.array([0.1, 0.05, 0.0])) == pytest.approx(np.zeros(6))
+    assert compute_rolling_twist(contact, np.array([0.1, 0.05, 0.0])) == pytest.approx(np.zeros(6))
 
 
 SHAPES: list[Shape] = [
@@ -147,7 +147,7 @@ def test_a_rolling_sheet_neither_slips_nor_spins(shape: Shape) -> None:
     start = shape.closest(np.array([0.004, 0.01, 0.2]))
     contact = make_tangent_contact(np.eye(3), start, WIDE)
     rate = contact.axes[:, :2] @ np.array([0.03, 0.05])
-    twist = rolling_twist(contact, rate)
+    twist = compute_rolling_twist(contact, rate)
     middle = contact.object_from_sheet[:3, 3]
     at_touch = twist[:3] + np.cross(twist[3:], contact.point - middle)
     assert at_touch == pytest.approx(np.zeros(3), abs=2e-6)
@@ -162,8 +162,11 @@ def test_twists_lead_along_the_poses(shape: Shape) -> None:
     step_s = 0.004
     later = shape.closest(start.point + step_s * rate, previous=start.point)
     for twist, there in (
-        (tangent_twist(ready, rate, np.eye(3), WIDE), make_tangent_contact(np.eye(3), later, WIDE)),
-        (rolling_twist(ready, rate), roll_contact(ready, later)),
+        (
+            compute_tangent_twist(ready, rate, np.eye(3), WIDE),
+            make_tangent_contact(np.eye(3), later, WIDE),
+        ),
+        (compute_rolling_twist(ready, rate), roll_contact(ready, later)),
     ):
         ahead = moved(ready.object_from_sheet, twist, step_s)
         assert ahead == pytest.approx(there.object_from_sheet, abs=3e-5)

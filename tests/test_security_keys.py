@@ -24,7 +24,7 @@ from flexsheet.messages.security import (
     SecurityError,
     derive_public_key,
     is_key,
-    new_key_pair,
+    make_key_pair,
     read_secret,
     write_secret,
 )
@@ -68,7 +68,7 @@ def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def make(folder: Path, host: str, *, replace: bool = False) -> str:
-    public, secret = new_key_pair()
+    public, secret = make_key_pair()
     write_secret(folder / f"{host}.secret", secret, replace=replace)
     return public
 
@@ -128,7 +128,7 @@ def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
 def test_no_new_public_key_looks_like_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = iter([(b"-" + ONE[1:].encode(), b"first"), (ONE.encode(), b"second")])
     monkeypatch.setattr(zmq, "curve_keypair", lambda: next(pairs))
-    assert new_key_pair() == (ONE, "second")
+    assert make_key_pair() == (ONE, "second")
 
 
 @pytest.mark.parametrize("key", ["-h=j" + "0" * 36, "--js" + "0" * 36, "-" + "0" * 39])
@@ -151,7 +151,7 @@ def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
     chance = random.Random(5)
     # All of Z85; any five of them are four bytes, if not too large.
     characters = string.digits + string.ascii_letters + ".-:+=^!/*?&<>()[]{}@%$#"
-    keys_tried = [new_key_pair()[0] for _ in range(30)]
+    keys_tried = [make_key_pair()[0] for _ in range(30)]
     keys_tried += [
         key
         for _ in range(2000)
@@ -176,7 +176,7 @@ def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
 def test_keys_are_no_part_of_the_plan_s_hash(tmp_path: Path) -> None:
     hashes = set()
     for _ in range(2):
-        given = {name: {**host, "key": new_key_pair()[0]} for name, host in HOSTS.items()}
+        given = {name: {**host, "key": make_key_pair()[0]} for name, host in HOSTS.items()}
         hashes.add(load_graph(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
     hashes.add(load_graph(write(tmp_path, {"beacon": beacon()}, hosts=HOSTS)).hash)
     assert len(hashes) == 1
@@ -185,7 +185,7 @@ def test_keys_are_no_part_of_the_plan_s_hash(tmp_path: Path) -> None:
     assert len(hashes) == 2
 
 
-ONE, TWO = new_key_pair()[0], new_key_pair()[0]
+ONE, TWO = make_key_pair()[0], make_key_pair()[0]
 
 
 @pytest.mark.parametrize(

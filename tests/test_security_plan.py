@@ -23,7 +23,7 @@ from flexsheet.messages import bus
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Source
 from flexsheet.messages.clock import SystemClock
-from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.security import make_key_pair, write_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Arming, EStop
 from flexsheet.nodes import node_class
@@ -88,7 +88,7 @@ def lab(folder: Path, **left: Any) -> ResolvedGraph:
     spec["nodes"]["console"] = {"type": "console", "host": "left"}
     spec["nodes"]["hand"] = {"type": f"{__name__}:Hand", "host": "left"}
     for number, (name, host) in enumerate(spec["hosts"].items(), start=1):
-        public, secret = new_key_pair()
+        public, secret = make_key_pair()
         write_secret(folder / "keys" / f"{name}.secret", secret, replace=True)
         host |= {"address": f"{NET}.{number}", "key": public}
     spec["hosts"]["left"] |= left

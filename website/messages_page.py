@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.field_types import field_type
+from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.topics import TOPICS, Topic
 
 INTRODUCTION = """\
@@ -102,7 +102,7 @@ def _header_table() -> str:
 def type_section(kind: type[BaseModel]) -> str:
     """Return a section with a type's name, docstring and fields."""
     rows = [
-        (f"`{name}`", field_type(field), _field_notes(field))
+        (f"`{name}`", describe_field_type(field), _field_notes(field))
         for name, field in kind.model_fields.items()
     ]
     text = inspect.cleandoc(kind.__doc__ or "")

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from flexsheet.messages.field_types import field_type
+from flexsheet.messages.field_types import describe_field_type
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import find_parameters_type
 from website.messages_page import nested_models, type_section
@@ -49,7 +49,7 @@ def _section(name: str) -> str:
     kind = node_class(name)
     about = (kind.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
     rows = [
-        f"| `{key}` | {field_type(field)} | {unit(key)} | {_default(field)} | "
+        f"| `{key}` | {describe_field_type(field)} | {unit(key)} | {_default(field)} | "
         f"{field.description or ''} |"
         for key, field in find_parameters_type(kind).model_fields.items()
     ]

@@ -5,15 +5,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, BlockField
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
     FAULT_BITS,
     STATUS,
     STATUS_ADDRESS,
-    RegisterField,
-    register_count,
+    count_registers,
 )
 
 BEGIN = "<!-- registers: written by `make pages`; a test compares -->\n"
@@ -47,9 +46,9 @@ def registers() -> str:
     return "\n".join(blocks)
 
 
-def _block(title: str, address: int, block: Sequence[RegisterField]) -> str:
+def _block(title: str, address: int, block: Sequence[BlockField]) -> str:
     """Return the heading and table of a block; address: its first register."""
-    lines = [f"## {title}: {register_count(block)} registers from {address}", ""]
+    lines = [f"## {title}: {count_registers(block)} registers from {address}", ""]
     lines += ["| register | field | type | meaning |", "|---|---|---|---|"]
     for field in block:
         length = field.count * struct.calcsize(f">{field.kind}") // 2

@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import free_bytes, write_error
+from flexsheet.messages.files import free_bytes, make_write_error
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
@@ -129,7 +129,7 @@ def export(
             writer.write_metadata("flexsheet", {"bag": bag.name, "complete": complete})
         draft.replace(output)
     except OSError as error:
-        raise ExportError(str(write_error(output, error))) from error
+        raise ExportError(str(make_write_error(output, error))) from error
     except RuntimeError as error:
         raise ExportError(f"{output}: cannot be written: {error}") from error
     finally:

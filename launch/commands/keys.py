@@ -56,13 +56,13 @@ def new(
     import re
 
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, new_key_pair, write_secret
+    from flexsheet.messages.security import SecurityError, make_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(
             f'"{host}" is not a host name; use small letters, digits and _', BAD_INPUT
         )
-    public, secret = new_key_pair()
+    public, secret = make_key_pair()
     file = secret_file(host)
     try:
         write_secret(file, secret, replace=replace)

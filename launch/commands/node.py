@@ -103,10 +103,10 @@ def describe(
 
 
 def _parameter(name: str, field: Any) -> dict[str, Any]:
-    from flexsheet.messages.field_types import field_type
+    from flexsheet.messages.field_types import describe_field_type
 
     # As in docs/parameters.md, without the links.
-    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", field_type(field))
+    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     kind = re.sub(r"[`\\]", "", kind)
     return {
         "parameter": name,

@@ -18,8 +18,8 @@ from flexsheet.nodes.planner.compliance import (
     WEBER_RATIO_BARE,
     Compliance,
     ObjectCurve,
+    compute_force_uncertainty_ratio,
     fit_compliance,
-    force_uncertainty_ratio,
     make_stretch_limits,
 )
 
@@ -93,7 +93,7 @@ def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) ->
         "worst_error_ratio": float(np.abs(shown.centre.error_ratio).max()),
         "aimed_ratio": TARGET_ERROR_RATIO,
         "weber_ratio": [WEBER_RATIO, WEBER_RATIO_BARE],
-        "force_change_by_place_ratio": force_uncertainty_ratio(
+        "force_change_by_place_ratio": compute_force_uncertainty_ratio(
             shown.centre, scene.tolerances.sheet_position_m
         ),
         "note": shown.note,

@@ -36,9 +36,9 @@ from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
+    compute_rolling_twist,
     make_tangent_contact,
     roll_contact,
-    rolling_twist,
 )
 
 Floats = NDArray[np.float64]
@@ -176,7 +176,7 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
                     twists_world=np.array(
                         [
                             rotation
-                            @ rolling_twist(contact, scene.working_range.speed_m_per_s * direction)
+                            @ compute_rolling_twist(contact, scene.working_range.speed_m_per_s * direction)
                             for direction in (contact.axes[:, 0], contact.axes[:, 1])
                         ]
                     ),

@@ -27,7 +27,7 @@ from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import DISK_ERRORS, write_error
+from flexsheet.messages.files import DISK_ERRORS, make_write_error
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Point, Trial
 
@@ -523,7 +523,7 @@ def check_target(source: Path, target: Path) -> None:
 def _write_problem(target: Path, error: OSError) -> BadInputError:
     if error.errno in DISK_ERRORS:
         return BadInputError(
-            [Problem(str(write_error(target, error)), (), "the file is unchanged")]
+            [Problem(str(make_write_error(target, error)), (), "the file is unchanged")]
         )
     what = f"cannot be written: {error.strerror or error}"
     remedy = "give --output FILE in an existing, writable folder"

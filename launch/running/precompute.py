@@ -89,7 +89,7 @@ def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progr
 
     on_progress = _with_time_left("computing the sheet's force, once", progress)
     force_table.load_or_compute(scene, cache_dir, on_progress)
-    return force_table.table_cache(scene).path(cache_dir)
+    return force_table.make_table_cache(scene).path(cache_dir)
 
 
 def precompute_soft_body(
@@ -127,4 +127,4 @@ def precompute_soft_body(
     except (ValueError, MemoryError, precompute_table.WorkersError) as error:
         raise NoSoftBodyError(str(error)) from error
     spec = body.make_table_spec(scene, bodies[0].spec)
-    return precompute_table.table_cache(spec).path(folder)
+    return precompute_table.make_table_cache(spec).path(folder)

@@ -1,9 +1,9 @@
-"""Decide one arm's command in each cycle: follow the sheet's target, hold, stop or relax.
+"""Decide one arm's command in each cycle: follow the sheet's target, pause, stop or relax.
 
 This module uses no sockets and no clock.  The node passes in the inputs and the duration of the
-cycle, and sends the command that comes back.  `state_machine` defines the states and their
-transitions.  Both bridges bound the sheet's motion alike in the sheet's frame, so that the two
-arms stay together on long paths.  Each arm's joints then pass the limiter.
+cycle, and sends the returned command.  `state_machine` defines the states and their transitions.
+Both bridges bound the sheet's motion equally in the sheet's frame, which synchronizes the two arms
+on long paths.  Each arm's joints then pass the limiter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, scale_speeds, sync_factor
+from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, scale_speeds
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
@@ -41,7 +41,7 @@ from flexsheet.nodes.arm_bridge.path_check import (
 from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     StandstillMonitor,
-    edge_shift_m,
+    bound_edge_shift_m,
 )
 from flexsheet.nodes.arm_bridge.state_machine import (
     CHECKING_STATES,
@@ -89,7 +89,7 @@ MEASURED_SLACK_M = 0.002
 """How far a measured flange may exceed a limit of commands; servos ripple."""
 
 SLACK_STRETCH = 1.0005
-"""Stretch ratio at which the sheet counts as slack; it then pulls with 0.1 N."""
+"""Stretch ratio at which the sheet counts as slack; its tension is then 0.1 N."""
 
 NO_MOTION = np.zeros(6)
 
@@ -97,7 +97,7 @@ IMPLAUSIBLE_LENGTH_RATIO = 1.1
 """A measured sheet longer than this multiple of its limit is a measurement error."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""A goal further away than this in one cycle lies on another branch of solutions."""
+"""A goal further away than this in one cycle is on another branch of solutions."""
 
 RELAX_DELAY_S = 0.5
 """An arm without a target slackens the sheet after this time; a short gap changes nothing."""
@@ -188,12 +188,12 @@ class ArmControl:
 
     @property
     def state(self) -> State:
-        """The present state."""
+        """Return the present state."""
         return self._state
 
     @property
     def mode(self) -> ArmMode:
-        """The mode that the bridge publishes."""
+        """Return the mode that the bridge publishes."""
         return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
 
     @property
@@ -203,7 +203,7 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Faults for which the other arm must stop: own faults, an e-stop, a lost connection."""
+        """Return the faults for the other arm: own faults, an e-stop, a lost connection."""
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
@@ -264,7 +264,7 @@ class ArmControl:
         return newly
 
     def on_connection_lost(self, text: str) -> None:
-        """Drop everything but a latched fault or e-stop."""
+        """Discard the motion; a latched fault or e-stop remains."""
         self.measured_rad = None
         self._standstill.forget()
         self._inhibit(text, Event.CONNECTION_LOST)
@@ -532,7 +532,7 @@ class ArmControl:
         if is_late:
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
-            speed_factor = sync_factor(
+            speed_factor = compute_sync_factor(
                 geometry.world_from_edge(self.commanded_rad),
                 other.world_from_flange_commanded @ geometry.other_flange_from_edge,
                 goal.motion.world_from_sheet,
@@ -574,7 +574,7 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Start the motion if its path is known to be clear; else rest and request a check.
+        """Start the motion if its path has been checked; otherwise rest and request a check.
 
         The other bridge checks the same path of the same arms.  No arm moves before both follow.
         """
@@ -604,7 +604,7 @@ class ArmControl:
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
         """Store the result of a check: the alignment, or why the path is blocked.
 
-        None starts the motion as the arms stand.  The result of an older request is dropped.
+        None starts the motion without an alignment.  The result of an older request is dropped.
         """
         if request is not self.pending_check:
             return
@@ -772,7 +772,7 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
-        """Decelerate along the path; at rest, stay."""
+        """Decelerate along the path; at rest, command no motion."""
         self.handle(Event.RELAX_BLOCKED)
         self._drop_path()
         self._settle()
@@ -849,7 +849,7 @@ class ArmControl:
 
     def _is_at_command(self, measured: Floats) -> bool:
         """Return whether the arm is so near to its last command that it may restart there."""
-        return edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
+        return bound_edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))

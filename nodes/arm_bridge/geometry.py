@@ -15,7 +15,7 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
     forward,
-    next_joints,
+    solve_next_joints,
 )
 from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
@@ -104,7 +104,7 @@ class ArmGeometry:
             motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
         )
         flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return next_joints(self.base_from_world @ flange, present_rad)
+        return solve_next_joints(self.base_from_world @ flange, present_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the resting sheet between this arm's edge and the other's (world poses)."""

@@ -44,7 +44,7 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the target by `ahead_s` (of either sign), at most by `max_extrapolation_s`.
+    """Extrapolate the target by `ahead_s` (positive or negative), limited to `max_extrapolation_s`.
 
     overdue_s: time since the next target was due.  A target that needs a longer extrapolation is
     overdue by the rest, whenever it has arrived.  So is one too far in the future, whose clock
@@ -88,7 +88,9 @@ def make_goal(
     )
 
 
-def sync_factor(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) -> float:
+def compute_sync_factor(
+    own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool
+) -> float:
     """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
 
     own_edge, other_edge: world poses of the commanded edges; left: whether the own edge is the

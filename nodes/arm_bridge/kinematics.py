@@ -3,7 +3,7 @@
 Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.
 
 The chain follows two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube
-`mrv1a.urdf`).  At zero the arm stands upright, and every frame is parallel to the base.  J1, J4, J6
+`mrv1a.urdf`).  At zero the arm is upright, and every frame is parallel to the base.  J1, J4, J6
 rotate about z; J2, J3, J5 about y.  Shoulder height 300 mm, upper arm 250 mm, elbow shift 90 mm
 backwards, forearm 160 mm, flange 72 mm beyond the wrist centre.
 """
@@ -95,7 +95,7 @@ BRANCHES = tuple(
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """No joint angles within the ranges give the flange pose.
+    """A flange pose without joint angles within the ranges.
 
     limit: "reach", or the joint that the nearest branch has out of range.
     """
@@ -139,7 +139,7 @@ def forward(joints_rad: ArrayLike) -> Floats:
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
     """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
 
-    The order is that of `BRANCHES`.  A joint that a singularity leaves free is taken from
+    The order is that of `BRANCHES`.  A joint that a singularity leaves undefined equals that of
     `present_rad` (6,).  Angles are within a revolution of zero.  The list is empty when the wrist
     centre is too far or too near.
     """
@@ -194,7 +194,7 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
     return np.array(nearest)
 
 
-def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
+def solve_next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     """Return joints (6,) rad for the next step of a motion, on the present branch without jumps.
 
     The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
@@ -348,7 +348,7 @@ def find_branch(joints_rad: ArrayLike) -> Branch:
     )
 
 
-def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
+def solve_joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
     """Return joints (n, 6) rad of flange poses (n, 4, 4) on one branch, in or out of range.
 
     NaN where the wrist centre is out of reach.  J4 and J6 are the nearest to `near_rad` (6,) of

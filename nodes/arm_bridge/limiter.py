@@ -145,7 +145,7 @@ def find_desired_velocity(
 def clamp_to_range(
     joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
-    """Clamp desired velocities to the acceleration, and so that every joint can stop in range."""
+    """Clamp velocities to the acceleration, and to speeds that can stop within the range."""
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
     down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
@@ -283,7 +283,7 @@ def relax_limits(
 ) -> SheetLimits:
     """Widen the limits where the arms (world poses) exceed them, or nearly do.
 
-    A motion that starts beyond a limit may return within it, but not go further.  left: see
+    A motion that starts beyond a limit may return within it, and must not go further.  left: see
     `check_sheet`.
     """
     across = other_edge[:3, 3] - edge[:3, 3]

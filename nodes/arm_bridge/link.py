@@ -141,11 +141,24 @@ class ArmStatus:
     freshness: Freshness = field(default=Freshness.FIRST, kw_only=True)
 
 
+@dataclass(frozen=True, slots=True)
+class BlockField:
+    """Field of a register block or packet.
+
+    kind: a struct code, H (u16), I (u32), f (float32) or x (pad).
+    """
+
+    name: str
+    kind: str
+    count: int
+    about: str
+
+
 class ArmLink(Protocol):
     """Interface for the exchange of commands and answers with one arm, one exchange at a time.
 
     Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
-    joints), `hold` and `stop` (stay).
+    joints), `hold` and `stop` (no motion).
     """
 
     def due(self, now_ns: int) -> bool:

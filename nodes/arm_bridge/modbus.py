@@ -1,7 +1,7 @@
 """Exchange commands by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
 
 `COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
-docs/modbus.md from them.  Numbers of 32 bits take two registers, high word first.  The
+docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one first.  The
 CRC-32 (zlib's) covers every register before it in its block, high byte first.
 """
 
@@ -29,6 +29,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
+    BlockField,
     CounterMonitor,
     propagate_cancellation,
     validate_joints,
@@ -41,46 +42,35 @@ VERSION = 1
 COMMAND_ADDRESS = 0
 STATUS_ADDRESS = 100
 
-
-@dataclass(frozen=True, slots=True)
-class RegisterField:
-    """Field of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
-
-    name: str
-    kind: str
-    count: int
-    about: str
-
-
 COMMAND = (
-    RegisterField("magic", "H", 1, "0x4653, the letters FS"),
-    RegisterField("version", "H", 1, "version of this map: 1"),
-    RegisterField(
+    BlockField("magic", "H", 1, "0x4653, the letters FS"),
+    BlockField("version", "H", 1, "version of this map: 1"),
+    BlockField(
         "sequence", "I", 1, "increases with every command; an `idle` command may restart it"
     ),
-    RegisterField("time_us", "I", 1, "time of the command, sender's clock, wraps after 71 minutes"),
-    RegisterField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
-    RegisterField("reserved", "H", 1, "0"),
-    RegisterField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
-    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    BlockField("time_us", "I", 1, "time of the command, sender's clock, wraps after 71 minutes"),
+    BlockField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
+    BlockField("reserved", "H", 1, "0"),
+    BlockField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
+    BlockField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 STATUS = (
-    RegisterField("magic", "H", 1, "0x4653"),
-    RegisterField("version", "H", 1, "version of this map: 1"),
-    RegisterField("accepted", "I", 1, "sequence of the last accepted command"),
-    RegisterField("cycle", "I", 1, "the controller's cycles since its start"),
-    RegisterField("time_us", "I", 1, "time of the joint measurement, controller's clock"),
-    RegisterField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
-    RegisterField(
+    BlockField("magic", "H", 1, "0x4653"),
+    BlockField("version", "H", 1, "version of this map: 1"),
+    BlockField("accepted", "I", 1, "sequence of the last accepted command"),
+    BlockField("cycle", "I", 1, "the controller's cycles since its start"),
+    BlockField("time_us", "I", 1, "time of the joint measurement, controller's clock"),
+    BlockField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
+    BlockField(
         "faults",
         "H",
         1,
         "bits: 1 joint out of range, 2 step too large, 4 not finite, 8 watchdog, 16 servo",
     ),
-    RegisterField("joints_rad", "f", 6, "measured J1 to J6"),
-    RegisterField("refused", "I", 1, "commands refused since the controller's start"),
-    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    BlockField("joints_rad", "f", 6, "measured J1 to J6"),
+    BlockField("refused", "I", 1, "commands refused since the controller's start"),
+    BlockField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 COMMAND_MODES = {"idle": 0, "move": 1, "hold": 2, "stop": 3}
@@ -94,21 +84,21 @@ FAULT_BITS = {
 }
 
 
-def struct_format(block: Sequence[RegisterField]) -> str:
+def make_struct_format(block: Sequence[BlockField]) -> str:
     """Return the struct format of a block, big-endian."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
-def register_count(block: Sequence[RegisterField]) -> int:
+def count_registers(block: Sequence[BlockField]) -> int:
     """Return the number of 16-bit registers of a block."""
-    return struct.calcsize(struct_format(block)) // 2
+    return struct.calcsize(make_struct_format(block)) // 2
 
 
 # Every failure is raised as ArmLinkError; the library's log would repeat it with hex dumps.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
-_COMMAND_FORMAT, _STATUS_FORMAT = struct_format(COMMAND), struct_format(STATUS)
-_STATUS_REGISTERS = register_count(STATUS)
+_COMMAND_FORMAT, _STATUS_FORMAT = make_struct_format(COMMAND), make_struct_format(STATUS)
+_STATUS_REGISTERS = count_registers(STATUS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +129,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 
 
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
-    """Decode a status block; raises ArmAnswerError with what is wrong."""
+    """Decode a status block; raises ArmAnswerError if it is invalid."""
     if len(registers) != _STATUS_REGISTERS:
         raise ArmAnswerError(f"status of {len(registers)} registers, expected {_STATUS_REGISTERS}")
     whole = struct.pack(f">{len(registers)}H", *registers)
@@ -201,7 +191,7 @@ class ModbusLink:
     """`ArmLink` by one Modbus TCP connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
-    hand a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
+    pass a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
     connection reopens at once after a first failure, then after pauses that double up to
     `max_pause_s`.
     """

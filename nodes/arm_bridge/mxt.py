@@ -26,6 +26,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
+    BlockField,
     CounterMonitor,
     propagate_cancellation,
     validate_joints,
@@ -45,58 +46,44 @@ FLAG_RIGHT, FLAG_ABOVE, FLAG_NONFLIP = 4, 2, 1
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
 """Largest plausible angle of a joint; an answer with a larger one is invalid."""
 
-
-@dataclass(frozen=True, slots=True)
-class PacketField:
-    """Field of the packet.
-
-    kind: a struct code, H (u16), I (u32), f (float32) or x (pad).
-    """
-
-    name: str
-    kind: str
-    count: int
-    about: str
-
-
 PACKET = (
-    PacketField("command", "H", 1, "0 none, 1 move, 255 end"),
-    PacketField(
+    BlockField("command", "H", 1, "0 none, 1 move, 255 end"),
+    BlockField(
         "send_type",
         "H",
         1,
         "type of `data`: 0 none, 1 pose, 2 joints, 3 pulses; in an answer 0 to 11",
     ),
-    PacketField(
+    BlockField(
         "receive_type", "H", 1, "requested type of the answer's `data`: 0 to 11; 8 measured joints"
     ),
-    PacketField("reserved", "x", 2, "0"),
-    PacketField("data", "f", 8, "joints in rad, or x y z in mm and a b c in rad; the rest 0"),
-    PacketField(
+    BlockField("reserved", "x", 2, "0"),
+    BlockField("data", "f", 8, "joints in rad, or x y z in mm and a b c in rad; the rest 0"),
+    BlockField(
         "flags",
         "I",
         2,
         "structure of a pose (4 right, 2 above, 1 nonflip), and number of revolutions",
     ),
-    PacketField("send_io_type", "H", 1, "0: no signals"),
-    PacketField("receive_io_type", "H", 1, "0: no signals"),
-    PacketField("bit_top", "H", 1, "0"),
-    PacketField("bit_mask", "H", 1, "0"),
-    PacketField("io_data", "H", 1, "0"),
-    PacketField("timeouts", "H", 1, "in an answer: the controller's cycles without a command"),
-    PacketField("count", "I", 1, "in an answer: the communications since the program's start"),
-    PacketField("more_1", "x", 44, "a second monitor: type, pad, data; not used"),
-    PacketField("more_2", "x", 44, "a third"),
-    PacketField("more_3", "x", 44, "a fourth"),
+    BlockField("send_io_type", "H", 1, "0: no signals"),
+    BlockField("receive_io_type", "H", 1, "0: no signals"),
+    BlockField("bit_top", "H", 1, "0"),
+    BlockField("bit_mask", "H", 1, "0"),
+    BlockField("io_data", "H", 1, "0"),
+    BlockField("timeouts", "H", 1, "in an answer: the controller's cycles without a command"),
+    BlockField("count", "I", 1, "in an answer: the communications since the program's start"),
+    BlockField("more_1", "x", 44, "a second monitor: type, pad, data; not used"),
+    BlockField("more_2", "x", 44, "a third"),
+    BlockField("more_3", "x", 44, "a fourth"),
 )
 
 
-def struct_format(packet: Sequence[PacketField]) -> str:
+def make_struct_format(packet: Sequence[BlockField]) -> str:
     """Return the struct format of a packet, little-endian without padding by the compiler."""
     return "<" + "".join(f"{field.count}{field.kind}" for field in packet)
 
 
-_PACKET = struct.Struct(struct_format(PACKET))
+_PACKET = struct.Struct(make_struct_format(PACKET))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +138,7 @@ def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
-    """Decode an answer; raises ArmAnswerError with what is wrong."""
+    """Decode an answer; raises ArmAnswerError if it is invalid."""
     if len(packet) != PACKET_BYTES:
         raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
     command, send_type, receive_type, *data, _, _, _, _, _, _, _, timeouts, count = _PACKET.unpack(
@@ -208,7 +195,7 @@ class MxtLink:
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
         """Send one command and return the status that answers it; raises ArmLinkError.
 
-        The controller answers in its own cycle, so this takes up to CONTROLLER_CYCLE_S.
+        The controller answers in its own cycle, after up to CONTROLLER_CYCLE_S.
         """
         if mode == "idle":
             self._count, self._unanswered = None, 0

@@ -50,7 +50,7 @@ class OtherArm:
 
     @cached_property
     def invalid_reason(self) -> str | None:
-        """Why this state must not be used, or None."""
+        """Return why this state must not be used, or None."""
         if not np.isfinite(self.joints_rad).all():
             return "its joints are not finite"
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
@@ -61,12 +61,12 @@ class OtherArm:
 
     @property
     def estopped(self) -> bool:
-        """Whether an e-stop stops it; then neither arm moves, not even to slacken the sheet."""
+        """Return whether an e-stop stops it; then no arm moves, not even to slacken the sheet."""
         return self.mode == "estop" or self.estop_engaged
 
     @property
     def interlock_reason(self) -> str | None:
-        """Why this arm must not move together with it, or None."""
+        """Return why this arm must not move together with it, or None."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -1,7 +1,7 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
 Each bridge receives both arms' joints.  It simulates the sheet's motion and checks at each pose
-whether both arms are within their limits.  A check takes some milliseconds and therefore runs
+whether both arms are within their limits.  A check needs some milliseconds and therefore runs
 outside the cycle that sends commands.
 """
 
@@ -27,7 +27,7 @@ from flexsheet.nodes.arm_bridge.reach import (
     plan_path_through,
     solve_step,
 )
-from flexsheet.nodes.arm_bridge.standstill import edge_shift_m
+from flexsheet.nodes.arm_bridge.standstill import bound_edge_shift_m
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
@@ -52,10 +52,10 @@ CORNER_EVERY = 4
 """Steps between two corners of the checked path; it deviates by less than 1 mm between them."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""Distance of a target from the checked one up to which the check still holds."""
+"""Distance of a target from the checked one up to which the check remains valid."""
 
 MAX_START_MOTION_RAD = 0.002
-"""Joint motion since the check up to which the check still holds."""
+"""Joint motion since the check up to which it remains valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Fractions of the path at which the arms may align to the sheet; the first feasible one is used.
@@ -227,7 +227,7 @@ def _find_duration_s(begin: PathStep, there: PathStep) -> float:
         (begin.left_rad, there.left_rad),
         (begin.right_rad, there.right_rad),
     ):
-        travel_m = edge_shift_m(start, end)
+        travel_m = bound_edge_shift_m(start, end)
         change_rad = float(np.abs(end - start).max())
         duration_s = max(
             duration_s, travel_m / ALIGN_SPEED_M_PER_S, change_rad / ALIGN_SPEED_RAD_PER_S

@@ -29,9 +29,9 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     UnreachableError,
     branches,
     find_branch,
-    joints_on_branch,
-    next_joints,
     singularities,
+    solve_joints_on_branch,
+    solve_next_joints,
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
@@ -149,7 +149,7 @@ class ArmReach:
         return np.asarray(self.binding < 0)
 
 
-def flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
+def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
     """Return world_from_flange (n, 4, 4) of an arm for poses of the sheet."""
     width = geometry.sheet_limits.width_m
     outwards = -0.5 if geometry.left else 0.5
@@ -163,9 +163,9 @@ def compute_reach(
     geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Branch
 ) -> ArmReach:
     """Return how an arm reaches the poses on one branch; other: the other arm."""
-    flanges = flange_poses(geometry, places)
-    joints = joints_on_branch(geometry.base_from_world @ flanges, branch, CENTRE_RAD)
-    others = flange_poses(other, places)
+    flanges = compute_flange_poses(geometry, places)
+    joints = solve_joints_on_branch(geometry.base_from_world @ flanges, branch, CENTRE_RAD)
+    others = compute_flange_poses(other, places)
     margins = _margins(
         geometry, branch, joints=joints, flanges=flanges, others=others, places=places
     )
@@ -290,7 +290,7 @@ def _joint_rates(
         moved[:, :3, :3] = rotation_step @ flanges[:, :3, :3]
         arm = flanges[:, :3, 3] - centre
         moved[:, :3, 3] = centre + linear * time_s + np.einsum("nij,nj->ni", rotation_step, arm)
-        found.append(joints_on_branch(geometry.base_from_world @ moved, branch, CENTRE_RAD))
+        found.append(solve_joints_on_branch(geometry.base_from_world @ moved, branch, CENTRE_RAD))
     change = found[1] - found[0]
     return np.asarray((change - 2.0 * np.pi * np.rint(change / (2.0 * np.pi))) / (2 * SPEED_STEP_S))
 
@@ -366,7 +366,7 @@ def plan_path(
 
     The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If that
     is blocked, the path goes through start and goal shifted by one of the detours.  Raises
-    PathError with what blocks the straight path.
+    PathError with the limit that blocks the straight path.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None
@@ -476,7 +476,7 @@ def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
-    pose = arm.base_from_world @ flange_poses(arm, _make_poses([start]))[0]
+    pose = arm.base_from_world @ compute_flange_poses(arm, _make_poses([start]))[0]
     revolutions = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
     lowest, highest = arm.joint_limits.min_rad, arm.joint_limits.max_rad
     found: list[tuple[float, Floats]] = []
@@ -494,8 +494,8 @@ def _solve_joints(
     arm: ArmGeometry, place: SheetMotion, near_rad: Floats, *, fraction: float
 ) -> Floats:
     try:
-        pose = flange_poses(arm, _make_poses([place]))[0]
-        return next_joints(arm.base_from_world @ pose, near_rad)
+        pose = compute_flange_poses(arm, _make_poses([place]))[0]
+        return solve_next_joints(arm.base_from_world @ pose, near_rad)
     except UnreachableError as error:
         limit = error.limit if error.limit == "reach" else f"{error.limit} range"
         raise PathError(
@@ -521,7 +521,7 @@ def solve_step(
         _solve_joints(right, sheet, near.right_rad, fraction=fraction),
     )
     places = _make_poses([sheet])
-    flanges = [flange_poses(arm, places) for arm in (left, right)]
+    flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
     for number, (arm, joints) in enumerate(((left, step.left_rad), (right, step.right_rad))):
         margins = _margins(
             arm,
@@ -576,7 +576,7 @@ def _check_limits(
         np.array([step.left_rad for step in track]),
         np.array([step.right_rad for step in track]),
     )
-    flanges = [flange_poses(arm, places) for arm in (left, right)]
+    flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
     times = np.zeros(len(track))
     for index, arm in enumerate((left, right)):
         branch = find_branch(joints[index][0])

@@ -1,4 +1,4 @@
-"""Detect that an arm stands still, from fresh and plausible measurements."""
+"""Detect the standstill of an arm from fresh and plausible measurements."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ON_PATH_RAD = 0.005
 """Distance from the recently commanded joints within which any measurement is plausible."""
 
 
-def edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
+def bound_edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
     """Return an upper bound of the distance (m) of an edge between two sets of joints (6,) rad."""
     return float(JOINT_LEVER_M @ np.abs(joints_rad - other_rad))
 
@@ -63,7 +63,7 @@ class StandstillMonitor:
         self._lowest_rad, self._highest_rad = np.full(6, np.inf), np.full(6, -np.inf)
 
     def is_standing(self, *, at_command: bool) -> bool:
-        """Return whether the arm stands still; at_command: whether at its last command."""
+        """Return whether the arm is at rest; at_command: whether it is at its last command."""
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
     @property

@@ -52,7 +52,7 @@ class Event(Enum):
     FAULT = "a fault is latched"
     ESTOP = "an e-stop is latched"
     AT_REST = "the commanded joints are at rest"
-    RELAX = "the arm can begin to slacken the sheet"
+    RELAX = "the arm can start to slacken the sheet"
     RELAX_BLOCKED = "the arm must not, or cannot, slacken the sheet now"
     RELAX_ENDED = "the sheet is slack, or the arm does not obey"
     WAIT_FOR_OTHER = "this arm is ready, the other arm is not"

@@ -134,7 +134,7 @@ def code_version() -> str:
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
-def table_cache(spec: TableSpec) -> Specification[Table]:
+def make_table_cache(spec: TableSpec) -> Specification[Table]:
     """Return the cache specification of a nonlinear table."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
@@ -156,7 +156,7 @@ def compute_table(
     machine. Raises MemoryError, before any snapshot is solved, if the machine has too little memory
     for these workers; other errors as `cached` and `solve_all`.
     """
-    entry = table_cache(spec)
+    entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
     return cached(
         entry,

@@ -28,7 +28,7 @@ from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
 from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel
-from flexsheet.nodes.fem_solver.precompute_table import local_processes, solve_all, table_cache
+from flexsheet.nodes.fem_solver.precompute_table import local_processes, make_table_cache, solve_all
 from flexsheet.nodes.fem_solver.snapshot_interpolator import (
     NEIGHBOURS,
     SnapshotInterpolator,
@@ -218,7 +218,7 @@ def load_full_table(
     body: SceneBody, scene: Scene, model: SoftBodyModel, cache_dir: Path
 ) -> SceneBody | None:
     """Return the body with its full table, or None if that is not cached."""
-    table = load_cached(table_cache(make_table_spec(scene, body.spec)), cache_dir)
+    table = load_cached(make_table_cache(make_table_spec(scene, body.spec)), cache_dir)
     return None if table is None else attach_table(body, scene, model, table)
 
 

@@ -80,7 +80,7 @@ class SoftBodyFactory:
         if method == "linear" or spec.sticking:
             return [linear]
         table = load_cached(
-            precompute_table.table_cache(body.make_table_spec(scene, spec)), self.cache_dir
+            precompute_table.make_table_cache(body.make_table_spec(scene, spec)), self.cache_dir
         )
         if table is None:
             return [linear]

@@ -1,7 +1,7 @@
 """Choose the sheet's stretch and normal offset, so that it renders the object's force.
 
 A finger at depth `d` in the object would indent a sheet in the object's tangent plane by `d`.  The
-sheet would then give the object's force at one depth only.  So the sheet also moves along its
+sheet would then have the object's force at one depth only.  So the sheet also moves along its
 normal: by an offset r(d) behind the tangent plane (in front of it where r is negative).  The
 remaining indentation i = d - r is the one at which the sheet's model gives the object's force:
 
@@ -191,12 +191,12 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Distance of the sheet behind the object's tangent plane, (n,)."""
+        """Return the distance (n,) of the sheet behind the object's tangent plane, m."""
         return self.depths_m - self.indentation_m
 
     @property
     def error_ratio(self) -> Floats:
-        """Rendered over object's force, minus one (n,); 0 if neither can be felt."""
+        """Return rendered over object's force, minus one (n,); 0 if neither can be felt."""
         felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
         difference = (self.force_n - self.object_force_n) / np.maximum(
             self.object_force_n, FORCE_JND_FLOOR_N
@@ -207,11 +207,11 @@ class RenderedForce:
 
 _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
 DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
-"""Depths, over the maximum, at which the offset is computed: denser where contact begins.
+"""Depths, over the maximum, at which the offset is computed: denser near the start of the contact.
 
 They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, where its control points lie.
 The spline is C1, and its slope is bounded by those between its control points.  So bounds on the
-slope at these depths hold everywhere; a spline through the points would not guarantee that.
+slope at these depths are valid everywhere; a spline through the points would not guarantee that.
 """
 
 SATURATION_FRACTION = 0.1
@@ -341,7 +341,7 @@ class Compliance:
 
     @property
     def max_depth_m(self) -> float:
-        """Maximum depth of the fit; deeper the sheet moves with the finger."""
+        """Return the maximum depth of the fit (m), beyond which the sheet moves with the finger."""
         return float(self.centre.depths_m[-1])
 
     def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
@@ -381,7 +381,7 @@ class Compliance:
     def _weights(self, position_m: SheetPosition) -> Floats:
         """Return the nodes' weights (9,): linear in x^2 and y^2, since the sheet is symmetric.
 
-        No weight is negative.  So the bounds that hold at the nodes (force, advance, monotony) hold
+        No weight is negative.  So the bounds at the nodes (force, advance, monotony) are also valid
         between them.
         """
         weights = [
@@ -511,7 +511,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
             f"{rendered.object_force_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; "
             f"{cause}; users notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
         )
-    uncertainty = force_uncertainty_ratio(rendered, position_error_m)
+    uncertainty = compute_force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
             f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
@@ -522,7 +522,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
     return ""
 
 
-def force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
+def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
     """Return the relative change of the force at maximum depth by an error of the position."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
@@ -536,7 +536,7 @@ class StretchChoice:
     note: str
 
 
-def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
+def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     """Return minimum and maximum stretch: the scene's, within the usable edge force."""
     at_max_force = stretch_for_edge_force(
         USABLE_FRACTION * sheet.max_edge_force_n,
@@ -554,7 +554,7 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
 
     It follows from the linear model, which ignores the object's curve and the fingertip.
     """
-    least, largest = stretch_range(sheet)
+    least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(
         edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
         young_modulus_pa=sheet.young_modulus_pa,

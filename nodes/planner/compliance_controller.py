@@ -36,7 +36,7 @@ class ComplianceController:
     """Controller of the sheet's stretch and normal offset for the object under the finger.
 
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
-        small pushes by the stretch alone, as the paper does.
+        small pushes by the stretch only, like the paper.
     """
 
     def __init__(self, scene: Scene, model: SheetForceModel, mode: ComplianceMode) -> None:
@@ -88,7 +88,7 @@ class ComplianceController:
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted))))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return why the model does not hold for the deepest push at the sheet's centre, if so."""
+        """Return why the model is invalid for the deepest push at the centre; empty if valid."""
         max_depth_m = self._scene.working_range.push_depth_m
         reason = self._model.invalid_reason(
             fitted.stretch_ratio,

@@ -15,12 +15,12 @@ from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, t
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
     compute_rim_lift_m,
+    compute_rolling_twist,
+    compute_tangent_twist,
     limit_tilt,
     make_tangent_contact,
     measure_spin_rad,
     roll_contact,
-    rolling_twist,
-    tangent_twist,
     transport_axes,
 )
 
@@ -39,7 +39,7 @@ MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
 """Limits of plausible fingers, in the object's frame."""
 
 MAX_TILT_RAD = 1.4
-"""Maximum tilt of the sheet, whatever the scene.  Two normals within it are never opposite, so
+"""Maximum tilt of the sheet in any scene.  Two normals within it are never opposite, so
 that the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
@@ -141,7 +141,7 @@ class ContactStateMachine:
         twist = (
             np.zeros(6)
             if limited
-            else tangent_twist(self.contact, rate, self._home, limits.half_width_m)
+            else compute_tangent_twist(self.contact, rate, self._home, limits.half_width_m)
         )
         reason: SheetReason = (
             "beyond_tilt"
@@ -155,8 +155,8 @@ class ContactStateMachine:
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
         """Return the contact on the sheet at its current pose.
 
-        The finger touches a moving sheet at its current point and rotation; then the sheet neither
-        slips nor spins.
+        The finger touches a moving sheet at its current point and rotation; then the sheet
+        rolls without slip and spin.
         """
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
@@ -186,7 +186,7 @@ class ContactStateMachine:
             return self._hold(past or "beyond_tilt", depth)
         # Deep inside, where the nearest point is arbitrary, stay on the sheet's side.
         self._nearest_point = self.contact.point
-        twist = rolling_twist(self.contact, rate)
+        twist = compute_rolling_twist(self.contact, rate)
         return ContactCommand("contact", self._concavity_reason(), self.contact, twist, depth)
 
     def _blend_contact(

@@ -21,7 +21,7 @@ from flexsheet.nodes.models.sheet.force_models import (
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-from flexsheet.nodes.planner.sheet_force import make_rubber, membrane_table
+from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
 VERSION = 1
 """Version of the computation; another version computes the table again."""
@@ -38,7 +38,7 @@ FORCE_MODELS: dict[str, Callable[[Rubber], SheetForceModel]] = {
 }
 
 
-def table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
+def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
     """Describe the cache file of the scene's table."""
     rubber = make_rubber(scene.sheet)
     depends_on = {
@@ -69,9 +69,9 @@ def load_or_compute(
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
     return cached(
-        table_cache(scene),
+        make_table_cache(scene),
         cache_dir,
-        lambda: membrane_table(
+        lambda: compute_membrane_table(
             make_rubber(sheet),
             stretches=np.array(ends),
             xs_m=sheet.width_m * XS,
@@ -92,7 +92,7 @@ def load_force_model(
     rubber = make_rubber(scene.sheet)
     if method != "table":
         return FORCE_MODELS[method](rubber), method
-    table = load_cached(table_cache(scene), cache_dir)
+    table = load_cached(make_table_cache(scene), cache_dir)
     if table is None:
         note = "scaled; the table of the sheet's force is not computed: run flexsheet precompute"
         return ScaledSheetModel(rubber), note

@@ -15,7 +15,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
-from flexsheet.nodes.planner.timing import MonotonicTimestampFilter, next_horizon_s
+from flexsheet.nodes.planner.timing import MonotonicTimestampFilter, update_horizon_s
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 
 FIRST_HORIZON_S = 0.05
@@ -119,7 +119,7 @@ class Planner(Node):
         before_s = self._horizon_s
         max_s = (len(fingertip.predicted_path_world_m) - 1) * fingertip.prediction_step_s
         needed_s = age_s + self.parameters.actuation_delay_s
-        self._horizon_s = next_horizon_s(before_s, needed_s, max_s)
+        self._horizon_s = update_horizon_s(before_s, needed_s, max_s)
         return self._horizon_s - before_s
 
     def _publish(self, planned: PlannedStep, source_ns: int) -> None:

@@ -46,7 +46,7 @@ class PlannerParameters(NodeParameters):
         default=None, description="folder of the sheet's force table; null: the user's cache"
     )
     contact_on_m: float = Field(
-        default=0.0005, description="distance from the sheet at which contact begins"
+        default=0.0005, description="distance from the sheet at which contact starts"
     )
     contact_off_m: Positive = Field(
         default=0.003, description="distance from the sheet at which contact ends"

@@ -52,13 +52,13 @@ class SheetContact:
 
     @property
     def nearest(self) -> Nearest:
-        """The contact's surface point as a result of `Shape.closest`."""
+        """Return the contact's surface point as a result of `Shape.closest`."""
         no = np.zeros((), dtype=bool)
         return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, no, no)
 
     @property
     def object_from_sheet(self) -> Floats:
-        """The sheet's pose (4, 4), with its frame at its centre."""
+        """Return the sheet's pose (4, 4), with its frame at its centre."""
         contact_sheet = np.append(self.position_sheet_m, -self.lift_m)
         return transform(self.axes, self.point - self.axes @ contact_sheet)
 
@@ -114,7 +114,7 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
     return SheetContact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
 
 
-def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
+def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
     Without spin the sheet rotates by n x dn; without slip its point in contact is at rest.
@@ -126,11 +126,13 @@ def rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     return np.concatenate([cross(angular, to_centre), angular])
 
 
-def tangent_twist(contact: SheetContact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
+def compute_tangent_twist(
+    contact: SheetContact, rate: Floats, home: Floats, half_width_m: float
+) -> Floats:
     """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
 
-    The smallest rotation from `home` gives its axes.  Besides n x dn, it rotates them about the
-    normal n by -(h x n) dn / (1 + h n), where h is the third axis of home.
+    Its axes follow from `home` by the smallest rotation.  With h, the third axis of home, they
+    rotate by n x dn and, about the normal n, by -(h x n) dn / (1 + h n).
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -186,9 +188,9 @@ def limit_tilt(
 
 
 def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
-    """Return how far the tangent plane must be lifted to clear the object around the contact (m).
+    """Return the offset (m) of the tangent plane that clears the object around the contact.
 
-    It is 0 where the object is not concave.  `RIM_RADIUS_M` is how far a finger deforms the sheet.
+    It is 0 where the object is not concave.  A finger deforms the sheet within `RIM_RADIUS_M`.
     """
     return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 

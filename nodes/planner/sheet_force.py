@@ -66,7 +66,7 @@ def make_force_model(
 TABLE_DEPTHS_M = np.array([0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.05])
 
 
-def membrane_table(
+def compute_membrane_table(
     rubber: Rubber,
     *,
     stretches: Floats,

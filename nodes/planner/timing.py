@@ -40,7 +40,7 @@ class MonotonicTimestampFilter:
         return first_step_s if last_ns is None else (source_ns - last_ns) * 1e-9
 
 
-def next_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
+def update_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
     """Return the prediction horizon (s) of the next target.
 
     The horizon follows slowly, so that one late fingertip does not make the sheet's time jump.

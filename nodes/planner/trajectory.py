@@ -183,7 +183,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def motion(self) -> SheetMotion:
-        """The sheet's planned pose and motion."""
+        """Return the sheet's planned pose and motion."""
         return self._state.sheet
 
     def _make_step(self, command: ContactCommand) -> PlannedStep:

@@ -12,7 +12,7 @@ from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.page import MARK, render_page
 from flexsheet.launch.bags.report.session import Progress, Session, read_session
 from flexsheet.messages.bag import BagError
-from flexsheet.messages.files import DISK_ERRORS, write_error
+from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 
 def default_output(bag: Path) -> Path:
@@ -74,7 +74,7 @@ def _check(output: Path) -> None:
 
 def _unwritable(output: Path, error: OSError) -> BagError:
     if error.errno in DISK_ERRORS:
-        return BagError(str(write_error(output, error)))
+        return BagError(str(make_write_error(output, error)))
     return BagError(
         f"{output}: cannot be written: {error.strerror or error}; name a file in a writable "
         "folder with -o"
