@@ -1,4 +1,4 @@
-"""Draw the virtual object for the projector, corrected for where the sheet is."""
+"""Node that draws the virtual object for the projector, corrected for the sheet's pose."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """Draw as soon as the soft body has responded to a new fingertip, at most at `rate_hz`.
+    """Node that draws a frame for each soft-body message, at most at `rate_hz`.
 
-    Without a solver the fingertip triggers a frame, and without a finger the timer does. A frame is
-    published when it was drawn, or with a window when that showed it.
+    Without a solver, fingertip messages trigger frames; without a fingertip, the timer does. A
+    frame is published after it was drawn, or, with a window, after it was shown.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
@@ -52,9 +52,7 @@ class Renderer(Node):
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.output == "window":
-            return (
-                "it shows its frames in a window; verify its drawing with a bag of a headless run"
-            )
+            return "its frames are shown in a window; record a run with output: headless instead"
         return ""
 
     async def setup(self) -> None:
@@ -110,7 +108,7 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """Poll the window, and redraw when no message comes."""
+        """Handle window events, and draw a frame if no message triggered one."""
         if not self._output.poll():
             self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:
@@ -120,11 +118,11 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Called by the window's thread, too."""
+        """Publish a shown frame; may be called from the window's thread."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
-        """Start again from the scene: a lost context loses all that was drawn with it."""
+        """Create the output and all graphics objects again after the context was lost."""
         self.log.warning("window", problem=self._output.note)
         self._frame_renderer = None
         self._output.close()
@@ -133,7 +131,7 @@ class Renderer(Node):
             self.on_scene(self.scene.message, self.scene.header)
 
     def _draw_if_due(self) -> None:
-        # A quarter of a period early is in time: else a 60 Hz camera interferes with 30 Hz.
+        # Drawing up to a quarter of a period early avoids a beat between camera and frame rate.
         now_ns = self.clock.now_ns()
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
@@ -142,7 +140,7 @@ class Renderer(Node):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)
-        # Where drawing is slower than the rate, messages are read before the next frame.
+        # If drawing is slower than the rate, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
@@ -159,7 +157,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window showed, or skipped for a newer one."""
+        """Publish a frame that the window showed or replaced by a newer one."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

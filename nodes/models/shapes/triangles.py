@@ -14,6 +14,7 @@ from flexsheet.messages.errors import FlexsheetError
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
@@ -63,6 +64,14 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
         raise MeshError(f"{folded} pairs of neighbouring triangles are folded; repair them")
     if volume_m3(vertices, triangles) <= 0.0:
         raise MeshError("the mesh is inside out; reverse its triangles")
+
+
+def triangulate_grid(rows: int, columns: int) -> Indices32:
+    """Return the triangles (t, 3) of a grid of points, counter-clockwise if rows are along +y."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, above = corner + 1, corner + columns
+    both = [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
+    return np.concatenate(both).astype(np.int32)
 
 
 def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
