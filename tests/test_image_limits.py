@@ -41,7 +41,7 @@ PROJECTOR = np.array(SCENE.projector.world_from_projector.position_m)
 @pytest.fixture(scope="module")
 def stage() -> Iterator[SceneRenderer]:
     context = headless_context()
-    made = SceneRenderer(SCENE, context, spacing_m=0.005, dents=few_dents())
+    made = SceneRenderer(SCENE, context, spacing_m=0.005, basis=few_dents())
     yield made
     made.release()
     context.release()

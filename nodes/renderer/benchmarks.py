@@ -96,22 +96,24 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
 
 
-def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
+def roll_sheet(
+    scene: Scene, tilt_rad: float, contact_m: tuple[float, float] | None = None
+) -> Floats:
     """Return world_from_sheet of a sheet that touches the object at a tilt.
 
-    place_m: (x, y) of the contact on the sheet; None: for a cylinder, after rolling without slip
+    contact_m: (x, y) of the contact on the sheet; None: for a cylinder, after rolling without slip
     from zero tilt; for other objects, the sheet's centre, at the point nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
-        return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
+        return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
     radius = cylinder_of(scene).radius_m
     axis = pose_matrix(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
-    x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
+    x, y = (0.0, -radius * tilt_rad) if contact_m is None else contact_m
     return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
 
 
-def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
+def _lay_sheet(scene: Scene, tilt_rad: float, contact_m: tuple[float, float]) -> Floats:
     geometry = scene.object.geometry
     skin = make_surface(
         geometry,
@@ -121,7 +123,7 @@ def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> F
     ).rest_world_m
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     nearest_to_user = skin[(skin @ rotation[:, 2]).argmax()]
-    return transform(rotation, nearest_to_user - rotation @ np.array([*place_m, 0.0]))
+    return transform(rotation, nearest_to_user - rotation @ np.array([*contact_m, 0.0]))
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
@@ -148,12 +150,12 @@ def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
 
 
 def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    basis = deflection_cache.load_or_compute(scene, None) if solved else None
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
         shown = scale_projector(scene, *size)
-        stage = SceneRenderer(shown, context, spacing_m=SPACING_M, dents=dents)
+        scene_renderer = SceneRenderer(shown, context, spacing_m=SPACING_M, basis=basis)
         cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
         for tilt_deg, push_mm in dict.fromkeys(cases):
             if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
@@ -172,12 +174,12 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 yield Trial(
                     method=method,
                     case=case,
-                    run=partial(draw_stereo, stage, method, sheet),
-                    error=partial(_error_mm, stage, method, sheet, get_measure),
+                    run=partial(draw_stereo, scene_renderer, method, sheet),
+                    error=partial(_error_mm, scene_renderer, method, sheet, get_measure),
                     in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
                     in_scene=in_scene,
                 )
-        stage.release()
+        scene_renderer.release()
     context.release()
 
 
@@ -199,21 +201,21 @@ def _make_situation(
     return predicted, cache(lambda: reference(scene, *edges, tip))
 
 
-def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
+def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
     """Draw one stereo frame by a method or the lower bound `FLOOR`."""
     display = Display(correction=_correction_name(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
-        for eye in stage.eyes(display):
-            stage.canvas.draw_unresolved(stage.view(eye), look)
+        for eye in scene_renderer.eyes(display):
+            scene_renderer.canvas.draw_unresolved(scene_renderer.view(eye), look)
     elif method in SHAPES:
-        stage.draw_onto(display, SHAPES[method](sheet), look, read=False)
+        scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=False)
     else:
-        stage.draw(display, sheet, look, read=False)
+        scene_renderer.draw(display, sheet, look, read=False)
 
 
 def draw_coordinate_ramps(
-    stage: SceneRenderer, method: str, sheet: SheetPose
+    scene_renderer: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
     """Draw and return the projector's images of both coordinate ramps, in mono."""
     images = []
@@ -221,9 +223,9 @@ def draw_coordinate_ramps(
         display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
         look = DrawStyle(flat=True, pattern=pattern)
         if method in SHAPES:
-            image = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
+            image = scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=True)
         else:
-            image = stage.draw(display, sheet, look, read=True)
+            image = scene_renderer.draw(display, sheet, look, read=True)
         assert image is not None
         images.append(image)
     return images[0], images[1]
@@ -233,14 +235,14 @@ COORDINATE_RAMPS: tuple[Pattern, Pattern] = ("coordinate_ramp_x", "coordinate_ra
 
 
 def _error_mm(
-    stage: SceneRenderer,
+    scene_renderer: SceneRenderer,
     method: str,
     sheet: SheetPose,
     get_measure: Callable[[], ErrorMeasure],
     _drawn: None,
 ) -> float:
     """Return the root mean square error of all visible points, mm; infinite if there are none."""
-    errors_m = get_measure()(*draw_coordinate_ramps(stage, method, sheet))
+    errors_m = get_measure()(*draw_coordinate_ramps(scene_renderer, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 
 

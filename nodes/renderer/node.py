@@ -62,7 +62,7 @@ class Renderer(Node):
         self._shown = Display(correction="two_pass", stereo=self.parameters.stereo)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
-        self._still_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
+        self._idle_period_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
 
     async def close(self) -> None:
         self._output.close()
@@ -76,12 +76,12 @@ class Renderer(Node):
         if self.display.message is None:
             correction = chosen(given.correction, scene.methods.correction, "two_pass")
             self._shown = self._shown.model_copy(update={"correction": correction})
-        stage = SceneRenderer(
+        scene_renderer = SceneRenderer(
             scene,
             self._output.context,
             spacing_m=given.spacing_m,
             samples=given.samples,
-            dents=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
+            basis=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
             sheet_shape=chosen(given.sheet_shape, scene.methods.sheet_shape, "reduced_order"),
         )
         latency = DisplayLatencyEstimator(
@@ -91,7 +91,7 @@ class Renderer(Node):
         )
         ports = RendererInputs(**{name: self.inputs[name] for name in RendererInputs.__slots__})
         self._frame_renderer = FrameRenderer(
-            stage, self._output, ports, latency, self.clock, max_age_s=given.max_age_s
+            scene_renderer, self._output, ports, latency, self.clock, max_age_s=given.max_age_s
         )
 
     def on_display(self, display: Display, header: Header) -> None:
@@ -135,8 +135,8 @@ class Renderer(Node):
         now_ns = self.clock.now_ns()
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
-        rested_ns = now_ns - self._drawn_ns + self._period_ns // 4
-        if rested_ns < self._still_ns and self._frame_renderer.is_unchanged(self._shown):
+        idle_ns = now_ns - self._drawn_ns + self._period_ns // 4
+        if idle_ns < self._idle_period_ns and self._frame_renderer.is_unchanged(self._shown):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)

@@ -93,12 +93,12 @@ class SceneRenderer:
         *,
         spacing_m: float,
         samples: int = SAMPLES,
-        dents: IndentationBasis | None = None,
+        basis: IndentationBasis | None = None,
         sheet_shape: SheetShapeMethod = "reduced_order",
     ) -> None:
         """Create the graphics objects of the scene.
 
-        dents: deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles.
+        basis: deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles.
         Raises ValueError for a lens that folds the projector's image.
         """
         projector, geometry = scene.projector, scene.object.geometry
@@ -124,7 +124,7 @@ class SceneRenderer:
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
         )
         self.canvas.set_material(self._material())
-        self.dents, self.sheet_shape, self.note = dents, sheet_shape, ""
+        self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
@@ -135,8 +135,8 @@ class SceneRenderer:
             round(abs(across_px) * window.height),
             samples=samples,
         )
-        self._follower: DeformationTransfer | None = None
-        self._shaped_by: SoftBody | None = None
+        self._deformation: DeformationTransfer | None = None
+        self._drawn_body: SoftBody | None = None
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
@@ -161,7 +161,7 @@ class SceneRenderer:
     def set_skin(self, skin: Skin) -> None:
         """Set the skin whose displacements deform the drawn surface."""
         vertices = skin.vertices_world_m.astype(np.float64)
-        self._follower = DeformationTransfer(self._surface, vertices, skin.triangles)
+        self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
@@ -170,18 +170,18 @@ class SceneRenderer:
         Raises ValueError, without a change of the surface, if the displacement does not fit the
         current skin or is not finite.
         """
-        if body is self._shaped_by:
+        if body is self._drawn_body:
             return
         if body is None:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
             self._box_world = _box_around(self._surface.rest_world_m)
-        elif self._follower is None:
+        elif self._deformation is None:
             raise ValueError("a soft_body message was received before its skin")
         else:
-            moved = self._follower.apply(body.displacement_world_m)
+            moved = self._deformation.apply(body.displacement_world_m)
             self.canvas.set_moved(moved)
             self._box_world = _box_around(moved[:, :3])
-        self._shaped_by = body
+        self._drawn_body = body
 
     def draw_style(
         self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None
@@ -307,12 +307,12 @@ class SceneRenderer:
 
         Four triangles replace reduced_order without deflection shapes. `note` reports inaccuracies.
         """
-        if self.sheet_shape != "reduced_order" or self.dents is None:
+        if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
             self.note = NO_SHAPES_NOTE if lacks_shapes else self._range_note(sheet)
             mesh = pyramid_mesh(sheet)
             return mesh if self._lens is None else refine_mesh(mesh)
-        mesh = deflected_mesh(sheet, self.dents)
+        mesh = deflected_mesh(sheet, self.basis)
         self.note = mesh.note
         return mesh
 

@@ -70,23 +70,23 @@ _grid_triangles = cache(triangulate_grid)
 """Cached `triangulate_grid`: equal grids share one array, which avoids comparing contents."""
 
 
-def deflected_mesh(sheet: SheetPose, dents: IndentationBasis) -> SheetMesh:
+def deflected_mesh(sheet: SheetPose, basis: IndentationBasis) -> SheetMesh:
     """Return the mesh of the stretched sheet, deflected by the fingertip.
 
     The unpushed sheet is the ruled surface between its edges. The deflection of a flat sheet is
     added to it.
     """
-    stretch = sheet.edge_distance_m / dents.rubber.width_m
+    stretch = sheet.edge_distance_m / basis.rubber.width_m
     x, y, depth_m = 0.0, 0.0, 0.0
     if sheet.pushed_point is not None:
         x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
         depth_m = max(0.0, -z)
     position = (x, y)
-    flat = dents.grid(stretch, position)
-    offsets = dents.offsets(stretch, position, depth_m if depth_m >= MIN_PUSH_M else 0.0)
+    flat = basis.grid(stretch, position)
+    offsets = basis.offsets(stretch, position, depth_m if depth_m >= MIN_PUSH_M else 0.0)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
-    up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
+    up = (flat[..., 1] / basis.rubber.height_m + 0.5).ravel()
     left_bottom, right_bottom, right_top, left_top = sheet.corners
     # The ruled surface between the edges is bilinear in `across` and `up`.
     edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
@@ -97,7 +97,7 @@ def deflected_mesh(sheet: SheetPose, dents: IndentationBasis) -> SheetMesh:
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.invalid_reason(stretch, position, depth_m),
+        basis.invalid_reason(stretch, position, depth_m),
     )
 
 

@@ -62,7 +62,7 @@ def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> F
 
 
 def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    basis = deflection_cache.load_or_compute(scene, None) if solved else None
     rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
@@ -101,10 +101,10 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
         in_range = {
             "four_triangles": depth <= MAX_TRIANGLES_DEPTH_M,
         }
-        if dents is not None:
-            shapes |= {"reduced_order": partial(deflected_mesh, dents=dents), "membrane": elements}
+        if basis is not None:
+            shapes |= {"reduced_order": partial(deflected_mesh, basis=basis), "membrane": elements}
             in_range |= {
-                "reduced_order": not dents.invalid_reason(stretch, position, depth),
+                "reduced_order": not basis.invalid_reason(stretch, position, depth),
                 "membrane": True,
             }
         truth = reference(scene, *edges, tip)
