@@ -34,9 +34,10 @@ from flexsheet.nodes.fem_solver.benchmarks import (
 from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, saturate_depth
-from flexsheet.nodes.fem_solver.elasticity import quadrature, stiffness_matrix
+from flexsheet.nodes.fem_solver.elasticity import quadrature
 from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, build_mesh
 from flexsheet.nodes.methods import Trial, measure
+from tests.linear_elasticity import stiffness_matrix
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

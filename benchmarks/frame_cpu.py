@@ -125,7 +125,7 @@ def make_scene_renderer(scene: Scene, triangles: int) -> SceneRenderer:
             scene,
             headless_context(),
             spacing_m=spacing_m,
-            dents=deflection_cache.load_or_compute(scene, None),
+            basis=deflection_cache.load_or_compute(scene, None),
         )
         have = len(stage._surface.triangles)
         if abs(have - triangles) < 0.05 * triangles:
@@ -216,7 +216,7 @@ def main() -> None:
     )
     _, full = measure(scene, triangles=options.triangles, frames=options.frames // 5)
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name[:2] != "GL"]
-    skin = stage._follower.vertices if stage._follower else 0
+    skin = stage._deformation.vertices if stage._deformation else 0
     print(
         f"{scene.name}: {len(stage._surface.triangles)} triangles that follow a skin of {skin} "
         f"vertices, two eyes, two_pass, {stage.canvas.context.info['GL_RENDERER']}\n"

@@ -61,8 +61,8 @@ class CorrectionBench:
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
-        dents = deflection_cache.load_or_compute(scene, None)
-        self.stage = SceneRenderer(scene, headless_context(), spacing_m=0.0025, dents=dents)
+        basis = deflection_cache.load_or_compute(scene, None)
+        self.stage = SceneRenderer(scene, headless_context(), spacing_m=0.0025, basis=basis)
         self._eye = scene.eyes.centre_world_m
         self._expected = render_expected(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
         unmoved = self.situation(np.eye(4), None)
@@ -221,12 +221,12 @@ def print_stretches(bench: CorrectionBench) -> None:
 
 def print_frames(scene: Scene) -> None:
     """Print the wall time of a stereo frame: the median over rounds that include every method."""
-    dents, context = deflection_cache.load_or_compute(scene, None), headless_context()
+    basis, context = deflection_cache.load_or_compute(scene, None), headless_context()
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
     for size in SIZES_PX:
         shown = scale_projector(scene, *size)
-        bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, dents=dents)
+        bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, basis=basis)
         edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
         tip = np.array([0.0, 0.0, -0.03])
         sheet = estimate_sheet(

@@ -34,18 +34,14 @@ from flexsheet.nodes.models.shapes import (
     tightest_curvature,
 )
 from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
-from flexsheet.nodes.models.shapes.triangles import (
-    Facets,
-    half_edges,
-    triangle_normals,
-    vertex_normals,
-)
+from flexsheet.nodes.models.shapes.triangles import half_edges, triangle_normals, vertex_normals
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
     make_tangent_contact,
     roll_contact,
     transport_axes,
 )
+from tests.facets import Facets
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

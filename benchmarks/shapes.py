@@ -23,7 +23,8 @@ from benchmarks.planner_methods import ellipsoid_mesh
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.nodes.models.shapes import Shape, SmoothMeshShape, make_shape
 from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
-from flexsheet.nodes.models.shapes.triangles import Facets, triangle_normals, vertex_normals
+from flexsheet.nodes.models.shapes.triangles import triangle_normals, vertex_normals
+from tests.facets import Facets
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

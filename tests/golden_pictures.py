@@ -68,7 +68,7 @@ def draw(
     """A dented object with both its marks."""
     sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
     dented = display.correction == "two_pass" and sheet.pushed_point is not None
-    stage = SceneRenderer(scene, context, spacing_m=0.004, dents=few_dents() if dented else None)
+    stage = SceneRenderer(scene, context, spacing_m=0.004, basis=few_dents() if dented else None)
     follow(stage, dent(stage, 0.014, (0.008, -0.006)))
     marked = display.marks and display.pattern == "object"
     look = DrawStyle(

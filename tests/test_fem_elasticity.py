@@ -17,10 +17,9 @@ from flexsheet.nodes.fem_solver.elasticity import (
     quadrature,
     require_support,
     shape_gradients,
-    solve,
-    stiffness_matrix,
 )
 from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces, cylinder_mesh
+from tests.linear_elasticity import solve, stiffness_matrix
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

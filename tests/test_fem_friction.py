@@ -16,7 +16,7 @@ from flexsheet.nodes.fem_solver.closest_contact import (
     slide_anchor,
 )
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody
-from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom
 from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.precompute import (
     SoftBodyModel,
@@ -25,6 +25,7 @@ from flexsheet.nodes.fem_solver.precompute import (
     response_cache,
 )
 from flexsheet.nodes.models.shapes import CylinderShape
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]

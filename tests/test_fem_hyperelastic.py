@@ -14,12 +14,11 @@ from flexsheet.nodes.fem_solver.elasticity import (
     SolidMeshError,
     degrees_of_freedom,
     element_stiffness,
-    solve,
-    stiffness_matrix,
 )
 from flexsheet.nodes.fem_solver.hyperelastic import InvertedElementError, NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import EDGES, boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import IndefiniteError, NestedDissection
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.solids import box, distorted
 
 Floats = NDArray[np.float64]

@@ -25,8 +25,6 @@ from flexsheet.nodes.fem_solver.elasticity import (
     quadrature,
     require_support,
     shape_gradients,
-    solve,
-    stiffness_matrix,
 )
 from flexsheet.nodes.fem_solver.mesh import (
     Focus,
@@ -54,6 +52,7 @@ from flexsheet.nodes.fem_solver.mesh.smoothing import _distortion
 from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
 from flexsheet.nodes.models.shapes import make_shape
 from tests.examples import examples
+from tests.linear_elasticity import solve, stiffness_matrix
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,7 +14,7 @@ import pytest
 
 from flexsheet.nodes.cache import CheckpointStore, default_cache_dir, load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute
-from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom
 from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from flexsheet.nodes.fem_solver.precompute import (
@@ -26,6 +26,7 @@ from flexsheet.nodes.fem_solver.precompute import (
     load_or_compute,
     response_cache,
 )
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.soft_bodies import cylinder_spec
 
 SPEC = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.005)

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ellipk, ellipkinc
 
-from flexsheet.nodes.fem_solver.elasticity import solve, stiffness_matrix
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import boundary_faces
 from tests.fem_fields import dofs_of, equilibrium, lame, relative_errors, surface_loads
 from tests.fem_verification import Record, at_most, between, near
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.solids import box, bricks
 
 Floats = NDArray[np.float64]

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver import newton
-from flexsheet.nodes.fem_solver.elasticity import solve, stiffness_matrix
 from flexsheet.nodes.fem_solver.mesh import boundary_faces
 from tests.fem_fields import dofs_of
 from tests.fem_verification import Record, at_most, between, near
 from tests.half_space import half_space
+from tests.linear_elasticity import solve, stiffness_matrix
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.nodes.fem_solver.elasticity import SolidMeshError, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.elasticity import SolidMeshError
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from tests.fem_fields import body_loads, dofs_of, equilibrium, lame, surface_loads
 from tests.fem_verification import Record, at_most
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.scene_solids import SHAPES, scene_solid
 from tests.solids import box, distorted
 

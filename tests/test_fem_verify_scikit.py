@@ -12,16 +12,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from flexsheet.nodes.fem_solver.elasticity import (
-    element_stiffness,
-    quadrature,
-    solve,
-    stiffness_matrix,
-)
+from flexsheet.nodes.fem_solver.elasticity import element_stiffness, quadrature
 from flexsheet.nodes.fem_solver.mesh import EDGES, boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from tests.fem_fields import dofs_of, pressure_loads
 from tests.fem_verification import Record, at_most
+from tests.linear_elasticity import solve, stiffness_matrix
 from tests.scene_solids import SHAPES, scene_solid
 
 Floats = NDArray[np.float64]

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from flexsheet.nodes.fem_solver.elasticity import stiffness_matrix
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from tests.fem_fields import equilibrium, lame, pressure_loads, rate, relative_errors
 from tests.fem_verification import Record, at_most, between, near
+from tests.linear_elasticity import stiffness_matrix
 from tests.thick_sphere import INNER, OUTER, eighth, faces_at, symmetry
 
 Floats = NDArray[np.float64]

@@ -41,7 +41,7 @@ PROJECTOR = np.array(SCENE.projector.world_from_projector.position_m)
 @pytest.fixture(scope="module")
 def stage() -> Iterator[SceneRenderer]:
     context = headless_context()
-    made = SceneRenderer(SCENE, context, spacing_m=0.005, dents=few_dents())
+    made = SceneRenderer(SCENE, context, spacing_m=0.005, basis=few_dents())
     yield made
     made.release()
     context.release()
@@ -123,8 +123,8 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
 @pytest.mark.parametrize(
     ("tip", "said"),
     [
-        ((0.0, 0.119, -0.01), "too near to the sheet's edge"),
-        ((0.125, 0.0, -0.01), "too near to the sheet's edge"),
+        ((0.0, 0.119, -0.01), "too close to the sheet's edge"),
+        ((0.125, 0.0, -0.01), "too close to the sheet's edge"),
         ((0.0, 0.0, -0.065), "deeper than"),
         ((0.0, 0.0, -0.02), ""),
     ],

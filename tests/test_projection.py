@@ -42,7 +42,7 @@ def context() -> moderngl.Context:
 
 @pytest.fixture(scope="module")
 def stage(context: moderngl.Context) -> SceneRenderer:
-    return SceneRenderer(SCENE, context, spacing_m=0.004, dents=few_dents())
+    return SceneRenderer(SCENE, context, spacing_m=0.004, basis=few_dents())
 
 
 def sheet_at(pose: Floats, tip: Floats | None = None, *, twist_rad: float = 0.0) -> SheetPose:
@@ -168,9 +168,9 @@ def test_the_grid_is_projected_too(stage: SceneRenderer) -> None:
 def test_a_new_shape_of_another_grid_is_drawn_anew(stage: SceneRenderer) -> None:
     tip = np.array([0.0, 0.0, -0.02])
     dented = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
-    stage.dents = None
+    stage.basis = None
     pyramid = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
-    stage.dents = few_dents()
+    stage.basis = few_dents()
     again = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
     assert (dented == again).all()
     assert (dented != pyramid).any()

@@ -128,9 +128,9 @@ async def test_tilted_heads_have_tilted_eyes(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("eye", "why"),
     [
-        ({"valid": False, "centre_world_m": np.zeros(3)}, "not seen"),
-        ({"valid": True, "centre_world_m": np.array([0, 0, 0.04])}, "0.040 m before the screen"),
-        ({"valid": True, "centre_world_m": np.array([0, 0, -1.0])}, "before the screen"),
+        ({"valid": False, "centre_world_m": np.zeros(3)}, "not tracked"),
+        ({"valid": True, "centre_world_m": np.array([0, 0, 0.04])}, "0.040 m from the screen"),
+        ({"valid": True, "centre_world_m": np.array([0, 0, -1.0])}, "from the screen"),
         (
             {"valid": True, "centre_world_m": np.array([0, 0, 0.4]), "right_world": np.zeros(3)},
             "right_world is zero",

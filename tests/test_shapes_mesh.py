@@ -24,7 +24,6 @@ from flexsheet.nodes.models.shapes import (
 )
 from flexsheet.nodes.models.shapes.smooth_mesh import EDGE, MAX_CURVATURE_RATIO, default_smoothing_m
 from flexsheet.nodes.models.shapes.triangles import (
-    Facets,
     check_mesh,
     count_intersections,
     dihedrals_rad,
@@ -35,6 +34,7 @@ from flexsheet.nodes.models.shapes.triangles import (
     vertex_normals,
     volume_m3,
 )
+from tests.facets import Facets
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

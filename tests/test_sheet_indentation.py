@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.models.sheet import indentation
 from flexsheet.nodes.models.sheet.indentation import (
     IndentationBasis,
@@ -104,7 +105,7 @@ def test_a_stretched_sheet_narrows_between_its_clamps(shapes: IndentationBasis) 
 
 def test_triangles_face_the_user(shapes: IndentationBasis) -> None:
     flat = shapes.grid(1.05, (0.02, 0.01)).reshape(-1, 2)
-    corners = flat[indentation.triangulate_grid(2 * TIP + 1, 2 * TIP + 1)]
+    corners = flat[triangulate_grid(2 * TIP + 1, 2 * TIP + 1)]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     areas = 0.5 * (one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
     assert areas.min() > 0
@@ -115,7 +116,7 @@ def test_what_is_out_of_range_is_named(shapes: IndentationBasis) -> None:
     assert shapes.invalid_reason(1.05, (0.0, 0.0), 0.02) == ""
     assert "stretch 1.100" in shapes.invalid_reason(1.1, (0.0, 0.0), 0.02)
     assert "deeper than 30 mm" in shapes.invalid_reason(1.05, (0.0, 0.0), 0.04)
-    assert "too near to the sheet's edge" in shapes.invalid_reason(1.05, (0.11, 0.0), 0.02)
+    assert "too close to the sheet's edge" in shapes.invalid_reason(1.05, (0.11, 0.0), 0.02)
 
 
 def test_a_sheet_of_another_modulus_dents_alike() -> None:

@@ -276,7 +276,7 @@ class ReferenceSet:
         return Trial(
             method=method,
             case={"depth_mm": 1e3 * depth_m},
-            size={"skin_nodes": len(rest), "judge": present[0].name if present else "none"},
+            size={"skin_nodes": len(rest), "reference": present[0].name if present else "none"},
             run=run,
             error=error,
             in_range=in_range,

@@ -407,7 +407,7 @@ class LinearSoftBody:
         self._points = response.rest[response.contact_nodes[corners]]
         normals = response.normals[corners]
         self._depths = curve_depths(linear_depth_m, max_depth_m, push_depth_m)
-        self._place_forces = np.array(
+        self._corner_forces = np.array(
             [
                 self._forces(point, normal)
                 for point, normal in zip(self._points, normals, strict=True)
@@ -455,12 +455,12 @@ class LinearSoftBody:
 
         The value does not depend on the current push, so it is available before contact.
         """
-        forces = self._weights(surface) @ self._place_forces
+        forces = self._weights(surface) @ self._corner_forces
         return float(forces[len(CURVE_FRACTIONS)]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
         """Return the force curve near `surface` as a weighted mean of the nodes' curves."""
-        return np.column_stack([self._depths, self._weights(surface) @ self._place_forces])
+        return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:
         """Return Gaussian weights of the mesh corners around a point; their sum is 1."""

@@ -1,4 +1,4 @@
-"""Assemble and solve linear isotropic elasticity on 10-node tetrahedra.
+"""Compute element matrices of linear isotropic elasticity on 10-node tetrahedra.
 
 Small strain, Hooke's law with Lame's constants (Zienkiewicz & Taylor, "The Finite Element Method",
 vol. 1, ch. 4-6). Degrees of freedom are numbered 3 * node + axis.
@@ -6,21 +6,15 @@ vol. 1, ch. 4-6). Degrees of freedom are numbered 3 * node + axis.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.mesh import EDGES
 
-if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CHUNK_ELEMENTS = 2048
 MAX_POISSON_RATIO = 0.4999
 """Closer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
 MIN_VOLUME_RATIO = 1e-6
@@ -130,27 +124,11 @@ def element_stiffness(
     return stiffness.reshape(-1, 30, 30)
 
 
-def stiffness_matrix(
-    nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
-) -> csc_matrix:
-    """Return the assembled stiffness matrix (3n, 3n), N/m; errors as `element_stiffness`."""
-    from scipy.sparse import csc_matrix
-
-    size = 3 * len(nodes)
-    total = csc_matrix((size, size))
-    for start in range(0, len(elements), CHUNK_ELEMENTS):
-        part = elements[start : start + CHUNK_ELEMENTS]
-        blocks = element_stiffness(
-            nodes, part, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
-        )
-        dofs = (3 * part[:, :, None] + np.arange(3)).reshape(-1, 30)
-        rows, columns = np.repeat(dofs, 30, axis=1).ravel(), np.tile(dofs, (1, 30)).ravel()
-        total = total + csc_matrix((blocks.ravel(), (rows, columns)), shape=(size, size))
-    return total
-
-
 def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
-    """Raise SolidMeshError unless three fixed nodes (n,) are not collinear."""
+    """Raise SolidMeshError if all fixed nodes are collinear, so that the body can move.
+
+    nodes (n, 3). fixed (n,): flags of the fixed nodes.
+    """
     fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
     if (
@@ -174,33 +152,4 @@ def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
 def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
     """Return an array (size,) with values (k,) added at their indices (k,)."""
     result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
-    return result
-
-
-def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats) -> Floats:
-    """Solve for the displacements (3n,) by one sparse factorisation.
-
-    fixed_dofs (k,), values (k,): prescribed degrees of freedom and their displacements. loads
-    (3n,): nodal forces. Raises SolidMeshError if the body is free to move.
-    """
-    from scipy.sparse.linalg import splu
-
-    free = np.setdiff1d(np.arange(stiffness.shape[0]), fixed_dofs)
-    result = np.zeros(stiffness.shape[0])
-    result[fixed_dofs] = values
-    inner = stiffness[free][:, free].tocsc()
-    try:
-        # The matrix is positive definite, so diagonal pivots suffice and keep the factor sparse.
-        factor = splu(
-            inner,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:
-        raise SolidMeshError(f"the body is free to move: {error}") from error
-    pivots = np.abs(factor.U.diagonal())
-    if pivots.min() < 1e-12 * pivots.max():
-        raise SolidMeshError("the body is free to move: the stiffness is singular to rounding")
-    result[free] = factor.solve(loads[free] - stiffness[free][:, fixed_dofs] @ values)
     return result

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from threading import Event
+from typing import TypeVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
@@ -15,7 +17,6 @@ from flexsheet.nodes.fem_solver import body, precompute
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor
 from flexsheet.nodes.fem_solver.contact import Response
 from flexsheet.nodes.fem_solver.deadline_fallback import DeadlineFallback
-from flexsheet.nodes.fem_solver.interruption import run_unless_superseded
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import (
     FACTORY_PARAMETERS,
@@ -24,6 +25,10 @@ from flexsheet.nodes.fem_solver.soft_body_factory import (
     choose_method,
 )
 from flexsheet.nodes.node import Input, Node, Output
+
+T = TypeVar("T")
+
+POLL_S = 0.05
 
 
 class FemSolver(Node):
@@ -135,3 +140,27 @@ class FemSolver(Node):
             )
         message = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
         self.soft_body.publish(message, source_ns=header.source_ns)
+
+
+async def run_unless_superseded(
+    compute: Callable[[Callable[..., None]], T],
+    progress: Callable[..., None],
+    is_superseded: Callable[[], bool],
+) -> T:
+    """Run `compute` in a thread and return its result.
+
+    compute: receives `progress` with a stop event as its first argument. Raises Interrupted once
+    `is_superseded` returns true. The thread is then abandoned, because meshing takes up to 8 s, and
+    its errors are ignored.
+    """
+    stop = Event()
+    task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))
+    try:
+        while not task.done():
+            await asyncio.wait({task}, timeout=POLL_S)
+            if not task.done() and is_superseded():
+                raise precompute.Interrupted
+        return task.result()
+    finally:
+        stop.set()
+        task.add_done_callback(lambda ended: ended.cancelled() or ended.exception())

@@ -38,7 +38,7 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetForceModel,
     SheetPosition,
     depth_for_force,
-    interpolated_inverse,
+    interpolate_inverse,
 )
 
 Floats = NDArray[np.float64]
@@ -295,7 +295,7 @@ def _indentation_for_edge_force(
     added = pushed.edge_force_n - flat
     if added[-1] <= edge_force_n - flat:
         return float(grid[-1])
-    return float(interpolated_inverse(grid, added, np.array([edge_force_n - flat]))[0])
+    return float(interpolate_inverse(grid, added, np.array([edge_force_n - flat]))[0])
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:

@@ -1,9 +1,9 @@
-"""Measure the image correction's methods: the time of a stereo frame, and its image error.
+"""Measure time and image error of the correction methods.
 
-The time is that of a whole stereo frame: both eyes are drawn and the drawing is waited for; nothing
-is read. `floor` is the minimum of any method: clear, draw the same triangles once for each eye,
-with as many samples. The error is measured at each point that the eye sees on the true sheet. The
-reference shares no code with the renderer; the caller provides it.
+The time is that of drawing a stereo frame, without reading it. The method `floor` is a lower bound:
+it clears the frame and draws the same triangles once for each eye, with the same number of samples.
+The error is measured at each point that the eye sees on the reference sheet. The caller provides
+the reference, which shares no code with the renderer.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 Floats = NDArray[np.float64]
 
 ErrorMeasure = Callable[[Image, Image], Floats]
-"""Projector images of `coordinate_ramp_x` and `coordinate_ramp_y` to the errors (n,), m, at all
-points of the object that the eye sees."""
+"""Function from the projector images of `coordinate_ramp_x` and `coordinate_ramp_y` to the errors
+(n,), m, at all visible points of the object."""
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
-"""Returns an `ErrorMeasure` for a scene whose sheet has its left and right edge at two poses (4, 4)
-and is pushed by a fingertip (3,), or by none."""
+"""Function that returns an `ErrorMeasure` for a scene, the poses (4, 4) of the left and right edge,
+and the fingertip (3,) or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
-"""Two passes onto cheaper shapes than the deflected sheet's own."""
+"""Two-pass methods with approximate sheet shapes."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
@@ -59,10 +59,10 @@ SPACING_M = 0.0025
 
 
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return every correction over the tilts and pushes of the paper's figures 11 and 13.
+    """Return the benchmark of all corrections over the tilts and pushes of the paper's figures.
 
-    The ends of the scene's working range are included. Without `solved`, only methods that need no
-    deflection shapes.
+    The cases are those of figures 11 and 13 and the limits of the scene's working range. solved:
+    whether to include the methods that need precomputed deflection shapes.
     """
     return Family(
         name="correction",
@@ -75,15 +75,15 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
 
 
 MAX_TRIANGLES_DEPTH_MM = 3.5
-"""For this push a pyramid leaves half a millimetre (rms) of the true deflection."""
+"""Push for which four triangles have an error of half a millimetre (rms)."""
 
 
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
-    """Return whether a method's stated range covers a case.
+    """Return whether a case is within a method's specified range.
 
-    `none` is for the sheet on the imaginary screen, `one_plane` for a flat one, `four_triangles`
-    for a push up to `MAX_TRIANGLES_DEPTH_MM`. Two passes have the range of their shape, up to 50
-    degrees of tilt.
+    `none` requires the sheet on the imaginary screen, `one_plane` an unpushed sheet, and
+    `four_triangles` a push of up to `MAX_TRIANGLES_DEPTH_MM`. All methods except `none` are for up
+    to 50 degrees of tilt.
     """
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
@@ -96,22 +96,24 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
 
 
-def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
-    """Return world_from_sheet tangent to the cylinder at a tilt.
+def roll_sheet(
+    scene: Scene, tilt_rad: float, contact_m: tuple[float, float] | None = None
+) -> Floats:
+    """Return world_from_sheet of a sheet that touches the object at a tilt.
 
-    place_m: (x, y) of the sheet where it touches; None: after rolling without slip from the upright
-    pose. Any other object is touched at its farthest skin point, by the sheet's middle.
+    contact_m: (x, y) of the contact on the sheet; None: for a cylinder, after rolling without slip
+    from zero tilt; for other objects, the sheet's centre, at the point nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
-        return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
+        return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
     radius = require_cylinder(scene).radius_m
     axis = pose_matrix(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
-    x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
+    x, y = (0.0, -radius * tilt_rad) if contact_m is None else contact_m
     return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
 
 
-def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
+def _lay_sheet(scene: Scene, tilt_rad: float, contact_m: tuple[float, float]) -> Floats:
     geometry = scene.object.geometry
     skin = make_surface(
         geometry,
@@ -121,18 +123,17 @@ def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> F
     ).rest_world_m
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     nearest_to_user = skin[(skin @ rotation[:, 2]).argmax()]
-    return transform(rotation, nearest_to_user - rotation @ np.array([*place_m, 0.0]))
+    return transform(rotation, nearest_to_user - rotation @ np.array([*contact_m, 0.0]))
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the ends of the scene's working range, as `CASES`."""
+    """Return the limits of the scene's working range as cases, see `CASES`."""
     tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return the scene with a projector of other pixels that lights the same width, and its
-    middle."""
+    """Return the scene with another projector resolution and the same illuminated width."""
     projector = scene.projector
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
@@ -149,12 +150,12 @@ def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
 
 
 def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    basis = deflection_cache.load_or_compute(scene, None) if solved else None
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
         shown = scale_projector(scene, *size)
-        stage = SceneRenderer(shown, context, spacing_m=SPACING_M, dents=dents)
+        scene_renderer = SceneRenderer(shown, context, spacing_m=SPACING_M, basis=basis)
         cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
         for tilt_deg, push_mm in dict.fromkeys(cases):
             if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
@@ -165,26 +166,27 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 "width_px": size[0],
                 "height_px": size[1],
             }
-            sheet, judgement = _situation(shown, reference, tilt_deg=tilt_deg, push_mm=push_mm)
+            sheet, get_measure = _make_situation(
+                shown, reference, tilt_deg=tilt_deg, push_mm=push_mm
+            )
             in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
             for method in METHODS if solved else WITHOUT_SHAPES:
                 yield Trial(
                     method=method,
                     case=case,
-                    run=partial(draw_stereo, stage, method, sheet),
-                    error=partial(_error_mm, stage, method, sheet, judgement),
+                    run=partial(draw_stereo, scene_renderer, method, sheet),
+                    error=partial(_error_mm, scene_renderer, method, sheet, get_measure),
                     in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
                     in_scene=in_scene,
                 )
-        stage.release()
+        scene_renderer.release()
     context.release()
 
 
-def _situation(
+def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet, and a function that computes its error measure at the first
-    call."""
+    """Return the predicted sheet and a function that returns its error measure, cached."""
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -199,31 +201,31 @@ def _situation(
     return predicted, cache(lambda: reference(scene, *edges, tip))
 
 
-def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a method, or the floor."""
+def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
+    """Draw one stereo frame by a method or the lower bound `FLOOR`."""
     display = Display(correction=_correction_name(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
-        for eye in stage.eyes(display):
-            stage.canvas.draw_unresolved(stage.view(eye), look)
+        for eye in scene_renderer.eyes(display):
+            scene_renderer.canvas.draw_unresolved(scene_renderer.view(eye), look)
     elif method in SHAPES:
-        stage.draw_onto(display, SHAPES[method](sheet), look, read=False)
+        scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=False)
     else:
-        stage.draw(display, sheet, look, read=False)
+        scene_renderer.draw(display, sheet, look, read=False)
 
 
 def draw_coordinate_ramps(
-    stage: SceneRenderer, method: str, sheet: SheetPose
+    scene_renderer: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
-    """Return the projector's images of both coordinate ramps, for the scene's point of view."""
+    """Draw and return the projector's images of both coordinate ramps, in mono."""
     images = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
         look = DrawStyle(flat=True, pattern=pattern)
         if method in SHAPES:
-            image = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
+            image = scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=True)
         else:
-            image = stage.draw(display, sheet, look, read=True)
+            image = scene_renderer.draw(display, sheet, look, read=True)
         assert image is not None
         images.append(image)
     return images[0], images[1]
@@ -233,17 +235,14 @@ COORDINATE_RAMPS: tuple[Pattern, Pattern] = ("coordinate_ramp_x", "coordinate_ra
 
 
 def _error_mm(
-    stage: SceneRenderer,
+    scene_renderer: SceneRenderer,
     method: str,
     sheet: SheetPose,
-    judgement: Callable[[], ErrorMeasure],
+    get_measure: Callable[[], ErrorMeasure],
     _drawn: None,
 ) -> float:
-    """Return the root mean square error of all points seen; infinite when none is.
-
-    The floor corrects nothing.
-    """
-    errors_m = judgement()(*draw_coordinate_ramps(stage, method, sheet))
+    """Return the root mean square error of all visible points, mm; infinite if there are none."""
+    errors_m = get_measure()(*draw_coordinate_ramps(scene_renderer, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 
 

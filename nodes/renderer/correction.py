@@ -1,17 +1,16 @@
 """Correct the projected image for a moved or pushed sheet: equations (1)-(6) of the paper.
 
-V is the eye, P the projector, A a point of the object. C is where the line V-A meets the actual
-screen (the sheet). C' is where the line C-P meets the imaginary screen, and A' the point of the
-line V-C' at A's depth. Drawn at A', the object is seen at A.
+V is the eye, P the projector, A a point of the object. C is the intersection of the line V-A with
+the actual screen (the sheet), C' that of the line C-P with the imaginary screen, and A' the point
+of the line V-C' at A's depth. A point that is drawn at A' is seen at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners. All points are in the world frame, metres. What cannot be corrected is masked (`valid`
-false), never moved:
+corners. All points are in the world frame, m. Points are masked (`valid` false) and not moved if
 
-- a screen seen edge-on by the eye or the projector, within `GRAZING_SINE`, or from its other side;
-- a point level with the eye or behind it, or one whose C is behind the eye or the projector.
+- the eye or the projector sees the screen edge-on, within `GRAZING_SINE`, or from the other side;
+- the point is not in front of the eye, or its C is behind the eye or the projector.
 
-A triangle without area takes the plane of the whole sheet, and so does a push below `MIN_PUSH_M`.
+A triangle without area is replaced by the plane of the sheet, and so is a push below `MIN_PUSH_M`.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 GRAZING_SINE = 0.05
-"""Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At that angle a pixel covers
-twenty times its width."""
+"""Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle a pixel is
+stretched by a factor of 20."""
 
 NEAR_M = 0.02
-"""Object points closer to the eye's own depth than this are not drawn."""
+"""Minimum depth of drawn points from the eye."""
 
 MIN_PUSH_M = 1e-4
-"""Below this depth the four triangles are the plane."""
+"""Minimum push depth for the four triangles; below it, the screen is a plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenPlane:
-    """A point of the plane (3,) and its unit normal (3,), which points to the user."""
+    """Plane by a point (3,) and a unit normal (3,) towards the user."""
 
     point: Floats
     normal: Floats
@@ -48,11 +47,11 @@ class ScreenPlane:
 
 @dataclass(frozen=True, slots=True)
 class ProjectionScreen:
-    """The actual screen: four planes through one point, distinguished by the corners.
+    """Actual screen: four triangles with a common vertex, or one plane.
 
-    point: r_s (3,), common to all four. normals: n_si (4, 3), towards the user. corners: (4, 3)
-    counter-clockwise as the user sees them. Triangle i lies between corner i and the next. None
-    when all four normals are one plane's.
+    point: r_s (3,), common to all triangles. normals: n_si (4, 3), towards the user. corners: (4,
+    3), counter-clockwise for the user; triangle i is between corner i and the next. None if all
+    normals are equal.
     """
 
     point: Floats
@@ -62,9 +61,9 @@ class ProjectionScreen:
 
 @dataclass(frozen=True, slots=True)
 class CorrectedPoints:
-    """The corrected points A' (n, 3), their points C' on the screen (n, 3), and validity (n,).
+    """Corrected points A' (n, 3), points C' on the imaginary screen (n, 3), and validity (n,).
 
-    Points that are not valid hold A.
+    Invalid points are equal to A.
     """
 
     points: Floats
@@ -73,11 +72,11 @@ class CorrectedPoints:
 
 
 IMAGINARY_SCREEN = ScreenPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-"""The world frame is the imaginary screen's: r_o, n_o."""
+"""Imaginary screen (r_o, n_o), whose frame is the world frame."""
 
 
 def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
-    """Return the screen that is one plane."""
+    """Return a screen that consists of one plane."""
     return ProjectionScreen(plane.point, np.tile(plane.normal, (4, 1)), None)
 
 
@@ -87,8 +86,7 @@ def make_pushed_screen(
     """Return the four triangles between the pushed point and the sheet's corners (section III-C 3).
 
     pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane: of
-    the sheet at rest. It replaces triangles without area, and all four when the push is less than
-    `MIN_PUSH_M`.
+    the unpushed sheet; it replaces triangles without area, and all four below `MIN_PUSH_M`.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -101,11 +99,11 @@ def make_pushed_screen(
 
 
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
-    """Return (4, 3) unit normals of the planes through the eye, the pushed point and each corner.
+    """Return the unit normals (4, 3) of the planes through eye, pushed point and each corner.
 
-    Seen from the eye the four spokes divide the image into sectors. A direction d lies in the
-    sector after spoke i when d . normal_i >= 0 > d . normal_(i+1). Zeros for one plane, and for a
-    spoke that the eye sees end-on.
+    Seen from the eye, the lines from the pushed point to the corners divide the image into sectors.
+    A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1). Normals are zero for a
+    screen of one plane, and for a line that points to the eye.
     """
     if screen.corners is None:
         return np.zeros((4, 3))
@@ -115,11 +113,11 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
 
 def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> NDArray[np.intp]:
-    """Return the triangle (n,) of each point: the one that the line V-A crosses.
+    """Return the number (n,) of the triangle that the line V-A of each point intersects.
 
-    It is the sector in which the line lies deepest. Inside the sheet's outline that is the triangle
-    which is hit. Outside, the sectors continue, so that every point has exactly one. Where the
-    indentation folds over itself as seen from the eye, the choice is unique but ignores depth.
+    It is the sector whose boundary is farthest from the line. Outside the sheet's outline the
+    sectors are extended, so that each point has exactly one. Where triangles overlap as seen from
+    the eye, depth is ignored.
     """
     sides = (points - eye) @ sector_normals(screen, eye).T
     depths = np.minimum(sides, -np.roll(sides, -1, axis=1))
@@ -128,10 +126,9 @@ def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> N
 
 
 def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple[Floats, Bools]:
-    """Return C (n, 3) by equations (1) and (2), and where it exists, before the eye and not
-    grazing.
+    """Return C (n, 3) by equations (1) and (2), and its validity (n,).
 
-    r_s: (3,). n_s: (n, 3), a normal per point.
+    r_s: (3,). n_s: (n, 3), one normal per point. C is invalid behind the eye or at grazing angles.
     """
     denominator = np.sum((eye - points) * n_s, axis=1)
     length = np.linalg.norm(eye - points, axis=1)
@@ -144,8 +141,7 @@ def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple
 def imaginary_point(
     on_actual: Floats, projector: Floats, n_s: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """Return C' (n, 3) by equations (3) and (4), and where the projector lights the screen's
-    back."""
+    """Return C' (n, 3) by equations (3) and (4), and whether the projector lights it (n,)."""
     light = on_actual - projector
     denominator = light @ imaginary.normal
     length = np.linalg.norm(light, axis=1)
@@ -159,7 +155,7 @@ def imaginary_point(
 def shifted_point(
     points: Floats, on_imaginary: Floats, eye: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """Return A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
+    """Return A' (n, 3) by equations (5) and (6), and whether A is in front of the eye (n,)."""
     normal = imaginary.normal
     valid = (eye - points) @ normal > NEAR_M
     denominator = (eye - on_imaginary) @ normal
@@ -175,15 +171,15 @@ def correct(
     screen: ProjectionScreen,
     imaginary: ScreenPlane = IMAGINARY_SCREEN,
 ) -> CorrectedPoints:
-    """Return A' of every point A (n, 3) by equations (1)-(6); `object.vert.glsl` does the same.
+    """Return A' of points A (n, 3) by equations (1)-(6), as `object.vert.glsl` computes it.
 
     Raises ValueError unless the eye is in front of the imaginary screen and the projector behind
     it.
     """
     if (eye - imaginary.point) @ imaginary.normal <= NEAR_M:
-        raise ValueError(f"the eye {eye} is not in front of the imaginary screen")
+        raise ValueError(f"eye position {eye} m is not in front of the imaginary screen")
     if (projector - imaginary.point) @ imaginary.normal >= 0.0:
-        raise ValueError(f"the projector {projector} is not behind the imaginary screen")
+        raise ValueError(f"projector position {projector} m is not behind the imaginary screen")
     n_s = screen.normals[select_triangles(points, screen, eye)]
     on_actual, seen = actual_point(points, eye, screen.point, n_s)
     on_imaginary, lit = imaginary_point(on_actual, projector, n_s, imaginary)
@@ -196,8 +192,7 @@ def correct(
 
 
 def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
-    """Return whether the eye sees the front and the projector lights the back at the plane's
-    point."""
+    """Return whether the eye sees the plane's front and the projector lights its back."""
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(
         to_eye @ plane.normal > GRAZING_SINE * np.linalg.norm(to_eye)
@@ -206,7 +201,7 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Return where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
+    """Return the intersections (n, 2) of lines from the eye to points (n, 3) with z = 0."""
     fraction = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings
@@ -220,10 +215,9 @@ def pixel_from_screen(
     cy_px: float,
     world_from_projector: Floats,
 ) -> Floats:
-    """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, metres, to projector
-    pixels.
+    """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, m, to projector pixels.
 
-    It is that of a pinhole; a lens distorts the pixels afterwards (`lens.py`).
+    The projector is a pinhole; lens distortion is applied to the pixels later (`lens.py`).
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
@@ -233,9 +227,9 @@ def pixel_from_screen(
 
 
 def clip_from_screen(pixel_from_screen: Floats, width_px: int, height_px: int) -> Floats:
-    """Return (3, 3): homogeneous (x, y, w) on the imaginary screen to OpenGL's clip (x, y, w).
+    """Return the map (3, 3) from (x, y, 1) on the imaginary screen to OpenGL's clip (x, y, w).
 
-    Pixel (0, 0) is the centre of the top left pixel.
+    The origin of pixels is the centre of the top left pixel.
     """
     clip_from_pixel = np.array(
         [

@@ -1,4 +1,4 @@
-"""Cache the sheet's deflection shapes, which take half a minute to solve."""
+"""Compute and cache the sheet's deflection shapes (half a minute of computation)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 Floats = NDArray[np.float64]
 
 VERSION = 2
-"""Version of the computation; another version solves the shapes again."""
+"""Version of the computation. Increase it when results for the same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""Margin of stretch that the arms may add to the scene's limits."""
+"""Margin of the solved stretch ratios beyond the scene's limits."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
-"""Fields of `IndentationBasis` that are in the file, in their order."""
+"""Fields of `IndentationBasis` in the cache file."""
 
 MAX_DEPTH_RATIO = 1.2
 """Maximum solved depth over the scene's push depth."""
@@ -41,7 +41,7 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the sheet of a scene, and the pushes for which the scene needs shapes."""
+    """Return the sheet of a scene and the range of pushes that must be solved for it."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -53,9 +53,9 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Describe the cache file of the scene's deflection shapes.
+    """Return the cache specification of the scene's deflection shapes.
 
-    A sheet's shapes depend neither on its thickness nor on its modulus; so neither does the name.
+    The shapes do not depend on the sheet's thickness and modulus.
     """
     rubber, within = required_shapes(scene)
     depends_on = {
@@ -85,7 +85,7 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> IndentationBasis:
-    """Return the scene's cached shapes, or solve them on all cores and store them."""
+    """Load the scene's cached shapes, or solve them on all cores and store them."""
     rubber, within = required_shapes(scene)
 
     def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:

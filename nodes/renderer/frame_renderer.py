@@ -1,4 +1,4 @@
-"""Draw one frame from the newest messages, and describe it."""
+"""Draw a frame from the newest messages and return its description."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, pr
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
 VISIBLE_CHANGE_M = 1e-4
-"""A fifth of a pixel of half a millimetre. A smaller change is shown a second late."""
+"""Minimum displacement that triggers a frame, about a fifth of a pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
-"""Distance of the sheet's points from the flange that holds its edge."""
+"""Maximum distance of an edge's points from the flange of its arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class RendererInputs:
-    """The inputs that a frame is drawn from."""
+    """Inputs of a frame."""
 
     skin: Input[Skin]
     soft_body: Input[SoftBody]
@@ -47,7 +47,7 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """Draw a scene's frames on an output; count them, and those whose light was late."""
+    """Renderer of a scene's frames on an output; counts late and superseded frames."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class FrameRenderer:
             self.on_soft_body(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a frame would equal the last one: nothing touches, nothing moves."""
+        """Return whether a frame would equal the last one: no contact and no motion."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -85,9 +85,10 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame and hand it to the output; also return its exposure (ns).
+        """Draw a frame on the output; return it and the exposure time of its data (ns).
 
-        The frame's light times assume that no window shows it; see `on_shown`.
+        begun_ns: start of drawing. The display times of the frame are those without a window; see
+        `on_shown`.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -110,7 +111,7 @@ class FrameRenderer:
         self._number += 1
         pair = both_eyes(eyes, shown.stereo, across)
         which = which_eye(shown.stereo, self._number, shows_both=self._output.shows_both)
-        picture = scene_renderer.draw(
+        image = scene_renderer.draw(
             shown,
             sheet,
             scene_renderer.draw_style(shown, finger_tip, ports.sheet_target.message),
@@ -143,13 +144,15 @@ class FrameRenderer:
             shaped_for_ns=shaped_for_ns,
             fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
             occluded_fraction=scene_renderer.occluded_fraction,
-            pixels=() if picture is None else (picture,),
+            pixels=() if image is None else (image,),
         )
         return frame, source_ns
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
-        """Return the frame with the window's measured times; `swapped_ns` 0: a newer frame replaced
-        it."""
+        """Return the frame with its measured display times.
+
+        swapped_ns: time of the swap; 0 if a newer frame replaced it.
+        """
         if not swapped_ns:
             self.superseded += 1
             return frame
@@ -161,14 +164,13 @@ class FrameRenderer:
         )
 
     def on_soft_body(self, body: SoftBody, header: Header) -> None:
-        """Add a response of the solver."""
+        """Add a response of the soft-body solver."""
         self._extrapolator.add(body, header)
 
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
-        """Deform the drawn object as predicted; the last response of a silent solver stays, at any
-        age.
+        """Deform the object as predicted; without new responses, as in the last one.
 
-        Returns the exposure (ns) of the frame, and the instant of the indentation.
+        Returns the exposure time of the data and the time of the deformation, ns.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age_s
@@ -186,14 +188,14 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether there is a finger, or an indentation that it has left."""
+    """Return whether a finger is tracked or the object is still deformed."""
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())
 
 
 def has_moved(before: ArmState | None, now: ArmState | None) -> bool:
-    """Return whether an arm moved its edge of the sheet visibly, more than servo ripple does."""
+    """Return whether an arm moved its edge of the sheet by more than `VISIBLE_CHANGE_M`."""
     if before is None or now is None:
         return before is not now
     change = np.abs(now.world_from_flange - before.world_from_flange)

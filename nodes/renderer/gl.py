@@ -1,5 +1,4 @@
-"""Draw one eye's image into a multisampled frame with OpenGL, without a window, and read it
-back."""
+"""Draw the image of one eye into an offscreen, multisampled OpenGL frame."""
 
 from __future__ import annotations
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
     NEAR_M,
@@ -29,14 +29,14 @@ SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = {"grid": 1, "checker": 2, "white": 3}
-"""Patterns on the imaginary screen, and their numbers in the shader."""
+"""Patterns on the imaginary screen and their numbers in the shader."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 RAMP_AXES = {"coordinate_ramp_x": 1, "coordinate_ramp_y": 2}
 MARK_RADIUS_M = 0.003
 
 
 class NoOpenGLError(FlexsheetError, RuntimeError):
-    """No OpenGL 3.3 context could be created; the message names the packages to install."""
+    """Raised when no OpenGL 3.3 context can be created."""
 
     code = "no-opengl"
     remedy = "`flexsheet doctor` names the packages for EGL."
@@ -44,10 +44,10 @@ class NoOpenGLError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class EyeView:
-    """The geometry that one eye's image is drawn with.
+    """Geometry of one eye's image.
 
-    eye, projector: (3,) world. screen: None draws without correction. clip_from_screen: (3, 3), see
-    `correction.clip_from_screen`. lens: None: no distortion.
+    eye, projector: (3,), world. screen: None for no correction. clip_from_screen: (3, 3), see
+    `correction.clip_from_screen`. lens: None for no distortion.
     """
 
     eye: Floats
@@ -59,7 +59,7 @@ class EyeView:
 
 @dataclass(frozen=True, slots=True)
 class DrawStyle:
-    """How the object is drawn; marks are points of the object at rest, or None."""
+    """Style in which the object is drawn; marks are points of the object at rest, or None."""
 
     flat: bool
     pattern: str
@@ -69,11 +69,11 @@ class DrawStyle:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceMaterial:
-    """The object's own colour and texture.
+    """Colour and texture of the object.
 
-    colour: red, green, blue, 0 to 1. pitch_m: of the procedural textures. image: (height, width,
-    3), top row first, or None. image_from_world: (4, 4), maps points of the object at rest to 0..1
-    across the image from its left and bottom.
+    colour: red, green, blue, 0 to 1. pitch_m: period of the procedural textures. image: (height,
+    width, 3), top row first, or None. image_from_world: (4, 4), maps points of the object at rest
+    to image coordinates 0..1 from the left and the bottom.
     """
 
     colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
@@ -85,12 +85,12 @@ class SurfaceMaterial:
 
 
 class Canvas:
-    """A context with the shaders, the meshes and the frame of one projector."""
+    """Shaders, meshes and frame for the image of one projector."""
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
-        """samples: per pixel, at its edges; limited to what the driver supports."""
+        """Allocate the frame; samples: per pixel, limited by the driver's maximum."""
         self.width_px, self.height_px = width_px, height_px
         self.context = context
         vertex, fragment = shader_text("object.vert.glsl"), shader_text("object.frag.glsl")
@@ -104,7 +104,7 @@ class Canvas:
         )
         picture = self.context.renderbuffer(size, 4)
         self.resolved = self.context.framebuffer(picture)
-        # The same image, to draw into without samples. Resolving would copy a depth too.
+        # The same image with a depth buffer, for drawing without multisampling.
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._object: _MeshBuffers | None = None
@@ -113,7 +113,7 @@ class Canvas:
         self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
-        """Free the frame and the meshes; the context stays."""
+        """Release the frame and the meshes, but not the context."""
         for mesh in (self._object, self._grid):
             if mesh is not None:
                 mesh.release()
@@ -150,33 +150,33 @@ class Canvas:
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
     ) -> None:
-        """Set the object's vertices at rest (vertices, 3), world, unit normals there, outward
-        triangles."""
+        """Set the object's vertices at rest (vertices, 3), world, and its outward triangles.
+
+        normals: (vertices, 3), unit normals at rest; None: along z.
+        """
         if self._object is not None:
             self._object.release()
         self._object = _MeshBuffers(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
-        """Set the present positions of the vertices and the unit normals there, both (vertices,
-        3)."""
+        """Set the current vertex positions and unit normals, both (vertices, 3)."""
         if self._object is None:
-            raise RuntimeError("set_mesh comes before set_shape")
+            raise RuntimeError("set_mesh must be called before set_shape")
         self._object.move(_interleaved(positions, normals))
 
     def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """Set both as `set_shape`, side by side (vertices, 6); normals need not have unit
-        length."""
+        """Set positions and normals, of any length, as one array (vertices, 6)."""
         if self._object is None:
-            raise RuntimeError("set_mesh comes before set_moved")
+            raise RuntimeError("set_mesh must be called before set_moved")
         self._object.move(moved)
 
     def draw(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw and wait until it is drawn."""
+        """Draw an image and wait for completion."""
         self.draw_into(self._frame, view, look)
         self.finish()
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw the minimum of any method, for comparison; the image cannot be read."""
+        """Draw without resolving the samples, as a lower bound of the time of all methods."""
         self.draw_into(self._frame, view, look)
         self.context.finish()
 
@@ -186,8 +186,7 @@ class Canvas:
         frame.clear(0.0, 0.0, 0.0, 1.0)
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
         if look.pattern != "black" and mesh is not None:
-            # A projector behind the screen draws mirrored: then front faces have the other
-            # orientation.
+            # A projector behind the screen draws a mirrored image, which reverses front faces.
             mirrored = _determinant(view.clip_from_screen) < 0.0
             self.context.front_face = "cw" if mirrored else "ccw"
             set_view(self._uniforms, view)
@@ -197,12 +196,12 @@ class Canvas:
             mesh.array(self._program).render(moderngl.TRIANGLES)
 
     def begin(self) -> None:
-        """Draw without samples into the frame that is read, which is black, from now on."""
+        """Clear and bind the frame that is read, for drawing without multisampling."""
         self._single.use()
         self._single.clear(0.0, 0.0, 0.0, 1.0)
 
     def finish(self) -> None:
-        """Resolve the frame's samples and wait until all is drawn."""
+        """Resolve the frame's samples and wait for completion."""
         self.context.copy_framebuffer(self.resolved, self._frame)
         self.context.finish()
 
@@ -213,15 +212,14 @@ class Canvas:
         return np.ascontiguousarray(rows[::-1])
 
     def shifted_points(self, view: EyeView) -> Floats:
-        """Return (vertices, 4): A' of each vertex as the shader moves it, and 1 where it is
-        valid."""
+        """Return the shader's A' of each vertex and its validity, 0 or 1, (vertices, 4)."""
         if self._object is None:
-            raise RuntimeError("set_mesh comes before shifted_points")
+            raise RuntimeError("set_mesh must be called before shifted_points")
         program = self.context.program(
             vertex_shader=shader_text("object.vert.glsl"), varyings=("shifted",)
         )
         set_view(Uniforms(program), view)
-        self._frame.use()  # without a window nothing runs, not even this, before a frame is bound
+        self._frame.use()  # transform feedback without a window requires a bound frame
         captured = self.context.buffer(reserve=self._object.count * 16)
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
@@ -243,14 +241,14 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """A program's uniforms; one that already has its value is not written again."""
+    """Uniforms of a shader program; unchanged values are not written again."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
         self._last: dict[str, object] = dict.fromkeys(program)
 
     def set(self, **values: object) -> None:
-        """Set values; uniforms that the compiler removed as unused are ignored."""
+        """Set uniforms; those that the compiler removed as unused are ignored."""
         last = self._last
         for name, value in values.items():
             if name in last and last[name] != value:
@@ -258,7 +256,7 @@ class Uniforms:
 
 
 def set_view(uniforms: Uniforms, view: EyeView) -> None:
-    """Pass a view to the vertex shader; uniforms that the compiler removed are ignored."""
+    """Set the vertex shader's uniforms for a view."""
     screen = view.screen
     uniforms.set(
         eye=tuple(view.eye.tolist()),
@@ -281,7 +279,7 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
 
 
 class _MeshBuffers:
-    """Vertex buffers of one mesh: the fixed ones, and those that change with each frame."""
+    """Static and per-frame vertex buffers of one mesh."""
 
     def __init__(
         self,
@@ -294,17 +292,18 @@ class _MeshBuffers:
         self._context = context
         if normals is None:
             normals = np.tile([0.0, 0.0, 1.0], (self.count, 1))
-        begun = _interleaved(rest, normals)
-        self._rest, self._moving = context.buffer(begun), context.buffer(begun, dynamic=True)
+        content = _interleaved(rest, normals)
+        self._rest, self._moving = context.buffer(content), context.buffer(content, dynamic=True)
         self._triangles = context.buffer(np.ascontiguousarray(triangles, np.int32))
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals (vertices, 6). Raises ValueError for another number of
-        vertices."""
+        """Set positions and normals (vertices, 6); raise ValueError for another shape."""
         if moved.shape != (self.count, 6):
-            raise ValueError(f"positions and normals {moved.shape} for {self.count} vertices")
-        # New memory for each frame: the driver need not wait until the last one is drawn.
+            raise ValueError(
+                f"positions and normals: expected shape ({self.count}, 6), found {moved.shape}"
+            )
+        # New memory for each frame, so that the driver need not wait for the last frame.
         self._moving.orphan()
         self._moving.write(moved)
 
@@ -327,10 +326,7 @@ class _MeshBuffers:
 
 
 def _determinant(matrix: Floats) -> float:
-    """Return the determinant of a (3, 3) matrix.
-
-    This is faster than numpy.linalg.det, which accepts any size.
-    """
+    """Return the determinant of a (3, 3) matrix, faster than `numpy.linalg.det`."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
@@ -340,33 +336,28 @@ def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
 
 
 def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
-    """Return a fine mesh on the imaginary screen, 300 mm square, that carries the grid."""
+    """Return a fine mesh on the imaginary screen, 300 mm square, for the screen patterns."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    right, above = corner + 1, corner + cells + 1
-    triangles = np.concatenate(
-        [np.column_stack([corner, right, above + 1]), np.column_stack([corner, above + 1, above])]
-    )
-    return points, triangles.astype(np.int32)
+    return points, triangulate_grid(cells + 1, cells + 1)
 
 
 def shader_text(name: str) -> str:
-    """Return the shader's text; the file's text replaces a line `#include "name"`."""
+    """Return the text of a shader file with its lines `#include "name"` expanded."""
     text = files("flexsheet.nodes.renderer").joinpath(name).read_text()
     return re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window. Raises NoOpenGLError."""
-    # As a dict, because the stub types every further setting as one.
+    """Return an OpenGL 3.3 context without a window; raise NoOpenGLError."""
+    # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}
     try:
         return moderngl.create_context(standalone=True, require=330, **settings)
     except Exception as error:
         raise NoOpenGLError(
-            f"no headless OpenGL 3.3 through EGL: {error}; "
+            f"OpenGL 3.3 is not available through EGL: {error}; "
             "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri"
         ) from error

@@ -1,4 +1,4 @@
-"""Prepare the projector's lens distortion for the shaders, which apply it to a pinhole's image."""
+"""Convert the projector's lens distortion for the shaders."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""Ratio of slopes beyond the image's corners up to which the lens must be invertible."""
+"""Slope up to which the distortion must be invertible, over that of the image's corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
-    """A lens in OpenGL's clip coordinates.
+    """Lens in OpenGL clip coordinates.
 
-    focal_centre: (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3. reach: the maximum squared slope of
-    a ray that the model distorts. Steeper rays are treated as if they had that slope, because the
-    polynomial would fold them back into the image.
+    focal_centre: (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3. reach: squared slope at which rays
+    are clamped, because the polynomial would fold steeper rays back into the image.
     """
 
     focal_centre: tuple[float, float, float, float]
@@ -27,9 +26,9 @@ class ClipLens:
 
 
 def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
-    """Return the lens for the shader `lens.glsl`; None for one without distortion.
+    """Return the lens for the shader `lens.glsl`; None for a lens without distortion.
 
-    Raises ValueError for a distortion that folds within the image: no such lens exists.
+    Raises ValueError for a distortion that is not invertible within the image.
     """
     if not any(lens.distortion):
         return None
@@ -39,7 +38,7 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
         for x in (-0.5, width_px - 0.5)
         for y in (-0.5, height_px - 0.5)
     ]
-    # Radii r at which the radial polynomial r (1 + k1 r^2 + ...) stops growing.
+    # Radii r at which the radial polynomial r (1 + k1 r^2 + ...) has zero slope.
     stationary = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
     real = stationary[(np.abs(stationary.imag) < 1e-9) & (stationary.real > 0.0)].real
     fold = float(np.sqrt(real.min())) if len(real) else np.inf
@@ -48,8 +47,8 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
     if largest < needed:
         raise ValueError(
             f"projector.lens.distortion: {lens.distortion} folds the image: its maximum slope is "
-            f"{largest:.3f}, the corners need {needed:.3f}; calibrate again with pixels in all of "
-            "the image"
+            f"{largest:.3f}, the corners need {needed:.3f}; calibrate again with points in the "
+            "whole image"
         )
     reach = min(fold, 4.0 * needed)
     return ClipLens(

@@ -1,4 +1,4 @@
-"""Find the projector's monitor and open a window on it, through GLFW, on the main thread."""
+"""Find the projector's monitor and open a window on it with GLFW (main thread only)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ON_A_PROJECTOR = {
 
 
 class WindowError(FlexsheetError, RuntimeError):
-    """The requested window cannot be opened; the message gives the remedy."""
+    """Raised when the requested window cannot be opened."""
 
     code = "window"
     remedy = "Set the monitor to one that the text lists, or run headless."
@@ -34,7 +34,7 @@ class WindowError(FlexsheetError, RuntimeError):
 
 @contextmanager
 def glfw_errors() -> Iterator[None]:
-    """Convert GLFW's errors to WindowError; GLFW raises them only after `start_glfw`."""
+    """Convert GLFW's errors, which are raised after `start_glfw`, to WindowError."""
     try:
         yield
     except glfw.GLFWError as error:
@@ -42,7 +42,7 @@ def glfw_errors() -> Iterator[None]:
 
 
 def start_glfw() -> None:
-    """Connect to the display. Raises WindowError when there is none."""
+    """Connect to the display; raise WindowError if there is none."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -56,32 +56,30 @@ def start_glfw() -> None:
 def _no_display(why: str) -> WindowError:
     return WindowError(
         f"parameter output: window: no display ({why}); set DISPLAY to the screen of the "
-        "projector (such as DISPLAY=:0), or draw without a window: output: headless"
+        "projector (such as DISPLAY=:0), or use output: headless"
     )
 
 
 def monitor_names() -> list[str]:
-    """Return the names of the monitors, the primary one first; an index into this list selects
-    one."""
+    """Return the names of the monitors in the order of their numbers, the primary one first."""
     return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
 
 
 def find_monitor(monitor: str | int) -> Any:
-    """Return GLFW's monitor of that number or name. Raises WindowError, which lists all
-    monitors."""
+    """Return GLFW's monitor by number or name; raise WindowError with a list if there is none."""
     monitors, names = glfw.get_monitors(), monitor_names()
-    wanted = monitor
+    key = monitor
     if isinstance(monitor, str) and monitor not in names and monitor.isdigit():
-        wanted = int(monitor)
-    if isinstance(wanted, int) and 0 <= wanted < len(monitors):
-        return monitors[wanted]
-    same = [index for index, name in enumerate(names) if name == wanted]
+        key = int(monitor)
+    if isinstance(key, int) and 0 <= key < len(monitors):
+        return monitors[key]
+    same = [index for index, name in enumerate(names) if name == key]
     if len(same) == 1:
         return monitors[same[0]]
     have = "; ".join(
         f'{index}: "{name}" {_mode(monitors[index])}' for index, name in enumerate(names)
     )
-    why = f"{len(same)} monitors have that name, give the number" if same else "there is none"
+    why = f"{len(same)} monitors have this name, set the number" if same else "unknown monitor"
     raise WindowError(f"parameter monitor: {monitor!r}: {why}; monitors: {have or 'none'}")
 
 
@@ -95,24 +93,24 @@ def _text(name: bytes | str) -> str:
 
 
 def refresh_period_s(monitor: Any) -> float:
-    """Return the refresh period of a monitor as it runs now; 0 when it is not known."""
+    """Return the current refresh period of a monitor, s; 0 if it is unknown."""
     rate_hz = glfw.get_video_mode(monitor).refresh_rate
     return 1.0 / rate_hz if rate_hz > 0 else 0.0
 
 
 def hidden_window() -> Any:
-    """Return an invisible window: its context is the one to draw in."""
+    """Return an invisible window whose context is for drawing."""
     return _create((1, 1), {glfw.VISIBLE: False})
 
 
 def open_window(
     size: tuple[int, int], monitor: Any | None, share: Any, *, stereo: bool
 ) -> tuple[Any, bool]:
-    """Return a window whose context shares objects with `share`, and whether it has a buffer per
-    eye.
+    """Return a window that shares graphics objects with `share`, and whether it is quad-buffered.
 
-    monitor: full-screen there; None: an ordinary window. stereo: a buffer per eye if the driver has
-    that. Raises WindowError for a monitor without a mode of that size.
+    monitor: of a full-screen window; None: an ordinary window. stereo: quad-buffered (one buffer
+    per eye) if the driver supports it. Raises WindowError for a monitor without a mode of this
+    size.
     """
     width, height = size
     if monitor is not None:
@@ -129,7 +127,7 @@ def open_window(
         try:
             window = _create(size, {**hints, glfw.STEREO: True}, monitor, share)
         except WindowError:
-            pass  # no such buffers: the eyes alternate instead
+            pass  # quad buffering is not supported, so the eyes alternate
         else:
             return window, True
     return _create(size, hints, monitor, share), False

@@ -1,4 +1,4 @@
-"""Draw the virtual object for the projector, corrected for where the sheet is."""
+"""Node that draws the virtual object for the projector, corrected for the sheet's pose."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """Draw as soon as the soft body has responded to a new fingertip, at most at `rate_hz`.
+    """Node that draws a frame for each soft-body message, at most at `rate_hz`.
 
-    Without a solver the fingertip triggers a frame, and without a finger the timer does. A frame is
-    published when it was drawn, or with a window when that showed it.
+    Without a solver, fingertip messages trigger frames; without a fingertip, the timer does. A
+    frame is published after it was drawn, or, with a window, after it was shown.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
@@ -52,9 +52,7 @@ class Renderer(Node):
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.output == "window":
-            return (
-                "it shows its frames in a window; verify its drawing with a bag of a headless run"
-            )
+            return "its frames are shown in a window; record a run with output: headless instead"
         return ""
 
     async def setup(self) -> None:
@@ -64,7 +62,7 @@ class Renderer(Node):
         self._shown = Display(correction="two_pass", stereo=self.parameters.stereo)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
-        self._still_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
+        self._idle_period_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
 
     async def close(self) -> None:
         self._output.close()
@@ -78,12 +76,12 @@ class Renderer(Node):
         if self.display.message is None:
             correction = resolve_method(given.correction, scene.methods.correction, "two_pass")
             self._shown = self._shown.model_copy(update={"correction": correction})
-        stage = SceneRenderer(
+        scene_renderer = SceneRenderer(
             scene,
             self._output.context,
             spacing_m=given.spacing_m,
             samples=given.samples,
-            dents=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
+            basis=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
             sheet_shape=resolve_method(
                 given.sheet_shape, scene.methods.sheet_shape, "reduced_order"
             ),
@@ -95,7 +93,7 @@ class Renderer(Node):
         )
         ports = RendererInputs(**{name: self.inputs[name] for name in RendererInputs.__slots__})
         self._frame_renderer = FrameRenderer(
-            stage, self._output, ports, latency, self.clock, max_age_s=given.max_age_s
+            scene_renderer, self._output, ports, latency, self.clock, max_age_s=given.max_age_s
         )
 
     def on_display(self, display: Display, header: Header) -> None:
@@ -112,7 +110,7 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """Poll the window, and redraw when no message comes."""
+        """Handle window events, and draw a frame if no message triggered one."""
         if not self._output.poll():
             self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:
@@ -122,11 +120,11 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Called by the window's thread, too."""
+        """Publish a shown frame; may be called from the window's thread."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
-        """Start again from the scene: a lost context loses all that was drawn with it."""
+        """Create the output and all graphics objects again after the context was lost."""
         self.log.warning("window", problem=self._output.note)
         self._frame_renderer = None
         self._output.close()
@@ -135,16 +133,16 @@ class Renderer(Node):
             self.on_scene(self.scene.message, self.scene.header)
 
     def _draw_if_due(self) -> None:
-        # A quarter of a period early is in time: else a 60 Hz camera interferes with 30 Hz.
+        # Drawing up to a quarter of a period early avoids a beat between camera and frame rate.
         now_ns = self.clock.now_ns()
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
-        rested_ns = now_ns - self._drawn_ns + self._period_ns // 4
-        if rested_ns < self._still_ns and self._frame_renderer.is_unchanged(self._shown):
+        idle_ns = now_ns - self._drawn_ns + self._period_ns // 4
+        if idle_ns < self._idle_period_ns and self._frame_renderer.is_unchanged(self._shown):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)
-        # Where drawing is slower than the rate, messages are read before the next frame.
+        # If drawing is slower than the rate, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
@@ -161,7 +159,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window showed, or skipped for a newer one."""
+        """Publish a frame that the window showed or replaced by a newer one."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -1,8 +1,8 @@
-"""Build the drawn surface: a fine mesh of the scene's object that follows the solver's skin.
+"""Build the drawn mesh of the scene's object and deform it with the solver's skin.
 
-The equations correct at vertices only, and facets are visible in a silhouette. So the drawn mesh is
-finer than the solver's and lies on the true shape. Between the skin's vertices the displacement and
-the rotation of the normal are interpolated.
+The drawn mesh is finer than the solver's and is on the true shape, because the paper's equations
+correct at vertices only and coarse facets are visible in a silhouette. The skin's displacement and
+the rotation of its normals are interpolated between its vertices.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from flexsheet.nodes.models.shapes.triangles import (
     find_degenerate,
     nearest_in_triangles,
     refine_facets,
+    triangulate_grid,
 )
 
 Floats = NDArray[np.float64]
@@ -32,14 +33,14 @@ Real = TypeVar("Real", np.float32, np.float64)
 MIN_AROUND = 128
 """Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
-"""Sample points of a skin, next to a drawn vertex, whose triangles may hold the nearest point."""
+"""Number of skin samples near a drawn vertex whose triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectSurface:
-    """The object at rest, world frame.
+    """Surface of the object at rest.
 
-    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled. triangles:
+    rest_world_m, normals_world: (vertices, 3); vertices on sharp edges are duplicated. triangles:
     (triangles, 3), outward.
     """
 
@@ -51,7 +52,7 @@ class ObjectSurface:
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
     ) -> ObjectSurface:
-        """Return a surface given in the object's frame."""
+        """Return the surface in the world from points and normals in the object's frame."""
         return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
@@ -62,10 +63,10 @@ class ObjectSurface:
 def make_surface(
     geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
 ) -> ObjectSurface:
-    """Return the surface of a scene's geometry with this shape; vertices about `spacing_m` apart.
+    """Return the surface of a geometry and its shape with vertices about `spacing_m` apart.
 
-    Only the touchable rectangle of a plane is drawn, and the smooth surface of a mesh. Raises
-    ValueError for a spacing that needs too many triangles.
+    A plane is drawn as its touchable rectangle, a mesh as its smooth surface. Raises ValueError for
+    a spacing that needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -90,7 +91,7 @@ def make_surface(
         case _:
             cuboid_map = GEOMETRIES[geometry.shape].cuboid_map
             if cuboid_map is None:
-                raise ValueError(f'geometry "{geometry.shape}" has no cuboid_map to be drawn by')
+                raise ValueError(f'geometry "{geometry.shape}": drawing it requires a cuboid_map')
             points, triangles = _inflate_cuboid(cuboid_map(geometry, shape), spacing_m)
             normals = shape.closest(points).normal
     return ObjectSurface.placed(points, normals, triangles, world_from_object)
@@ -101,7 +102,7 @@ def cylinder_surface(
 ) -> ObjectSurface:
     """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
-    Its side comes first, ring by ring; then each end cap, with a rim of its own and a centre.
+    The vertices are the side's rings, then each end cap with its rim and centre.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
     around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
@@ -136,18 +137,11 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
+    """Return points (n, 2) of a grid of cells over -0.5..0.5, and counter-clockwise triangles."""
     u, v = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
     )
-    here = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
-    above = here + columns + 1
-    triangles = np.concatenate(
-        [
-            np.column_stack([here, here + 1, above + 1]),
-            np.column_stack([here, above + 1, above]),
-        ]
-    )
+    triangles = triangulate_grid(rows + 1, columns + 1).astype(np.int64)
     return np.column_stack([u.ravel(), v.ravel()]), triangles
 
 
@@ -173,7 +167,7 @@ def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDAr
 
 
 class VertexNormals:
-    """Compute unit normals at the vertices of moving triangles: their triangles' mean, by area."""
+    """Function that computes area-weighted unit normals at the vertices of a mesh."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
@@ -184,9 +178,8 @@ class VertexNormals:
         self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
 
     def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
-        """Return (vertices, 3) for positions (vertices, 3)."""
-        # By rows of one coordinate: gathering and multiplying then access contiguous memory.
-        # np.cross is several times slower than its own six products.
+        """Return the unit normals (vertices, 3) for vertex positions (vertices, 3)."""
+        # Arrays of one coordinate each are contiguous; np.cross is several times slower.
         coordinates = np.ascontiguousarray(positions.T)
         a, b, c = (coordinates.take(corner, axis=1) for corner in self._corners)
         b -= a
@@ -201,18 +194,19 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """Transfer a skin's displacement to a drawn surface.
+    """Deformation of a drawn surface by the displacement of a skin.
 
-    A drawn vertex moves as the nearest point of the skin. Its normal, exact at rest, rotates as the
-    skin's own smooth normals there rotate on average.
+    A drawn vertex moves with the nearest point of the skin. Its normal changes by the interpolated
+    change of the skin's smooth normals there.
     """
 
     def __init__(
         self, surface: ObjectSurface, skin_vertices: Floats, skin_triangles: Indices
     ) -> None:
-        """skin_vertices: (s, 3) at rest, world; skin_triangles: (t, 3), outward.
+        """Compute the interpolation weights.
 
-        Raises ValueError for a skin without triangles, or with coordinates that are not finite.
+        skin_vertices: (s, 3), world, at rest. skin_triangles: (t, 3), outward. Raises ValueError
+        for a skin without triangles, or with coordinates that are not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -225,20 +219,22 @@ class DeformationTransfer:
         self._moves = np.empty((self.vertices, 6), np.float32)
 
     def apply(self, displacement: Singles | None) -> Singles:
-        """Return positions and normals, not of unit length, side by side (vertices, 6).
+        """Return positions and normals (vertices, 6); the normals are not of unit length.
 
-        displacement: (s, 3) of the skin; None: at rest. Raises ValueError for one of another skin,
-        or one that is not finite.
+        displacement: (s, 3) of the skin; None: at rest. Raises ValueError for a wrong shape or
+        values that are not finite.
         """
         if displacement is None:
             return self._rest
         if displacement.shape != self._skin.shape:
-            raise ValueError(f"displacement of {len(displacement)} vertices does not fit the skin")
+            raise ValueError(
+                f"displacement: expected {len(self._skin)} skin vertices, found {len(displacement)}"
+            )
         moves = self._moves
         moves[:, :3] = displacement
-        # A sum is NaN or infinite as soon as one of its terms is.
+        # The sum is not finite if one of its terms is not.
         if not np.isfinite(moves[:, :3].sum()):
-            raise ValueError("displacement of the skin holds NaN or infinity")
+            raise ValueError("displacement of the skin contains NaN or infinity")
         np.subtract(self._normals(self._skin + displacement), self._rest_normals, out=moves[:, 3:])
         result: Singles = self._weights @ moves
         result += self._rest
@@ -246,11 +242,11 @@ class DeformationTransfer:
 
 
 def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
-    """Return (points, skin vertices), float32: interpolates values of the skin's vertices at
-    points.
+    """Return the matrix (points, skin vertices), float32, that interpolates skin values at points.
 
-    Each point takes the barycentric weights of the nearest point of the skin; triangles without
-    area are ignored. Raises ValueError for a skin that has no others, or with NaN.
+    The weights are barycentric at the nearest point of the skin; triangles without area are
+    ignored. Raises ValueError for a skin without other triangles, or with vertices that are not
+    finite.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("the skin has vertices that are not finite")
@@ -283,10 +279,10 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return points (n, 3) spread over triangles (t, 3, 3), and their triangle (n,).
+    """Return sample points (n, 3) on triangles (t, 3, 3), and their triangle (n,).
 
-    Large triangles get more. So the nearest samples find the nearest triangle also on a skin that
-    is finer in front.
+    Larger triangles have more samples, so that the nearest samples identify the nearest triangle on
+    a graded skin.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

@@ -1,4 +1,4 @@
-"""Select the eyes to draw for, which of them a frame is for, and how the projector packs both."""
+"""Select the eyes of a frame and pack the images of both eyes for the projector."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Floats = NDArray[np.float64]
 WhichEye = Literal["both", "left", "right"]
 
 MIN_EYE_DISTANCE_M = 0.05
-"""Minimum distance of an eye from the imaginary screen. For closer eyes nothing can be drawn."""
+"""Minimum distance of an eye from the imaginary screen."""
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """Return the eyes to draw for, the unit direction (3,) from left to right, and a reason.
+    """Return the eyes to draw for, the unit direction (3,) from left to right, and a note.
 
-    tracked: the newest `eye` message, or None when there is none or it is too old. The reason tells
-    why the eyes are not the tracked ones; empty if they are.
+    tracked: newest `eye` message; None if there is none or it is too old. The note contains the
+    reason why a tracked message is not used, or is empty.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
         return eyes, across, ""
     if not tracked.valid:
-        return eyes, across, "the eyes are not seen: using the scene's"
+        return eyes, across, "the eyes are not tracked: using the scene's eyes"
     length = float(np.linalg.norm(tracked.right_world))
     if length < 1e-6:
         return eyes, across, "eye.right_world is zero: using the scene's eyes"
@@ -39,17 +39,15 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"an eye {where} before the screen: using the scene's eyes",
+            f"an eye is {where} from the screen: using the scene's eyes",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """Return the world positions (2, 3) of the left and right eye.
+    """Return the world positions (2, 3) of the left and right eye, equal in mono mode.
 
-    In mono mode both are the point of view.
-
-    across: (3,) unit direction from left to right; None: along x.
+    across: (3,), unit direction from left to right; None: along x.
     """
     direction = np.array([1.0, 0.0, 0.0]) if across is None else across
     half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
@@ -59,9 +57,9 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 
 
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
-    """Return the eye that frame `number` is for: in frame_sequential odd frames are the left eye's.
+    """Return the eyes of frame `number`; in frame_sequential, odd frames are for the left eye.
 
-    shows_both: the output alternates by itself, and takes both images of each frame.
+    shows_both: whether the output alternates the eyes and needs both images of each frame.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
@@ -71,10 +69,10 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
 def select_drawn_eyes(
     pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
 ) -> Floats:
-    """Return (1 or 2, 3): the eyes of a pair (2, 3) that a frame draws, one image each.
+    """Return the eyes (1 or 2, 3) of a pair (2, 3) for which a frame's images are drawn.
 
-    A frame for one eye shows the other's image where the eyes are swapped: the glasses then open
-    the other way round. Images of both eyes are swapped where they are packed.
+    With swap_eyes, a frame for one eye contains the other eye's image, for glasses of the opposite
+    phase. Images of both eyes are swapped by `pack`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)
@@ -83,15 +81,14 @@ def select_drawn_eyes(
 
 
 def pack(left: Image, right: Image, mode: StereoMode, *, swap_eyes: bool = False) -> Image:
-    """Return one image (height, width, 3) of two of that size.
+    """Pack two images into one image (height, width, 3) of the same size.
 
-    mono: the left image. side_by_side, top_bottom: each squeezed to half the width or height by
-    averaging neighbours, left first. anaglyph: red of the left, green and blue of the right, each
-    from its grey. frame_sequential: nothing is packed, the left one comes first. swap_eyes
-    exchanges the two first. Raises ValueError if the sizes differ or are odd.
+    mono, frame_sequential: the left image. side_by_side, top_bottom: both, halved in width or
+    height by averaging, left first. anaglyph: red of the left, green and blue of the right, both
+    in grey. swap_eyes: exchange the images first. Raises ValueError if the sizes differ or are odd.
     """
     if left.shape != right.shape:
-        raise ValueError(f"images of {left.shape} and {right.shape} cannot be packed")
+        raise ValueError(f"images to pack must have equal sizes: {left.shape} and {right.shape}")
     if swap_eyes:
         left, right = right, left
     if mode in ("mono", "frame_sequential"):
@@ -112,6 +109,6 @@ def _gray(image: Image) -> Image:
 
 def _halved(image: Image, axis: int) -> Image:
     if image.shape[axis] % 2:
-        raise ValueError(f"an image of {image.shape[1]}x{image.shape[0]} cannot be halved")
+        raise ValueError(f"image size {image.shape[1]}x{image.shape[0]} must be even for halving")
     even, odd = (image[:, i::2] if axis == 1 else image[i::2] for i in (0, 1))
     return ((even.astype(np.uint16) + odd + 1) // 2).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Provide the renderer's output: offscreen, or a window on the projector's monitor."""
+"""Outputs of the renderer: offscreen, or a window on the projector's monitor."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ from flexsheet.nodes.renderer.monitors import (
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
 
-CLOSED = "the window was closed and frames are not shown; restart the node to open it"
+CLOSED = "the window was closed; frames are not shown until the node is restarted"
 
 
 class OutputWindow(Protocol):
-    """Take eyes' images; `context` is the one to draw in, current in the caller's thread."""
+    """Interface of an output for the eyes' images.
+
+    context: for drawing, current in the caller's thread.
+    """
 
     context: moderngl.Context
     is_seen: bool
-    """Whether images are shown, and `shown` reports when."""
+    """Whether images are shown and their swap times are reported."""
     shows_both: bool
-    """Whether it alternates the eyes of frame_sequential by itself."""
+    """Whether the output alternates the eyes in the mode frame_sequential."""
     period_s: float
-    """Refresh period that swaps wait for; 0: none."""
+    """Refresh period of the monitor, s; 0 if swaps do not wait for it."""
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
@@ -43,7 +46,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """Show nothing: frames are drawn for readers only."""
+    """Output without a window: frames are only drawn and read."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -56,10 +59,10 @@ class OffscreenOutput:
         """Do nothing: there is no window."""
 
     def take(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Do nothing: no image is stored."""
+        """Do nothing: images are not stored."""
 
     def show(self, tag: Any, display: Display) -> None:
-        """Do nothing: no image is shown."""
+        """Do nothing: images are not shown."""
 
     def poll(self) -> bool:
         return True
@@ -83,9 +86,9 @@ def open_output(
 
 
 class ProjectorWindow:
-    """A window, full-screen on the projector's monitor, that swaps in a thread of its own.
+    """Full-screen window on the projector's monitor that swaps in a separate thread.
 
-    Called on the main thread only, which the window system requires.
+    The window system requires that all methods are called on the main thread.
     """
 
     def __init__(
@@ -96,10 +99,11 @@ class ProjectorWindow:
         now_ns: Callable[[], int],
         shown: Shown,
     ) -> None:
-        """monitor: its name or number; None: an ordinary window, for tests.
+        """Create the drawing context.
 
-        swap_interval: refreshes per swap; 0 does not wait, and tears. Raises WindowError without a
-        display or such a monitor.
+        monitor: name or number; None: an ordinary window, for tests. swap_interval: refreshes per
+        swap; 0: no wait, with tearing. Raises WindowError if there is no display or no such
+        monitor.
         """
         start_glfw()
         self._monitor = None if monitor is None else find_monitor(monitor)
@@ -116,7 +120,7 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for images of that size, and replace one of another size."""
+        """Open the window for images of a size (px), unless it is open with that size."""
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return
         self._shut()
@@ -142,7 +146,7 @@ class ProjectorWindow:
         self._note_size(size, self._presenter.framebuffer_px)
 
     def take(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Store an eye's image, 0 the first, for the next `show`."""
+        """Store the image of eye `number` for the next `show`."""
         if self._presenter is None:
             return
         if self._filling is None:
@@ -150,7 +154,7 @@ class ProjectorWindow:
         self.context.copy_framebuffer(self._filling.frames[number], image)
 
     def show(self, tag: Any, display: Display) -> None:
-        """Show the stored images at the next refresh; `shown(tag, when)` reports it."""
+        """Show the stored images at the next refresh, which `shown` reports with the tag."""
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
@@ -161,10 +165,10 @@ class ProjectorWindow:
         self._presenter.put(slot)
 
     def poll(self) -> bool:
-        """Handle the events of the window; return False after its graphics context is lost.
+        """Handle the window's events; return False if the graphics context was lost.
 
-        Then all must be created again. A closed window stays closed; `note` reports that.
-        WindowError gives the reason of the loss.
+        A lost output must be created again; `note` contains the reason. A window that the user
+        closed is not opened again; `note` reports that.
         """
         glfw.poll_events()
         if self._presenter is not None and self._presenter.problem is not None:
@@ -190,12 +194,12 @@ class ProjectorWindow:
         self.note = (
             ""
             if fits
-            else f"window of {width}x{height} for images of {size[0]}x{size[1]}: shown unscaled, "
-            "in the middle"
+            else f"the window is {width}x{height}, the images {size[0]}x{size[1]}: they are shown "
+            "unscaled in the centre"
         )
 
     def _shut(self) -> None:
-        """Close the window; drawing can continue."""
+        """Close the window but not the drawing context."""
         if self._presenter is not None:
             self._presenter.stop()
             self._presenter = None
@@ -210,7 +214,7 @@ class ProjectorWindow:
             self._window = None
 
     def close(self) -> None:
-        """Close the window and free all resources."""
+        """Close the window and release all resources."""
         self._shut()
         self.context.release()
         glfw.destroy_window(self._hidden)

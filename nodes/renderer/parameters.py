@@ -17,7 +17,7 @@ from flexsheet.nodes.renderer.gl import SAMPLES
 class RendererParameters(NodeParameters):
     rate_hz: Positive = Field(default=30.0, description="Maximum frame rate.")
     idle_rate_hz: Positive = Field(
-        default=1.0, description="Frame rate while nothing touches or moves."
+        default=1.0, description="Frame rate while nothing moves and no finger is tracked."
     )
     output: Literal["headless", "window"] = "headless"
     monitor: str | int | None = Field(
@@ -29,12 +29,13 @@ class RendererParameters(NodeParameters):
     )
     prediction_horizon_s: NonNegative = Field(
         default=0.016,
-        description="Initial time from the start of drawing to the middle of the light.",
+        description="Time from the start of drawing to the middle of the frame's display, before "
+        "the first measurement.",
     )
     display_latency_s: NonNegative = Field(
         default=0.008,
         description="Time from the swap (without a window: the end of drawing) to the middle of "
-        "the light: half a frame plus the projector's own delay.",
+        "the frame's display: half a frame plus the projector's delay.",
     )
     max_age_s: Positive = Field(
         default=0.1, description="Maximum age of poses, fingertips, eyes and soft bodies."
@@ -50,7 +51,7 @@ class RendererParameters(NodeParameters):
     )
     correction: Correction | Literal["auto"] = Field(
         default="auto",
-        description="Correction until a display message. auto: the scene's, else two_pass.",
+        description="Correction before a display message. auto: the scene's, else two_pass.",
     )
     sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
         default="auto",
@@ -60,5 +61,5 @@ class RendererParameters(NodeParameters):
         default=None, description="Folder of the sheet's deflection shapes. null: the user's cache."
     )
     stereo: StereoMode = Field(
-        default="side_by_side", description="Stereo mode until a display message."
+        default="side_by_side", description="Stereo mode before a display message."
     )

@@ -1,8 +1,8 @@
-"""Show the newest image in a window, from a thread of its own that waits for the refresh.
+"""Show the newest image in a window from a separate thread.
 
-A swap that waits for the projector blocks this thread only. The event loop continues to draw into
-textures that both contexts share. Three pairs of them are used in turn: one is shown, one is ready,
-one is drawn into.
+A swap that waits for the projector's refresh blocks only this thread. The event loop continues to
+draw into textures that both contexts share. There are three pairs of textures (triple buffering):
+one is shown, one is ready, and one is drawn into.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""Swaps after a resize: a driver's buffers may take their new size two swaps later."""
+"""Number of swaps after a resize, because drivers may resize their buffers two swaps later."""
 
 _NO_WINDOW: Any = None
 MODES: dict[StereoMode, int] = {
@@ -37,13 +37,13 @@ MODES: dict[StereoMode, int] = {
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
-"""Called in the presenter's thread with an image's tag and its swap time, ns; 0 for an image that a
-newer one replaced."""
+"""Callback, in the presenter's thread, with an image's tag and swap time, ns. The time is 0 for an
+image that a newer one replaced."""
 
 
 @dataclass(slots=True)
 class Slot:
-    """Two textures, left and right, and their content."""
+    """Textures of the left and right eye's image, and how to show them."""
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
     frames: tuple[moderngl.Framebuffer, moderngl.Framebuffer]
@@ -59,7 +59,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """Own a window's context in a thread; `put` hands over images."""
+    """Thread that owns a window's context and shows the images passed to `put`."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return a slot to draw into: neither shown nor ready."""
+        """Return the slot to draw into, which is neither shown nor ready."""
         with self._changed:
             return next(
                 slot
@@ -94,7 +94,7 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Show this slot from the next refresh on; it must be drawn. Does not wait."""
+        """Show a completely drawn slot from the next refresh on, without waiting for it."""
         with self._changed:
             superseded, self._ready = self._ready, slot
             self._changed.notify()
@@ -108,7 +108,7 @@ class Presenter:
             self._changed.notify()
 
     def stop(self) -> None:
-        """End the thread; then its context is free."""
+        """Stop the thread, which releases its context."""
         with self._changed:
             self._stop = True
             self._changed.notify()
@@ -119,16 +119,16 @@ class Presenter:
             with glfw_errors():
                 glfw.make_context_current(self._window)
                 glfw.swap_interval(self._swap_interval)
-                pane = _Pane(self._slots)
+                quad = _WindowQuad(self._slots)
                 while (slot := self._next()) is not None:
-                    self._present(pane, *slot)
+                    self._present(quad, *slot)
         except (WindowError, moderngl.Error) as error:
             self.problem = error
         finally:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """Return the slot to show now, and whether it is a new one; None at the end."""
+        """Wait for and return the slot to show and whether it is new; None after `stop`."""
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
@@ -145,30 +145,30 @@ class Presenter:
     def _alternates(self, slot: Slot) -> bool:
         return slot.mode == "frame_sequential" and not self._quad_buffered
 
-    def _present(self, pane: _Pane, slot: Slot, is_new: bool) -> None:
+    def _present(self, quad: _WindowQuad, slot: Slot, is_new: bool) -> None:
         left, right = slot.textures[:: -1 if slot.swap_eyes else 1]
         if slot.mode == "frame_sequential" and self._quad_buffered:
             for buffer, texture in ((GL_BACK_LEFT, left), (GL_BACK_RIGHT, right)):
-                pane.choose_buffer(buffer)
-                pane.draw(self.framebuffer_px, 0, texture, texture)
+                quad.choose_buffer(buffer)
+                quad.draw(self.framebuffer_px, 0, texture, texture)
         else:
             if self._alternates(slot):
                 left = right if self._right_is_next else left
                 self._right_is_next = not self._right_is_next
-            pane.draw(self.framebuffer_px, MODES[slot.mode], left, right)
+            quad.draw(self.framebuffer_px, MODES[slot.mode], left, right)
         glfw.swap_buffers(self._window)
-        pane.wait_until_done()
+        quad.wait_until_done()
         swapped_ns = self._now_ns()
-        if pane.is_lost():
+        if quad.is_lost():
             raise WindowError("the graphics card was reset")
         if is_new:
             self._shown(slot.tag, swapped_ns)
 
 
-class _Pane:
-    """Draw into the window: one triangle over all of it, with the slots' textures.
+class _WindowQuad:
+    """Drawing of the slots' textures over the whole window.
 
-    GL functions that wait are called through ctypes, which lets the other threads run.
+    Blocking GL functions are called through ctypes, which releases the interpreter lock.
     """
 
     def __init__(self, slots: list[Slot]) -> None:
@@ -196,7 +196,7 @@ class _Pane:
         left: moderngl.Texture,
         right: moderngl.Texture,
     ) -> None:
-        """Draw pixel for pixel, in the middle of a window of another size."""
+        """Draw the textures unscaled in the centre of the window."""
         origin = (np.array(framebuffer_px) - self._size) // 2
         screen = self._context.screen
         screen.viewport = (0, 0, *framebuffer_px)
@@ -212,8 +212,7 @@ class _Pane:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of OpenGL of the current context; None if the driver has none of that
-    name."""
+    """Return an OpenGL function of the current context, or None if the driver lacks it."""
     address = glfw.get_proc_address(name)
     if not address:
         return None

@@ -1,9 +1,8 @@
-"""Project in two passes: draw what the eye should see, then map it onto the sheet's mesh.
+"""Correct the image in two passes (projective texture mapping).
 
-The first pass draws the object as the eye sees it, through a rectangle on the imaginary screen. The
-second draws the sheet as the projector sees it. Each of its points takes the colour that the eye
-should see there. Any sheet shape works and depth is exact. There is no seam between triangles,
-because nothing is moved vertex by vertex.
+The first pass draws the object as the eye should see it, through a rectangle on the imaginary
+screen. The second pass draws the sheet's mesh as the projector sees it, textured with the first
+image. The method supports any sheet shape and exact depth, and has no seams between triangles.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 Floats = NDArray[np.float64]
 
 CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
-"""OpenGL's name of the first plane, and how many `sheet.vert.glsl` has."""
+"""OpenGL constant of the first clip plane, and number of clip planes in `sheet.vert.glsl`."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenRectangle:
-    """A rectangle on the imaginary screen, metres."""
+    """Rectangle on the imaginary screen, m."""
 
     left: float
     bottom: float
@@ -42,7 +41,10 @@ class ScreenRectangle:
 
     @property
     def clip_from_screen(self) -> Floats:
-        """(3, 3): (x, y, 1) on the imaginary screen to OpenGL's clip, filled by the rectangle."""
+        """Return the map (3, 3) from (x, y, 1) on the screen to OpenGL clip coordinates.
+
+        The rectangle fills the clip space.
+        """
         return np.array(
             [
                 [2.0 / self.width, 0.0, -2.0 * self.left / self.width - 1.0],
@@ -53,12 +55,12 @@ class ScreenRectangle:
 
 
 class TwoPassProjector:
-    """The frame of the first pass, and the sheet that the second one draws."""
+    """Two-pass renderer with the frame of the first pass and the sheet's buffers."""
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
-        """width_px, height_px: of the eye's image; samples as in `Canvas`."""
+        """Allocate the frame of the eye's image; samples: as in `Canvas`."""
         self._context = context
         samples = min(samples, context.max_samples)
         size = (width_px, height_px)
@@ -87,7 +89,7 @@ class TwoPassProjector:
         look: DrawStyle,
         window: ScreenRectangle,
     ) -> None:
-        """Draw one eye's image onto the sheet, into the canvas's frame; wait until it is done."""
+        """Draw one eye's image onto the sheet, into the canvas's frame, and wait for completion."""
         seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen, lens=None)
         canvas.draw_into(self._frame, seen, look)
         self._context.copy_framebuffer(self._resolved, self._frame)
@@ -96,7 +98,7 @@ class TwoPassProjector:
         self._uniforms.set(window=(window.left, window.bottom, window.width, window.height))
         self._image.use()
         canvas.begin()
-        # The projector is behind the sheet and sees its back.
+        # The projector is behind the sheet, so back faces must be drawn.
         self._context.disable(moderngl.CULL_FACE)
         for plane in range(CLIP_PLANES):
             self._context.enable_direct(CLIP_DISTANCE_0 + plane)
@@ -107,7 +109,7 @@ class TwoPassProjector:
         self._context.finish()
 
     def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
-        """Return the sheet's vertices in a buffer, with its triangles; new when those change."""
+        """Return the sheet's vertex array; its buffers are reused for the same triangles."""
         if self._array is not None and sheet is self._drawn:
             return self._array
         vertices, previous = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
@@ -136,7 +138,7 @@ class TwoPassProjector:
             self._vertices.release()
 
     def release(self) -> None:
-        """Free all buffers; the context stays."""
+        """Release all buffers, but not the context."""
         self._release_sheet()
         for frame in (self._frame, self._resolved):
             for attachment in (*frame.color_attachments, frame.depth_attachment):

@@ -1,4 +1,4 @@
-"""Draw one scene: the object, the projector, and the predicted sheet."""
+"""Draw the images of one scene for the projector."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 OVERSAMPLING = 1.5
-"""Pixels of the eye's image per pixel of the projector's."""
+"""Resolution of the eye's image over that of the projector."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""Margin of the rectangle around the object, and steps of its edges. Steps keep an outline's pixels
-steady as the object moves."""
+"""Margin of the rectangle around the object, and quantization of its edges, which avoids flicker of
+the outline when the object moves."""
 MAX_WINDOW_M = 0.3
-"""Maximum extent of the rectangle from the screen's middle: the sheet ends before."""
+"""Maximum extent of the rectangle from the screen's centre, beyond the sheet's edges."""
 MIN_REPORTED_FRACTION = 0.005
-"""A smaller occluded fraction is not reported."""
+"""Minimum occluded fraction that is reported."""
 NO_SHAPES_NOTE = (
     "no deflection shapes in the cache: a pushed sheet is drawn as four triangles "
     "(flexsheet precompute)"
@@ -72,8 +72,7 @@ def pose_matrix(pose: Pose) -> Floats:
 
 
 def projector_homography(scene: Scene) -> Floats:
-    """Return (3, 3): the imaginary screen, metres, to projector pixels before the lens distorts
-    them."""
+    """Return the homography (3, 3) from the imaginary screen, m, to undistorted pixels."""
     lens = scene.projector.lens
     return pixel_from_screen(
         fx_px=lens.fx_px,
@@ -85,7 +84,7 @@ def projector_homography(scene: Scene) -> Floats:
 
 
 class SceneRenderer:
-    """Draw frames of one scene."""
+    """Renderer of one scene."""
 
     def __init__(
         self,
@@ -94,11 +93,14 @@ class SceneRenderer:
         *,
         spacing_m: float,
         samples: int = SAMPLES,
-        dents: IndentationBasis | None = None,
+        basis: IndentationBasis | None = None,
         sheet_shape: SheetShapeMethod = "reduced_order",
     ) -> None:
-        """dents: of the scene's sheet, for the two-pass projection. Without them a pushed sheet is
-        drawn as four triangles. Raises ValueError for a lens that folds the projector's image."""
+        """Create the graphics objects of the scene.
+
+        basis: deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles.
+        Raises ValueError for a lens that folds the projector's image.
+        """
         projector, geometry = scene.projector, scene.object.geometry
         self.scene = scene
         self._world_from_projector = pose_matrix(projector.world_from_projector)
@@ -114,7 +116,7 @@ class SceneRenderer:
             spacing_m=spacing_m,
         )
         self._object_from_world = inverse(self._world_from_object)
-        # Starting from the nearest vertex makes the closest point of a mesh ten times as fast.
+        # A start at the nearest vertex makes nearest-point queries of a mesh ten times as fast.
         meshed = isinstance(geometry, Mesh)
         self._near = cKDTree(self._surface.rest_world_m) if meshed else None
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
@@ -122,7 +124,7 @@ class SceneRenderer:
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
         )
         self.canvas.set_material(self._material())
-        self.dents, self.sheet_shape, self.note = dents, sheet_shape, ""
+        self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
@@ -133,12 +135,12 @@ class SceneRenderer:
             round(abs(across_px) * window.height),
             samples=samples,
         )
-        self._follower: DeformationTransfer | None = None
-        self._shaped_by: SoftBody | None = None
+        self._deformation: DeformationTransfer | None = None
+        self._drawn_body: SoftBody | None = None
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        """Return the scene's appearance; an image is fitted to the object's front."""
+        """Return the object's material; a texture image is scaled to the object's front."""
         appearance, object_from_world = (
             self.scene.object.appearance,
             inverse(self._world_from_object),
@@ -157,37 +159,36 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Let the drawn surface follow displacements of this skin from now on."""
+        """Set the skin whose displacements deform the drawn surface."""
         vertices = skin.vertices_world_m.astype(np.float64)
-        self._follower = DeformationTransfer(self._surface, vertices, skin.triangles)
+        self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
-        """Deform the surface by a soft body's response to the present skin; None: at rest.
+        """Deform the surface by a soft-body response; None: at rest.
 
-        Raises ValueError when the displacement is not of that skin, or not finite: the surface
-        stays.
+        Raises ValueError, without a change of the surface, if the displacement does not fit the
+        current skin or is not finite.
         """
-        if body is self._shaped_by:
+        if body is self._drawn_body:
             return
         if body is None:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
             self._box_world = _box_around(self._surface.rest_world_m)
-        elif self._follower is None:
-            raise ValueError("a soft_body message came before its skin")
+        elif self._deformation is None:
+            raise ValueError("a soft_body message was received before its skin")
         else:
-            moved = self._follower.apply(body.displacement_world_m)
+            moved = self._deformation.apply(body.displacement_world_m)
             self.canvas.set_moved(moved)
             self._box_world = _box_around(moved[:, :3])
-        self._shaped_by = body
+        self._drawn_body = body
 
     def draw_style(
         self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None
     ) -> DrawStyle:
-        """Return how to draw what is shown, with marks at the finger and where the sheet is
-        tangent.
+        """Return the style of a display message, with marks at the finger and the contact point.
 
-        finger_tip: (3,) when the light leaves, or None when it is not known.
+        finger_tip: (3,) at the display time, or None if it is unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return DrawStyle(
@@ -200,8 +201,7 @@ class SceneRenderer:
         )
 
     def surface_point(self, world_point: Floats) -> Floats:
-        """Return the point (3,) of the undeformed object nearest to a world point, for the
-        marks."""
+        """Return the point (3,), world, of the undeformed object nearest to a world point (3,)."""
         start = None
         if self._near is not None:
             _, vertex = self._near.query(world_point)
@@ -210,7 +210,7 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return the slack sheet on the imaginary screen: assumed before any arm reports a pose."""
+        """Return the slack sheet on the imaginary screen, used before the first arm poses."""
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
@@ -218,13 +218,13 @@ class SceneRenderer:
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
         """Return whether the eyes see the sheet's front and the projector lights its back.
 
-        centre: (3,) between the eyes; None: the scene's.
+        centre: (3,), midpoint of the eyes; None: the scene's.
         """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """Return (2, 3): the scene's left and right eye; twice the point of view when mono."""
+        """Return the positions (2, 3) of the scene's eyes, equal in mono mode."""
         return both_eyes(self.scene.eyes, display.stereo)
 
     def draw(
@@ -237,11 +237,11 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image; return it (height, width, 3) if `read`.
+        """Draw the projector's image and return it, (height, width, 3), if `read`.
 
-        eyes: (1 or 2, 3), one image each; None: the scene's, one when mono. `drawn(number)` is
-        called when an eye's image is in `canvas.resolved`, which the next one overwrites. Raises
-        ValueError for a sheet with NaN.
+        eyes: (1 or 2, 3), one image each; None: the scene's. drawn: called with the number of each
+        eye when its image is in `canvas.resolved`, before the next eye overwrites it. Raises
+        ValueError for a sheet pose that is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite")
@@ -266,7 +266,7 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw as `draw`, in two passes onto a sheet of that shape."""
+        """Draw as `draw`, with the two-pass method and a mesh of the sheet."""
 
         def draw_eye(eye: Floats) -> None:
             window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
@@ -275,7 +275,7 @@ class SceneRenderer:
         return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
 
     def view(self, eye: Floats, screen: ProjectionScreen | None = None) -> EyeView:
-        """Return the view of an eye's image, corrected for a screen, or not."""
+        """Return the view of an eye's image; screen: to correct for, or None."""
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens)
 
@@ -303,36 +303,35 @@ class SceneRenderer:
         return pack(images[0], images[-1], display.stereo, swap_eyes=display.swap_eyes)
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """Return the sheet's mesh by `sheet_shape`; four triangles while reduced_order has no
-        shapes.
+        """Return the sheet's mesh by the method `sheet_shape`.
 
-        `note` reports where it is not exact.
+        Four triangles replace reduced_order without deflection shapes. `note` reports inaccuracies.
         """
-        if self.sheet_shape != "reduced_order" or self.dents is None:
-            wants_shapes = self.sheet_shape == "reduced_order"
-            self.note = NO_SHAPES_NOTE if wants_shapes else self._range_note(sheet)
+        if self.sheet_shape != "reduced_order" or self.basis is None:
+            lacks_shapes = self.sheet_shape == "reduced_order"
+            self.note = NO_SHAPES_NOTE if lacks_shapes else self._range_note(sheet)
             mesh = pyramid_mesh(sheet)
             return mesh if self._lens is None else refine_mesh(mesh)
         mesh = deflected_mesh(
-            sheet, self.dents, density_kg_per_m3=self.scene.sheet.density_kg_per_m3
+            sheet, self.basis, density_kg_per_m3=self.scene.sheet.density_kg_per_m3
         )
         self.note = mesh.note
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a note on a push beyond the range of four triangles; empty within it."""
+        """Return a note about a push beyond the range of four triangles, or an empty text."""
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
         if depth_m <= MAX_TRIANGLES_DEPTH_M:
             return ""
         return (
-            f"pushed {1e3 * depth_m:.0f} mm: drawn as four triangles, whose range is "
-            f"{1e3 * MAX_TRIANGLES_DEPTH_M:g} mm; sheet_shape: reduced_order has a larger one"
+            f"push of {1e3 * depth_m:.0f} mm exceeds the range of four triangles, "
+            f"{1e3 * MAX_TRIANGLES_DEPTH_M:g} mm; use sheet_shape: reduced_order"
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Measure the fraction of the sheet without light because of folds, and note it."""
+        """Compute the fraction of the sheet that folds shadow, and add it to `note`."""
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (
@@ -341,9 +340,10 @@ class SceneRenderer:
             self.note = "; ".join(filter(None, (self.note, folds)))
 
     def _window(self, eye: Floats) -> ScreenRectangle:
-        """Return the part of the imaginary screen that the object covers, as the eye sees it.
+        """Return the rectangle of the imaginary screen that the object covers for an eye.
 
-        Points level with the eye or behind it are not drawn; the rectangle ends at `MAX_WINDOW_M`.
+        Points that are not in front of the eye are excluded; the extent is limited by
+        `MAX_WINDOW_M`.
         """
         box = np.minimum(self._box_world, [np.inf, np.inf, eye[2] - NEAR_M])
         crossings = on_imaginary_screen(box, eye)
@@ -356,12 +356,12 @@ class SceneRenderer:
         return ScreenRectangle(float(low[0]), float(low[1]), *(float(side) for side in high - low))
 
     def release(self) -> None:
-        """Free what is on the graphics card; the context stays."""
+        """Release all graphics objects, but not the context."""
         self.canvas.release()
         self._projection.release()
 
 
 def _box_around(points: NDArray[np.floating]) -> Floats:
-    """Return the corners (8, 3) of the box around points."""
+    """Return the corners (8, 3) of the bounding box of points (n, 3)."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return np.array(list(product(*zip(low, high, strict=True))))

@@ -1,4 +1,4 @@
-"""Estimate the sheet's pose, and the screen that the paper's equations assume for it."""
+"""Estimate the sheet's pose and its projection screen for the paper's equations."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from flexsheet.nodes.renderer.correction import (
 Floats = NDArray[np.float64]
 
 MIN_EDGE_DISTANCE_M = 0.05
-"""Minimum distance of the flanges; closer poses are implausible for a sheet."""
+"""Minimum plausible distance between the sheet's edges."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPose:
-    """The predicted sheet when the light leaves.
+    """Predicted sheet at the display time of a frame.
 
-    world_from_sheet: (4, 4). corners: (4, 3). pushed_point: (3,) in the world, or None.
+    world_from_sheet: (4, 4). corners: (4, 3), world. pushed_point: (3,), world, or None.
     """
 
     world_from_sheet: Floats
@@ -40,13 +40,13 @@ class SheetPose:
 
     @property
     def edge_distance_m(self) -> float:
-        """Distance between the middles of both clamped edges."""
+        """Return the distance between the centres of the clamped edges, m."""
         left_bottom, right_bottom, right_top, left_top = self.corners
         return float(np.linalg.norm(right_bottom + right_top - left_bottom - left_top)) / 2.0
 
     @property
     def contact_point(self) -> Floats:
-        """The pushed point, or the sheet's centre when nothing pushes it."""
+        """Return the pushed point, or the sheet's centre without a push."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
@@ -59,11 +59,11 @@ def estimate_sheet(
     ahead_s: float,
     finger_tip: Floats | None,
 ) -> SheetPose | None:
-    """Return the sheet between two edges, moved by `twist_world` (6,) for `ahead_s`.
+    """Return the sheet between two edges after `ahead_s` of the motion `twist_world` (6,).
 
-    finger_tip: (3,) at that instant, or None. It pushes the sheet when it is below the plane and
-    over the sheet. Returns None when the edges are too close for a sheet, or a pose or the twist is
-    not finite.
+    finger_tip: (3,) at that time, or None; it pushes the sheet if it is below the plane and within
+    the sheet's outline. Returns None if the edges are too close for a sheet, or a value is not
+    finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
@@ -84,7 +84,7 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the screen that the equations assume; None for a method without equations."""
+    """Return the screen for the paper's equations; None for methods that do not use them."""
     if method in ("none", "two_pass"):
         return None
     if method == "four_triangles" and sheet.pushed_point is not None:

@@ -1,4 +1,4 @@
-"""Build the sheet's mesh to project onto: flat, four triangles, or deflected as the membrane."""
+"""Build the mesh of the sheet for projection: flat, four triangles, or deflected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.nodes.models.rigid import apply, inverse
-from flexsheet.nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
+from flexsheet.nodes.models.sheet.indentation import IndentationBasis
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
 from flexsheet.nodes.renderer.sheet import SheetPose
@@ -18,7 +19,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 MAX_TRIANGLES_DEPTH_M = 0.0035
-"""Maximum push for which four triangles are visually as good as the sheet's shape."""
+"""Maximum push for which four triangles are as accurate as required."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 """Triangles between neighbouring corners and the pushed point."""
@@ -26,9 +27,10 @@ PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 
 @dataclass(frozen=True, slots=True)
 class SheetMesh:
-    """vertices: (n, 3) in the world. triangles: (m, 3), counter-clockwise for the user.
+    """Mesh of the sheet.
 
-    note: why the shape is not exactly the sheet's; empty where it is.
+    vertices: (n, 3), world. triangles: (m, 3), counter-clockwise for the user. note: why the shape
+    is inaccurate, or empty.
     """
 
     vertices: Floats
@@ -37,20 +39,20 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the sheet without a push: its corners, and its middle, which halves a twist."""
+    """Return the mesh of an unpushed sheet: its corners and their mean."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
 def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the paper's four triangles between the corners and the fingertip."""
+    """Return the paper's four triangles between the corners and the pushed point."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
 def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Return the same surface in smaller triangles, so that a lens can distort straight lines."""
+    """Return the same surface with smaller triangles, for lens distortion at the vertices."""
     vertices, triangles = mesh.vertices, mesh.triangles
     for _ in range(halvings):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -66,26 +68,26 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""The same array for the same grid, so that no comparison of content is needed."""
+"""Cached `triangulate_grid`: equal grids share one array, which avoids comparing contents."""
 
 
 def deflected_mesh(
-    sheet: SheetPose, dents: IndentationBasis, *, density_kg_per_m3: float = 0.0
+    sheet: SheetPose, basis: IndentationBasis, *, density_kg_per_m3: float = 0.0
 ) -> SheetMesh:
     """Return the sheet narrowed by its stretch, sagging by its weight and pushed by its fingertip.
 
-    Edges that are rotated relative to one another rotate the flat sheet evenly between them. The
-    deflection is added to that as to a flat one. Sag and indentation are superposed: the finger
+    The unpushed sheet is the ruled surface between its edges. The deflection of a flat sheet is
+    added to it. Sag and indentation are superposed: the finger
     indents the sheet by its depth below the sagging sheet.
     """
-    rubber = dents.rubber
+    rubber = basis.rubber
     stretch = sheet.edge_distance_m / rubber.width_m
     x, y, depth_m = 0.0, 0.0, 0.0
     if sheet.pushed_point is not None:
         x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
         depth_m = max(0.0, -z)
     position = (x, y)
-    flat = dents.grid(stretch, position)
+    flat = basis.grid(stretch, position)
     sag_m = partial(
         compute_sag_m,
         rubber,
@@ -97,12 +99,12 @@ def deflected_mesh(
     indentation_m = depth_m + float(sag_m(across=finger_across))
     if sheet.pushed_point is None or indentation_m < MIN_PUSH_M:
         indentation_m = 0.0
-    offsets = dents.offsets(stretch, position, indentation_m)
+    offsets = basis.offsets(stretch, position, indentation_m)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
     up = (flat[..., 1] / rubber.height_m + 0.5).ravel()
     left_bottom, right_bottom, right_top, left_top = sheet.corners
-    # Ruled between the edges: each point is bilinear in its position across and up.
+    # The ruled surface between the edges is bilinear in `across` and `up`.
     edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
     twist = right_top - right_bottom - left_top + left_bottom
     offsets = offsets.reshape(-1, 3)
@@ -113,17 +115,17 @@ def deflected_mesh(
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.invalid_reason(stretch, position, indentation_m),
+        basis.invalid_reason(stretch, position, indentation_m),
     )
 
 
 def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """Estimate the fraction of the sheet's visible area that folds keep the light from.
+    """Estimate the fraction (0..1) of the sheet's visible area that folds shadow.
 
-    Without light is what the projector sees facing away or edge-on, within `GRAZING_SINE`. The same
-    area again is counted for its shadow. 0 for a sheet without folds, 1 at most.
+    A triangle gets no light if it faces away from the projector or is seen edge-on, within
+    `GRAZING_SINE`. Its area is counted twice, because it casts a shadow of about the same area.
     """
-    # By rows of one coordinate, which is several times faster than by points.
+    # Arrays of one coordinate each are several times faster than arrays of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)
     a, b, c = (coordinates.take(mesh.triangles[:, i], axis=1) for i in range(3))
     b -= a

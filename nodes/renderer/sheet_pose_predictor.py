@@ -1,4 +1,4 @@
-"""Predict the sheet and the fingertip at the instant when the light leaves."""
+"""Predict the sheet's pose and the fingertip at the display time of a frame."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Floats = NDArray[np.float64]
 
 
 class SheetPosePredictor:
-    """Predict the sheet from the measured flange poses; keep the last valid sheet without them.
+    """Predictor of the sheet's pose from the measured flange poses.
 
-    Poses older than `max_age_s` are not used. `note` gives the reason why the last plane is kept;
-    empty otherwise.
+    Without valid poses newer than `max_age_s`, the last valid sheet is returned and `note` contains
+    the reason; otherwise `note` is empty.
     """
 
     def __init__(self, *, max_age_s: float) -> None:
@@ -37,9 +37,9 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the sheet `horizon_s` from now; before the first measured pose, the one at rest.
+        """Return the sheet `horizon_s` from now; before the first valid pose, the sheet at rest.
 
-        finger_tip: (3,) at that instant, or None. eye: (3,) the point of view.
+        finger_tip: (3,) at that time, or None. eye: (3,), the point of view.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if left.message is not None and right.message is not None and age_s <= self._max_age_s:
@@ -61,7 +61,7 @@ class SheetPosePredictor:
         why = "sheet edge-on or facing away"
         if sheet is None:
             fresh = age_s <= self._max_age_s
-            why = "flange poses fit no sheet" if fresh else f"arm poses {age_s:.2f} s old"
+            why = "implausible flange poses" if fresh else f"arm poses {age_s:.2f} s old"
         self.note = f"{why}: keeping the last valid sheet plane"
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
@@ -71,7 +71,7 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """Return the fingertip (3,) `horizon_s` from now, or None when it is not known."""
+    """Return the fingertip (3,), world, `horizon_s` from now; None if invalid or too old."""
     age_s = finger.age_s()
     if finger.message is None or not finger.message.valid or age_s > max_age_s:
         return None

@@ -1,7 +1,7 @@
-"""Measure the sheet-shape methods: the time of a shape, and its distance from the true sheet.
+"""Measure time and error of the sheet-shape methods.
 
-The error is the height of each method's mesh over the flat sheet against the true sheet's, at the
-true sheet's own points. The caller provides the true sheet.
+The error is the height difference between a method's mesh and the reference sheet at the
+reference's points. The caller provides the reference.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scipy.interpolate import LinearNDInterpolator
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Case, Family, Trial, clip_range
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.models.sheet import edge_poses
-from flexsheet.nodes.models.sheet.indentation import triangulate_grid
 from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
@@ -31,8 +31,8 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""Returns points (n, 3) of the true sheet in the world, between two edges and under a fingertip
-(3,)."""
+"""Function that returns points (n, 3), world, of the reference sheet, for the scene, the left and
+right edge's pose (4, 4) and the fingertip (3,)."""
 
 WITHOUT_SHAPES = ("four_triangles",)
 METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
@@ -43,13 +43,13 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""Names, and x over the width, y over the height."""
+"""Names and relative positions: x over the width, y over the height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return every shape at the scene's stretches, over depths and points.
+    """Return the benchmark of all sheet shapes over stretch ratios, depths and positions.
 
-    Without `solved`, only shapes that need no solution beforehand.
+    solved: whether to include the shapes that need precomputed deflection shapes.
     """
     return Family(
         name="sheet-shape",
@@ -62,7 +62,7 @@ def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> F
 
 
 def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    basis = deflection_cache.load_or_compute(scene, None) if solved else None
     rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
@@ -101,10 +101,10 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
         in_range = {
             "four_triangles": depth <= MAX_TRIANGLES_DEPTH_M,
         }
-        if dents is not None:
-            shapes |= {"reduced_order": partial(deflected_mesh, dents=dents), "membrane": elements}
+        if basis is not None:
+            shapes |= {"reduced_order": partial(deflected_mesh, basis=basis), "membrane": elements}
             in_range |= {
-                "reduced_order": not dents.invalid_reason(stretch, position, depth),
+                "reduced_order": not basis.invalid_reason(stretch, position, depth),
                 "membrane": True,
             }
         truth = reference(scene, *edges, tip)
@@ -121,10 +121,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 
 
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
-    """Return the root mean square height difference at the reference's points (n, 3), mm.
-
-    Heights are along the world's z, because the sheets of the family are horizontal.
-    """
+    """Return the root mean square error of the height (world z) at points `truth` (n, 3), mm."""
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
-    off = (heights - truth[:, 2])[np.isfinite(heights)]
-    return 1e3 * float(np.sqrt(np.mean(off**2)))
+    errors = (heights - truth[:, 2])[np.isfinite(heights)]
+    return 1e3 * float(np.sqrt(np.mean(errors**2)))

@@ -1,8 +1,8 @@
-"""Extrapolate the solver's responses to the instant when the light leaves.
+"""Extrapolate the solver's responses to the display time of a frame.
 
-The solver responds to the finger at the exposure, or `prediction_horizon_s` later. The light leaves
-some tens of milliseconds after that. A straight line through an older and the newest response
-extrapolates the skin, vertex by vertex.
+A response is for the time of the exposure plus `prediction_horizon_s`; the frame is displayed some
+tens of milliseconds later. Each vertex is extrapolated linearly from an older and the newest
+response.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""Time between the two responses. A shorter one amplifies noise, a longer one lags."""
+"""Time between the two responses. A shorter time amplifies noise, a longer one causes lag."""
 
 MAX_EXTRAPOLATION_S = 0.06
-"""Maximum extrapolation of the skin: a finger may reverse by then."""
+"""Maximum extrapolation time."""
 
 
 class SkinExtrapolator:
-    """Store the solver's last responses, and extrapolate them."""
+    """Linear extrapolator of the solver's recent responses."""
 
     def __init__(self) -> None:
         self._history: deque[tuple[int, SoftBody]] = deque(maxlen=HISTORY)
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response; another skin, method or clock clears the earlier ones."""
+        """Add a response; a change of skin, method or clock clears the history."""
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -38,11 +38,10 @@ class SkinExtrapolator:
         self._history.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """Return the skin at `at_ns` of that clock, and the instant (ns) that it was extrapolated
-        to.
+        """Return the response extrapolated to `at_ns` of a clock, and its time (ns).
 
-        Returns the newest response unchanged where that has another clock, is later than `at_ns`,
-        or is alone. Returns None and 0 before the first.
+        The newest response is returned unchanged if it has another clock, is later than `at_ns`, or
+        has no suitable predecessor. Returns None and 0 before the first response.
         """
         if not self._history:
             return None, 0
@@ -54,7 +53,7 @@ class SkinExtrapolator:
             base_s = (newest_ns - before_ns) * 1e-9
             if MIN_BASE_S <= base_s <= MAX_BASE_S:
                 moved = newest.displacement_world_m - before.displacement_world_m
-                carried = newest.displacement_world_m + moved * moved.dtype.type(ahead_s / base_s)
-                body = newest.model_copy(update={"displacement_world_m": carried})
+                predicted = newest.displacement_world_m + moved * moved.dtype.type(ahead_s / base_s)
+                body = newest.model_copy(update={"displacement_world_m": predicted})
                 return body, newest_ns + round(ahead_s * 1e9)
         return newest, newest_ns

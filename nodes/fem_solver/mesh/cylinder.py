@@ -17,7 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.fem_solver.mesh.solid import EDGES, SUBTRIANGLES, SolidMesh, boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    EDGES,
+    SUBTRIANGLES,
+    SolidMesh,
+    add_midside_nodes,
+    boundary_faces,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -291,12 +297,10 @@ def _finish_mesh(
     touch_angle: float,
 ) -> SolidMesh:
     """Return the 10-node mesh with curved edges on the side, fixed and touchable nodes."""
-    pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    middles = inverse.reshape(-1, 6) + len(corners)
-    elements = np.concatenate([tetrahedra, middles], axis=1)
-    nodes = np.concatenate([corners, 0.5 * (corners[unique[:, 0]] + corners[unique[:, 1]])])
-    level = np.concatenate([2 * layer, layer[unique[:, 0]] + layer[unique[:, 1]]])
+    nodes, elements = add_midside_nodes(corners, tetrahedra)
+    level = np.empty(len(nodes), dtype=np.int64)
+    level[: len(corners)] = 2 * layer
+    level[elements[:, 4:]] = layer[tetrahedra[:, EDGES]].sum(axis=2)
 
     faces = boundary_faces(elements)
     on_cap = np.abs(np.abs(nodes[:, 0]) - 0.5 * length_m) < 1e-9 * length_m

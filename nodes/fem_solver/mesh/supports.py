@@ -26,8 +26,7 @@ def select_fixed(
     """Return which skin points (n, 3) with outward unit normals (n, 3) are fixed, (n,).
 
     All vectors are in the object's frame: towards_user (3,), unit vector; down (3,), of a base, of
-    any length. Raises UnfitMeshError for a support that fixes fewer than three points that are not
-    collinear.
+    any length. Raises UnfitMeshError if all fixed points are collinear.
     """
     chosen: Bools
     match support:

@@ -14,6 +14,7 @@ from flexsheet.messages.errors import FlexsheetError
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
@@ -63,6 +64,14 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
         raise MeshError(f"{folded} pairs of neighbouring triangles are folded; repair them")
     if volume_m3(vertices, triangles) <= 0.0:
         raise MeshError("the mesh is inside out; reverse its triangles")
+
+
+def triangulate_grid(rows: int, columns: int) -> Indices32:
+    """Return the triangles (t, 3) of a grid of points, counter-clockwise if rows are along +y."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, above = corner + 1, corner + columns
+    both = [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
+    return np.concatenate(both).astype(np.int32)
 
 
 def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
@@ -350,31 +359,3 @@ def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
         chosen = every[np.arange(len(points)), closest]
         best = np.where(outside[:, None], chosen, best)
     return best
-
-
-class Facets:
-    """Search for the nearest points on the facets of a mesh."""
-
-    def __init__(self, vertices: Floats, triangles: Indices) -> None:
-        """Build the search tree; raise MeshError for a mesh without triangles."""
-        if not len(triangles):
-            raise MeshError("the mesh has no triangles")
-        self.corners = vertices[triangles]
-        self._centre = self.corners.mean(axis=1)
-        self._reach = float(np.linalg.norm(self.corners - self._centre[:, None], axis=2).max())
-        from scipy.spatial import cKDTree
-
-        self._tree = cKDTree(self._centre)
-
-    def nearest(self, points: Floats) -> tuple[Indices, Floats]:
-        """Return the triangles (n,) nearest to points (n, 3) and barycentric coordinates (n, 3)."""
-        reach = self._tree.query(points)[0] + self._reach
-        lists = self._tree.query_ball_point(points, reach * (1.0 + 1e-12))
-        chosen, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))
-        for i, (point, near) in enumerate(zip(points, lists, strict=True)):
-            corners = self.corners[near]
-            inside = nearest_in_triangles(np.broadcast_to(point, (len(near), 3)), corners)
-            offset = (inside[:, None, :] @ corners)[:, 0] - point
-            best = int((offset * offset).sum(1).argmin())
-            chosen[i], weights[i] = near[best], inside[best]
-        return chosen, weights

@@ -1,7 +1,7 @@
-"""Model the rubber sheet: the poses of its edges, its shape and its forces.
+"""Models of the rubber sheet: poses of its edges, shape and forces.
 
-Sheet frame: origin at the centre, x from the left clamped edge to the right one, y along the edges,
-    z towards the user.
+The sheet frame has its origin at the centre, x from the left clamped edge to the right one, y along
+the edges and z towards the user.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""Compute the force of the pushed sheet: interchangeable models behind one signature.
+"""Compute the force of the pushed sheet by interchangeable models.
 
-A model takes a stretch ratio, depths of a fingertip below the flat sheet, the position on the
-stretched sheet (x, y from its centre, m) and the fingertip's radius.  It returns the force along
-the sheet's normal, its derivative over the depth, and the force on the clamps.
+Inputs of a model are the stretch ratio, depths of a fingertip below the flat sheet, the position on
+the stretched sheet (x, y from its centre, m) and the fingertip's radius. Outputs are the normal
+force, its derivative by the depth, and the force on the clamps.
 
 By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
-    `nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.  `invalid_reason` of
-    each returns why it does not hold.
+`nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ CENTRE: SheetPosition = (0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class SheetForce:
-    """Hold a model's result at each depth (n,): force N, stiffness N/m, and force on each clamp
-    N."""
+    """Result of a force model at depths (n,): force, N, stiffness, N/m, and force per clamp, N."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -39,7 +37,7 @@ class SheetForce:
 
 
 class SheetForceModel(Protocol):
-    """Define what every force model of the sheet offers."""
+    """Interface of the sheet's force models."""
 
     @property
     def name(self) -> str: ...
@@ -55,7 +53,7 @@ class SheetForceModel(Protocol):
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> SheetForce:
-        """Return the forces at depths (n,), m; a depth of zero or less gives no force.
+        """Return the forces at depths (n,), m; the force is zero for depths <= 0.
 
         Raises ValueError for values that are not finite.
         """
@@ -69,7 +67,7 @@ class SheetForceModel(Protocol):
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> str:
-        """Return why the model does not hold there; empty where it does."""
+        """Return why the model is invalid for these inputs, or an empty text if it is valid."""
         ...
 
 
@@ -85,42 +83,42 @@ def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
     )
 
 
-def _checked(
+def _check_push(
     stretch_ratio: float, depths_m: Floats, position_m: SheetPosition, finger_radius_m: float
 ) -> Floats:
-    """Return the depths, at least 0; ValueError unless all is finite and stretch and radius are
-    positive."""
+    """Return the depths, limited to >= 0; raise ValueError for invalid inputs."""
     depths = np.asarray(depths_m, dtype=np.float64)
     numbers = (stretch_ratio, *position_m, finger_radius_m)
     if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
         raise ValueError(
-            f"a push of {depths} m at {position_m}, stretch {stretch_ratio}, radius "
-            f"{finger_radius_m} is not finite"
+            f"push of {depths} m at {position_m}, stretch ratio {stretch_ratio}, finger radius "
+            f"{finger_radius_m} m: all values must be finite"
         )
     if stretch_ratio <= 0.0 or finger_radius_m <= 0.0:
-        raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above 0")
+        raise ValueError(
+            f"stretch ratio {stretch_ratio} and finger radius {finger_radius_m} m must be above 0"
+        )
     return np.maximum(depths, 0.0)
 
 
 def relative_position(
     rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
 ) -> tuple[float, float]:
-    """Return (|x|, |y|) of a position on the stretched sheet: 0 at the centre, 1 at clamp and free
-    edge."""
+    """Return relative coordinates (|x|, |y|): 0 at the centre, 1 at the clamp and the free edge."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 
 
 MAX_RELATIVE_X = 0.98
-"""Relative x beyond which the closed forms stay constant: at the clamp they are infinite."""
+"""Upper limit of relative x in the closed-form models, which are infinite at the clamp."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinearSheetModel:
-    """Compute a force proportional to tension and depth: F = 0.95 T0/W d, in x like a string's.
+    """Force proportional to tension and depth: F = 0.95 T0/W d / (1 - x^2).
 
-    The factor holds for a disc of 10 mm.  The contact of a fingertip grows with the depth, so that
-    the line crosses the true curve, which starts flatter and ends steeper.
+    The factor is valid for a disc of 10 mm. The contact area of a fingertip grows with the depth,
+    so the true curve is flatter at small depths and steeper at large ones.
     """
 
     rubber: Rubber
@@ -134,7 +132,7 @@ class LinearSheetModel:
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
+        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
         edge = flat_edge_force_n(self.rubber, stretch_ratio)
         x, _ = relative_position(self.rubber, stretch_ratio, position_m)
         slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, MAX_RELATIVE_X) ** 2)
@@ -150,27 +148,26 @@ class LinearSheetModel:
     ) -> str:
         scaled = scaled_depth(self.rubber, stretch_ratio, depth_m)
         if stretch_ratio < 1.01:
-            return "a slack sheet is not linear at all"
+            return "a slack sheet is nonlinear"
         if not LINEAR_FROM <= scaled <= LINEAR_TO:
-            return "the line meets the curve of a fingertip at middle depths only"
+            return "the linear model is accurate at medium depths only"
         x, y = relative_position(self.rubber, stretch_ratio, position_m)
         if max(x, y) > 0.34:
-            return "too near to an edge"
+            return "the position is too close to an edge"
         if stretch_ratio > MAX_STRETCH_RATIO:
             return f"stretch {stretch_ratio:.3f} is more than {MAX_STRETCH_RATIO:g}"
         return _invalid_sizes(self.rubber, finger_radius_m)
 
 
 LINEAR_FROM, LINEAR_TO = 0.15, 0.33
-"""Scaled depths between which the line is within 25 % of the membrane."""
-
-
+"""Range of scaled depths in which the linear model is within 25 % of the membrane."""
 MAX_STRETCH_RATIO = 1.13
+"""Maximum stretch ratio of the closed-form models."""
 
 
 def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
     if not 0.9 <= rubber.height_m / rubber.width_m <= 1.1:
-        return "the sheet is not about square"
+        return "the sheet is not approximately square"
     if not 0.02 <= finger_radius_m / rubber.width_m <= 0.043:
         return "the fingertip's radius is not 2 to 4.3 % of the sheet's width"
     return ""
@@ -181,15 +178,14 @@ CUBIC_FACTOR = 2.43
 
 
 def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
-    """Return depth over width and over the root of the strain: sheets of equal scaled depth are
-    similar."""
+    """Return depth / width / sqrt(strain); pushes of equal scaled depth are similar."""
     strain = strain_measure(stretch_ratio, rubber.mooney_share)
     return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
 
-# Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet.  Stretch 1
-# to 1.12, fingertips of 5 to 10 mm on 240 mm, depths of 2 to 50 mm.  Positions up to half way to a
-# clamp and three quarters of the way to a free edge; 3.6 % rms.  See docs/sheet.md.
+# Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1
+# to 1.12, fingertips of 5 to 10 mm on 240 mm, depths of 2 to 50 mm, relative positions up to 0.5 in
+# x and 0.75 in y; 3.6 % rms. See docs/sheet.md.
 _TAUT_FACTOR, _TAUT_POWER, _TAUT_STRETCH, _TAUT_RADIUS = 1.781, 1.414, 0.762, 0.067
 _KNEE, _KNEE_SHARPNESS, _KNEE_POWER = 1.149, 5.0, 0.567
 _CUBIC_STRETCH, _CUBIC_RADIUS = 5.582, 0.062
@@ -200,7 +196,7 @@ _PULL, _PULL_KNEE, _PULL_X, _PULL_Y, _PULL_STRETCH = 0.779, 0.484, 1.093, 0.333,
 _FITTED_RADIUS = 0.007 / 0.24
 
 
-def _slack_place(x: float, y: float) -> float:
+def _slack_position_factor(x: float, y: float) -> float:
     near = 1.0 - min(x, MAX_RELATIVE_X) ** 2
     sideways = 1.0 - _SLACK_Y * min(y, 1.0) ** _SLACK_Y_POWER
     return float(sideways * near**-_SLACK_X)
@@ -209,7 +205,7 @@ def _slack_place(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the force (n,), N, that a push adds on each clamp, and E t W."""
+    """Return the additional force on each clamp due to a push (n,), N, and E t W, N."""
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
     scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
@@ -224,18 +220,17 @@ def _push_tension(
 
 @dataclass(frozen=True, slots=True)
 class ScaledSheetModel:
-    """Compute one curve for all tensions: a power of the scaled depth for tension, plus a cubic
-    part.
+    """Force as a power of the scaled depth, due to the tension, plus a cubic part.
 
-    With e the strain measure, w = d/W and u = w/sqrt(e) (a membrane's equations keep their form
-    under this scaling while strains are small):
+    With the strain measure e, w = d/W and u = w/sqrt(e) (the scaling of a membrane at small
+    strains):
 
-        F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3),
+        F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3)
 
-    where each part has its own dependence on position, fingertip radius and height.
+    Each part depends on position, fingertip radius and height.
 
     cubic_ratio: cubic part over that of ideal rubber, from calibration.
-    stretch_scale: true over nominal stretch, which corrects the slack width, from calibration.
+    stretch_scale: true over nominal stretch ratio, from calibration; corrects the slack width.
     """
 
     rubber: Rubber
@@ -251,7 +246,7 @@ class ScaledSheetModel:
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
+        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
         rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
         x, y = relative_position(rubber, s, position_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
@@ -265,7 +260,7 @@ class ScaledSheetModel:
             * s**-_CUBIC_STRETCH
             * radius**_CUBIC_RADIUS
             * height**_SLACK_HEIGHT
-            * _slack_place(x, y)
+            * _slack_position_factor(x, y)
         )
         force = cubic * depth_ratio**3
         slope = 3.0 * cubic * depth_ratio**2
@@ -306,13 +301,13 @@ class ScaledSheetModel:
             return "the depth is not 0.8 to 21 % of the sheet's width"
         x, y = relative_position(rubber, stretch_ratio, position_m)
         if x > 0.5 or y > 0.76:
-            return "too near to an edge"
+            return "the position is too close to an edge"
         return _invalid_sizes(rubber, finger_radius_m)
 
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """Solve the membrane's finite elements at each call: accurate, but it takes seconds."""
+    """Finite-element solution of the membrane: the most accurate model, which takes seconds."""
 
     rubber: Rubber
     cells: int = CELLS
@@ -326,18 +321,18 @@ class MembraneSheetModel:
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> SheetForce:
-        depths = _checked(stretch_ratio, depths_m, position_m, finger_radius_m)
-        wanted = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
+        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
+        solved_depths = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
         path = push_path(
             self.rubber,
             stretch_ratio=stretch_ratio,
-            depths_m=wanted,
+            depths_m=solved_depths,
             position_m=position_m,
             finger_radius_m=finger_radius_m,
             cells=self.cells,
         )
-        at = np.searchsorted(wanted, depths)
-        shallower = path.forces_n[np.searchsorted(wanted, _SLOPE_FRACTION * depths)]
+        at = np.searchsorted(solved_depths, depths)
+        shallower = path.forces_n[np.searchsorted(solved_depths, _SLOPE_FRACTION * depths)]
         rise = path.forces_n[at] - shallower
         run = np.where(depths > 0.0, (1.0 - _SLOPE_FRACTION) * depths, 1.0)
         return SheetForce(path.forces_n[at], rise / run, path.edge_forces_n[at])
@@ -351,17 +346,17 @@ class MembraneSheetModel:
         finger_radius_m: float,
     ) -> str:
         if depth_m < 0.2 * finger_radius_m:
-            return "the contact is smaller than the mesh"
+            return "the contact is smaller than a mesh cell"
         x, y = relative_position(self.rubber, stretch_ratio, position_m)
-        return "" if x <= 0.8 and y <= 0.9 else "the fingertip reaches over an edge"
+        return "" if x <= 0.8 and y <= 0.9 else "the fingertip overlaps an edge"
 
 
 _SLOPE_FRACTION = 0.96
-"""The force at this fraction of the depth gives the slope there."""
+"""Fraction of the depth at which a second force is computed for the finite difference."""
 
 
 def depth_for_force(
-    law: SheetForceModel,
+    model: SheetForceModel,
     stretch_ratio: float,
     forces_n: Floats,
     *,
@@ -369,38 +364,40 @@ def depth_for_force(
     position_m: SheetPosition,
     finger_radius_m: float,
 ) -> Floats:
-    """Return the depths (n,) at which the model gives these forces, at most `max_depth_m`.
+    """Return the depths (n,) at which the model gives the forces (n,), at most `max_depth_m`.
 
-    One call of the model at depths that are denser near 0, and linear interpolation of log force
-    over log depth, which is nearly straight: within 1e-3 of the depth.
+    The model is evaluated once on a geometric grid, and log force is interpolated linearly over log
+    depth. The relative error is below 1e-3.
     """
     grid = max_depth_m * _INVERSE_GRID
-    pressed = law.evaluate(
+    grid_forces = model.evaluate(
         stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
     ).force_n
-    return interpolated_inverse(grid, pressed, np.asarray(forces_n, dtype=np.float64))
+    return interpolate_inverse(grid, grid_forces, np.asarray(forces_n, dtype=np.float64))
 
 
 _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 
 
-def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats:
-    """Return where a rising function reaches `wanted`, from its values at `grid` (both positive).
+def interpolate_inverse(grid: Floats, values: Floats, targets: Floats) -> Floats:
+    """Return the arguments at which an increasing function reaches `targets` (n,).
 
-    Before the grid it follows the first interval's power; beyond, it stays at the end.
+    values: of the function at `grid`, both positive. Interpolation is linear in the logarithms.
+    Below the grid the first interval's power law is extrapolated; above it, the result is the end.
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
     logs, log_grid = logs[keep], np.log(grid[keep])
-    result = np.zeros(wanted.shape)
-    some = wanted > 0.0
+    result = np.zeros(targets.shape)
+    some = targets > 0.0
     if len(logs) < 2 or not some.any():
         result[some] = grid[-1]
         return result
-    asked = np.log(wanted[some])
+    log_targets = np.log(targets[some])
     power = (log_grid[1] - log_grid[0]) / (logs[1] - logs[0])
-    before = log_grid[0] + power * (asked - logs[0])
-    result[some] = np.exp(np.where(asked < logs[0], before, np.interp(asked, logs, log_grid)))
+    below = log_grid[0] + power * (log_targets - logs[0])
+    inside = np.interp(log_targets, logs, log_grid)
+    result[some] = np.exp(np.where(log_targets < logs[0], below, inside))
     return result
 
 
@@ -412,8 +409,7 @@ def make_model(
     cubic_ratio: float,
     mooney_share: float,
 ) -> ScaledSheetModel:
-    """Make the scaled model of a sheet with these parameters, for stretch ratios over the nominal
-    width."""
+    """Make the scaled model from calibrated parameters, for stretch ratios of the nominal width."""
     rubber = replace(
         nominal,
         width_m=slack_width_m,

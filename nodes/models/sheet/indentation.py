@@ -1,12 +1,11 @@
-"""Compute the indented sheet's shape by a reduced-order model of the membrane's finite elements.
+"""Compute the shape of the pushed sheet by a reduced-order model of the membrane.
 
-The elements are solved in advance over stretch, position and depth of the push.  A proper
-orthogonal decomposition reduces the shapes to a dozen modes.  Polynomials through Chebyshev points
-interpolate their coefficients.  A shape then takes some 0.1 ms.
+Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
+orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
+points interpolate their coefficients. A shape then takes about 0.1 ms.
 
-The grid of the shapes moves with the finger and is finest there, so that the tip of the indentation
-is always at the same nodes.  Only a quarter of the positions is solved; the others follow by mirror
-symmetry.
+The grid moves with the finger and is finest there, so that the tip of the indentation is always at
+the same nodes. Only one quadrant of positions is solved; the others follow by symmetry.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 Floats = NDArray[np.float64]
 
 HALF_CELLS = 14
-"""Cells of the grid from the finger to each side of the sheet."""
+"""Number of grid cells from the finger to each side of the sheet."""
 
 GRADING = 3.2
-"""Cells grow away from the finger as sinh(GRADING a), a from 0 to 1: the first has 2 mm of 120."""
+"""Grading: distances from the finger are proportional to sinh(GRADING a), a in 0..1."""
 
 MAX_TRUNCATION_RMS_M = 2e-5
-"""Maximum root mean square of the shapes that the modes leave out."""
+"""Maximum truncation error of the modes (root mean square)."""
 
 MAX_FRACTION_X, MAX_FRACTION_Y = 0.36, 0.40
-"""Largest solved positions, as fractions of width and height from the centre."""
+"""Maximum solved positions from the centre, as fractions of width and height."""
 
 
 @dataclass(frozen=True, slots=True)
 class IndentationRange:
-    """Hold the range of pushes that are solved: stretch ratios, and depths up to the maximum (m).
+    """Range of the solved pushes: stretch ratios and maximum depth (m).
 
-    stretch_nodes, place_nodes, depth_nodes: number of solved values, positions along either axis.
-    element_cells: number of finite elements along either side of the sheet.
+    stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes, of positions per axis.
+    element_cells: number of finite elements along each side of the sheet.
     """
 
     min_stretch: float
@@ -55,11 +54,10 @@ class IndentationRange:
 
 @dataclass(frozen=True, slots=True)
 class IndentationBasis:
-    """Hold the modes of the indented sheet and their coefficients.
+    """Reduced-order model of the pushed sheet.
 
-    stretches, xs_m, ys_m, roots: interpolation nodes; roots are of depth over maximum depth.
-    modes: (modes, rows, columns, 3), m.
-    coefficients: (stretches, xs, ys, roots, modes).
+    stretches, xs_m, ys_m, roots: interpolation nodes; roots are sqrt(depth / maximum depth).
+    modes: (modes, rows, columns, 3), m. coefficients: (stretches, xs, ys, roots, modes).
     """
 
     rubber: Rubber
@@ -77,10 +75,8 @@ class IndentationBasis:
     ) -> Floats:
         """Return the displacement (rows, columns, 3), m, from the flat, uniformly stretched sheet.
 
-        position_m: (x, y) of the fingertip over the sheet.
-
-        Rows run along y and columns along x of the sheet's frame.  Outside the solved range, the
-        nearest border of the range is taken (see `invalid_reason`).
+        position_m: (x, y) of the fingertip. Rows are along y and columns along x of the sheet
+        frame. Inputs are clamped to the solved range (see `invalid_reason`).
         """
         mirrored = (position_m[0] < 0.0, position_m[1] < 0.0)
         weights = (
@@ -100,7 +96,7 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the same points (rows, columns, 2) in the flat, uniformly stretched sheet."""
+        """Return the grid (rows, columns, 2), m, of `offsets` on the flat, stretched sheet."""
         sheet, most_x, most_y = self.rubber, self.xs_m[-1], self.ys_m[-1]
         focus_x = float(np.clip(position_m[0], -most_x, most_x)) / stretch_ratio
         x = _grade_coordinates(focus_x, 0.5 * sheet.width_m)
@@ -110,7 +106,7 @@ class IndentationBasis:
     def invalid_reason(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> str:
-        """Return why a push is outside the solved range; empty where it is inside."""
+        """Return why a push is outside the solved range, or an empty text."""
         if not self.stretches[0] <= stretch_ratio <= self.stretches[-1]:
             return (
                 f"stretch {stretch_ratio:.3f} is not from {self.stretches[0]:.3f} to "
@@ -120,22 +116,13 @@ class IndentationBasis:
             return f"push of {1e3 * depth_m:.0f} mm is deeper than {1e3 * self.deepest_m:.0f} mm"
         if abs(position_m[0]) > self.xs_m[-1] or abs(position_m[1]) > self.ys_m[-1]:
             x, y = 1e3 * position_m[0], 1e3 * position_m[1]
-            return f"push at ({x:.0f}, {y:.0f}) mm is too near to the sheet's edge"
+            return f"push at ({x:.0f}, {y:.0f}) mm is too close to the sheet's edge"
         return ""
-
-
-def triangulate_grid(rows: int, columns: int) -> NDArray[np.int32]:
-    """Return triangles (n, 3) of a grid's points, counter-clockwise for the user."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, above = corner + 1, corner + columns
-    both = [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
-    return np.concatenate(both).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True)
 class IndentationCase:
-    """Hold one run of the elements: stretch, position, ascending depths (n,), cells along a
-    side."""
+    """Input of a finite-element solution: one position and ascending depths (n,), m."""
 
     rubber: Rubber
     stretch_ratio: float
@@ -158,11 +145,9 @@ def solve_indentation_basis(
         solve_indentation, pushes
     ),
 ) -> IndentationBasis:
-    """Solve the elements at every node and reduce the shapes; takes 45 s of one core.
+    """Solve the membrane at all interpolation nodes and reduce the shapes (45 s on one core).
 
-    solve_all: solves the cases, in this or in other processes.
-
-    Raises NoEquilibriumError.
+    solve_all: solves the cases, in this or in other processes. Raises NoEquilibriumError.
     """
     stretches = _chebyshev_points(within.min_stretch, within.max_stretch, within.stretch_nodes)
     xs = _chebyshev_points(0.0, MAX_FRACTION_X * rubber.width_m, within.place_nodes)
@@ -197,7 +182,7 @@ def solve_indentation_basis(
 
 
 def solve_indentation(push: IndentationCase) -> Floats:
-    """Return displacements (depths, rows, columns, 3) of the elements on the grid of the push."""
+    """Return finite-element displacements (depths, rows, columns, 3), m, on the push's grid."""
     rubber, stretch = push.rubber, push.stretch_ratio
     pushed = push_path(
         rubber,
@@ -217,8 +202,10 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Return the fewest modes (m, size) that keep the samples (n, size), and coefficients (n,
-    m)."""
+    """Return modes (m, size) and coefficients (n, m) of samples (n, size).
+
+    The number of modes is the minimum for `MAX_TRUNCATION_RMS_M`.
+    """
     left, values, modes = np.linalg.svd(samples, full_matrices=False)
     lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / samples.size)
     count = (
@@ -230,7 +217,7 @@ def _decompose(samples: Floats) -> tuple[Floats, Floats]:
 
 
 def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
-    """Return (2 HALF_CELLS + 1,) coordinates from -half_m to half_m, finest about the focus."""
+    """Return coordinates (2 HALF_CELLS + 1,) from -half_m to half_m, densest near the focus."""
     fractions = np.sinh(GRADING * np.linspace(0.0, 1.0, HALF_CELLS + 1)) / np.sinh(GRADING)
     before = focus_m - (half_m + focus_m) * fractions[::-1]
     after = focus_m + (half_m - focus_m) * fractions
@@ -238,7 +225,7 @@ def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
 
 
 def _linear_weights(nodes: Floats, at: Floats) -> Floats:
-    """Return the weights (at, nodes) of linear interpolation."""
+    """Return the weights (k, n) of linear interpolation at points (k,) between nodes (n,)."""
     upper = np.clip(np.searchsorted(nodes, at), 1, len(nodes) - 1)
     fraction = np.clip((at - nodes[upper - 1]) / (nodes[upper] - nodes[upper - 1]), 0.0, 1.0)
     result = np.zeros((len(at), len(nodes)))
@@ -248,18 +235,17 @@ def _linear_weights(nodes: Floats, at: Floats) -> Floats:
 
 
 def _chebyshev_points(low: float, high: float, count: int) -> Floats:
-    """Return Chebyshev's extreme points (count,), ends included, ascending."""
+    """Return ascending Chebyshev points (count,) of the second kind, including both ends."""
     fractions = 0.5 * (1.0 - np.cos(np.pi * np.arange(count) / (count - 1)))
     return np.asarray(low + (high - low) * fractions)
 
 
 def _barycentric_weights(nodes: Floats, at: float) -> Floats:
-    """Return the weights (n,) of the interpolating polynomial at a point clamped to the nodes'
-    range.
+    """Return the weights (n,) of polynomial interpolation at a point clamped to the nodes' range.
 
     Barycentric form: Berrut and Trefethen, SIAM Review 46, 2004, equation (5.4).
     """
-    clamped = float(np.clip(at, *_bounds(nodes)))
+    clamped = float(np.clip(at, nodes[0], nodes[-1]))
     away = clamped - nodes
     at_node = np.flatnonzero(np.abs(away) < 1e-14 * max(float(np.ptp(nodes)), 1e-300))
     if len(at_node):
@@ -268,7 +254,3 @@ def _barycentric_weights(nodes: Floats, at: float) -> Floats:
     signs[[0, -1]] *= 0.5
     fractions = signs / away
     return np.asarray(fractions / fractions.sum())
-
-
-def _bounds(nodes: Floats) -> tuple[float, float]:
-    return float(nodes[0]), float(nodes[-1])

@@ -1,18 +1,18 @@
-"""Solve the sheet as a finite-element membrane: the most accurate force model, and the slowest.
+"""Solve the pushed sheet as a finite-element membrane.
 
 The elements are bilinear cells with four integration points, of incompressible Mooney-Rivlin rubber
 in plane stress,
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
 
-(neo-Hookean for C2 = 0).  A membrane carries no compression: it wrinkles.  Where the smaller
-principal stretch is below that of simple tension, l2 < l1^-1/2, the energy is that of simple
-tension, and zero where both are slack (tension field: Pipkin, IMA J. Appl. Math. 36, 1986).  Stress
-and tangent are written in the principal frame of C = F'F, which holds for every isotropic energy.
+(neo-Hookean for C2 = 0). A membrane wrinkles under compression. Where the smaller principal stretch
+is below that of uniaxial tension, l2 < l1^-1/2, the energy is that of uniaxial tension; it is zero
+where both are slack (tension field theory: Pipkin, IMA J. Appl. Math. 36, 1986). Stress and tangent
+are computed in the principal frame of C = F'F.
 
-The fingertip is a rigid sphere pushed in along the flat sheet's normal.  Nodes that it has touched
-stick to it, as rubber sticks to skin.  Newton's method finds the equilibria along the push from one
-another, with damping (Levenberg, Marquardt) where the slack sheet has no stiffness.
+The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Nodes that it touches
+stick to it. Newton's method computes each equilibrium from the previous one, with
+Levenberg-Marquardt damping where the slack sheet has no stiffness.
 """
 
 from __future__ import annotations
@@ -36,19 +36,18 @@ CELLS = 32
 MIN_CELL_RADII = 0.3
 """Cell size under the finger, in finger radii."""
 STEP_RADII = 0.4
-"""Maximum advance of the finger between equilibria, in its radii."""
+"""Maximum load step of the finger, in its radii."""
 PENALTY_PER_MODULUS = 2e5
 """Contact penalty stiffness: pressure per depth of penetration, in E t / width^2."""
 MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
-"""Distance of the two integration points from a cell's middle, over its side."""
+"""Distance of the integration points from a cell's centre, over its side."""
 TOLERANCE = 1e-7
 """Residual at equilibrium, in E t width."""
 
 
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
-    """Raised when no equilibrium of the membrane is found; the message has position and
-    residual."""
+    """Raised when the membrane's equilibrium does not converge."""
 
     code = "no-equilibrium"
     remedy = "Reduce the push or the tilt: it is beyond the sheet's range."
@@ -56,13 +55,11 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class PushPath:
-    """Hold the equilibria of one push, a row per depth.
+    """Equilibria of one push at depths (n,).
 
-    depths_m: (n,).
-    forces_n: (n,) of the sheet on the finger, along its normal.
-    edge_forces_n: (n,) on each clamp, along the line between them (mean of both).
-    positions: (n, rows, columns, 3) in the frame of the flat sheet, origin at its centre.
-    rest_m: (rows, columns, 2) of the same nodes in the slack sheet, from its centre.
+    forces_n (n,): normal force of the sheet on the finger. edge_forces_n (n,): mean force on the
+    clamps along the line between them. positions (n, rows, columns, 3): nodes in the sheet frame.
+    rest_m (rows, columns, 2): the same nodes in the slack sheet, relative to its centre.
     """
 
     depths_m: Floats
@@ -81,13 +78,11 @@ def push_path(
     finger_radius_m: float,
     cells: int = CELLS,
 ) -> PushPath:
-    """Solve the equilibria as a fingertip pushes to each of the ascending depths (n,), m.
+    """Solve the equilibria of a push to ascending depths (n,), m.
 
-    stretch_ratio: distance of the edges over the slack width.
-    position_m: (x, y) of the push on the stretched sheet, from its centre.
-
-    Raises ValueError for a position off the sheet or depths that do not ascend from 0, and
-    NoEquilibriumError.
+    stretch_ratio: distance of the edges over the slack width. position_m: (x, y) of the push on the
+    stretched sheet, from its centre. Raises NoEquilibriumError, and ValueError for a position off
+    the sheet or depths that are not ascending from 0.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if (
@@ -95,9 +90,11 @@ def push_path(
         or not np.isfinite(depths).all()
         or (np.diff(depths, prepend=0.0) < 0).any()
     ):
-        raise ValueError(f"depths {depths} must ascend from 0")
+        raise ValueError(f"depths {depths} m must be at least 0 and ascending")
     if not stretch_ratio > 0.0 or not finger_radius_m > 0.0:
-        raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above zero")
+        raise ValueError(
+            f"stretch ratio {stretch_ratio} and finger radius {finger_radius_m} m must be above 0"
+        )
     focus = np.array(
         [
             position_m[0] / stretch_ratio + 0.5 * rubber.width_m,
@@ -105,29 +102,29 @@ def push_path(
         ]
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
-        raise ValueError(f"position {position_m} is not on the sheet")
+        raise ValueError(f"position {position_m} m is not on the sheet")
     grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
-    state = _flat(grid, stretch_ratio)
+    state = _make_flat_state(grid, stretch_ratio)
     state = _solve_equilibrium(grid, state, None)
     foot: Floats = np.array([*position_m, 0.0], dtype=np.float64)
     sticking = np.zeros(len(state), dtype=bool)
     depth = 0.0
     rows: list[tuple[float, float, Floats]] = []
-    for wanted in depths:
-        steps = max(1, int(np.ceil((wanted - depth) / (STEP_RADII * finger_radius_m))))
-        advance = float(wanted - depth) / steps
-        for _ in range(steps if wanted > depth else 0):
-            state = _carried(grid, state, foot, sticking, (depth, advance))
+    for target in depths:
+        steps = max(1, int(np.ceil((target - depth) / (STEP_RADII * finger_radius_m))))
+        advance = float(target - depth) / steps
+        for _ in range(steps if target > depth else 0):
+            state = _predict_state(grid, state, foot, sticking, (depth, advance))
             depth += advance
             centre = foot.copy()
             centre[2] = finger_radius_m - depth
-            ball = _Ball(centre, finger_radius_m, grid.penalty, sticking)
-            state = _solve_equilibrium(grid, state, ball)
-            sticking = sticking | ball.touched(state)
+            finger = _FingerContact(centre, finger_radius_m, grid.penalty, sticking)
+            state = _solve_equilibrium(grid, state, finger)
+            sticking = sticking | finger.touched(state)
         inner = grid.gradient(state).reshape(-1, 3)
-        finger = -inner[sticking, 2].sum()
+        force = -inner[sticking, 2].sum()
         left, right = inner[grid.left, 0].sum(), inner[grid.right, 0].sum()
-        rows.append((float(finger), float(0.5 * (right - left)), state))
+        rows.append((float(force), float(0.5 * (right - left)), state))
     return PushPath(
         depths_m=depths,
         forces_n=np.array([row[0] for row in rows]),
@@ -137,10 +134,11 @@ def push_path(
     )
 
 
-def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
-    """Return coordinates (cells + 1,) from 0 to length_m: a node at the focus, and growing spacing.
+def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
+    """Return coordinates (cells + 1,) from 0 to length_m, densest at a node at the focus.
 
-    On either side x = sinh(k u) / sinh(k), u uniform, with the k that gives the finest cell.
+    On each side x = sinh(k u) / sinh(k) with uniform u, and k such that the finest cell has
+    `finest_m`.
     """
     left_cells = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
 
@@ -161,11 +159,11 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
 
 
 class _Grid:
-    """Hold the cells of the rest sheet, their strain, and the pattern of the stiffness matrix."""
+    """Finite-element grid of the sheet with the sparsity pattern of its stiffness matrix."""
 
     def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
-        x = graded(rubber.width_m, float(focus[0]), finest_m, cells)
-        y = graded(rubber.height_m, float(focus[1]), finest_m, cells)
+        x = grade_coordinates(rubber.width_m, float(focus[0]), finest_m, cells)
+        y = grade_coordinates(rubber.height_m, float(focus[1]), finest_m, cells)
         rows, columns = len(y), len(x)
         self.shape = (rows, columns)
         self.rest = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -181,9 +179,8 @@ class _Grid:
         u, v = (each.ravel() for each in np.meshgrid(*[[0.5 - GAUSS, 0.5 + GAUSS]] * 2))
         by_u = np.stack([v - 1.0, 1.0 - v, v, -v], axis=1)
         by_v = np.stack([u - 1.0, -u, u, 1.0 - u], axis=1)
-        # (cells, 4 points, 4 nodes, 2): gradient of the shape functions; F = sum of positions x
-        # gradient.
-        self.hats = np.stack(
+        # (4 cells, 4 nodes, 2) at four points per cell; F = sum over nodes of position x gradient.
+        self.shape_gradients = np.stack(
             [by_u / width[:, None, None], by_v / height[:, None, None]], axis=-1
         ).reshape(-1, 4, 2)
         area = width * height
@@ -205,31 +202,32 @@ class _Grid:
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return F (points, 3, 2) and C = F'F (points, 2, 2); four points per cell."""
+        """Return F (points, 3, 2) and C = F'F (points, 2, 2) at four points per cell."""
         at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
-        deformed = at_corners @ self.hats
+        deformed = at_corners @ self.shape_gradients
         return deformed, deformed.transpose(0, 2, 1) @ deformed
 
     def energy(self, positions: Floats) -> float:
         _, c = self.strain(positions)
         large, small, _ = principal(c)
-        return float(self.volume @ relaxed(large, small, self.c1, self.c2)[0])
+        return float(self.volume @ relaxed_energy(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Return the nodal forces (3 nodes,) in N that hold the sheet there."""
+        """Return the gradient (3 nodes,) of the elastic energy: the nodal forces, N."""
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
-        local = self.volume[:, None, None] * self.hats @ stress @ deformed.transpose(0, 2, 1)
+        volume = self.volume[:, None, None]
+        local = volume * self.shape_gradients @ stress @ deformed.transpose(0, 2, 1)
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Sum the forces of the points (points, 4, 3) at the nodes (3 nodes,)."""
+        """Sum the forces (points, 4, 3) of the integration points to nodal forces (3 nodes,)."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses of the points (points, ...) into the entries of the pattern."""
+        """Sum the stiffnesses (points, ...) of the integration points to matrix entries."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -237,14 +235,16 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, csc_array]:
-        """Return the gradient (3 nodes,) and the stiffness of the free coordinates; added (nodes,
-        3, 3)."""
+        """Return the energy gradient (3 nodes,) and the stiffness matrix of the free coordinates.
+
+        added (nodes, 3, 3): stiffness of the contact. free (3 nodes,). damping: added diagonal.
+        """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
-        volume, hats = self.volume[:, None, None], self.hats
+        volume, hats = self.volume[:, None, None], self.shape_gradients
         local = volume * hats @ stress @ deformed.transpose(0, 2, 1)
         count = len(local)
-        # Variation of E = (C - I)/2 as [E11, E22, 2 E12] with the nodes' coordinates.
+        # Derivative of E = (C - I)/2, as [E11, E22, 2 E12], by the nodes' coordinates.
         by_node = np.empty((count, 3, 4, 3))
         by_node[:, 0] = hats[:, :, :1] * deformed[:, None, :, 0]
         by_node[:, 1] = hats[:, :, 1:] * deformed[:, None, :, 1]
@@ -271,18 +271,20 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the eigenvalues (n,) of C (n, 2, 2), the larger first, and its direction (n, 2)."""
+    """Return the larger and smaller eigenvalue (n,) of C (n, 2, 2), and the first's direction."""
     middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
     spread = np.hypot(half, c[:, 0, 1])
     angle = 0.5 * np.arctan2(c[:, 0, 1], half)
     return middle + spread, middle - spread, np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats, Floats, Floats]:
-    """Return the energy of squared principal stretches p >= q (n,) per rest volume, and
-    derivatives.
+def relaxed_energy(
+    large: Floats, small: Floats, c1: float, c2: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return the tension-field energy per rest volume and its derivatives.
 
-    W is (n,), [W_p, W_q] is (2, n) and [W_pp, W_qq, W_pq] is (3, n).
+    large, small (n,): squared principal stretches p >= q. Returns W (n,), [W_p, W_q] (2, n) and
+    [W_pp, W_qq, W_pq] (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5
@@ -303,7 +305,7 @@ def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats,
             c1 / pq**2 + c2,
         ]
     )
-    # Here the width is free, so that only the stiffness along the tension remains.
+    # Under uniaxial tension only the stiffness along the tension remains.
     loose = ~taut
     first[1, loose] = 0.0
     along = second[0, loose] - second[2, loose] ** 2 / second[1, loose]
@@ -313,10 +315,12 @@ def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats,
 
 
 def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
-    """Return the second Piola-Kirchhoff stress (n, 2, 2) and its tangent (n, 3, 3) for [E11, E22, 2
-    E12]."""
+    """Return the second Piola-Kirchhoff stress (n, 2, 2) and its tangent (n, 3, 3).
+
+    The tangent's rows and columns are [E11, E22, 2 E12]. It is empty without `tangent`.
+    """
     large, small, direction = principal(c)
-    _, first, second = relaxed(large, small, c1, c2)
+    _, first, second = relaxed_energy(large, small, c1, c2)
     cos, sin = direction.T
     along = np.stack([cos * cos, sin * sin, cos * sin])
     across = np.stack([sin * sin, cos * cos, -cos * sin])
@@ -339,46 +343,46 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
     return stress, result
 
 
-class _Ball:
-    """Press nodes inside the fingertip outwards, and move the nodes that stick to it."""
+class _FingerContact:
+    """Penalty contact of nodes inside the fingertip; sticking nodes have no penalty."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
-        self._bed = np.where(sticking, 0.0, penalty)
+        self._penalty = np.where(sticking, 0.0, penalty)
 
-    def _reach(self, positions: Floats) -> tuple[Floats, Floats]:
+    def _penetration(self, positions: Floats) -> tuple[Floats, Floats]:
         offset = positions - self.centre
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-12)
         return np.maximum(self.radius - distance, 0.0), offset / distance[:, None]
 
     def touched(self, positions: Floats) -> Bools:
-        touched: Bools = self._reach(positions)[0] > 0.0
+        touched: Bools = self._penetration(positions)[0] > 0.0
         return touched
 
     def energy(self, positions: Floats) -> float:
-        return 0.5 * float(self._bed @ self._reach(positions)[0] ** 2)
+        return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return the gradient (nodes, 3) and the definite part of its derivative (nodes, 3, 3)."""
-        inside, outward = self._reach(positions)
-        stiff = np.where(inside > 0.0, self._bed, 0.0)
+        inside, outward = self._penetration(positions)
+        stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
             "n,ni,nj->nij", stiff, outward, outward
         )
 
 
-def _flat(grid: _Grid, stretch_ratio: float) -> Floats:
+def _make_flat_state(grid: _Grid, stretch_ratio: float) -> Floats:
     positions = np.zeros((len(grid.rest), 3))
     positions[:, :2] = (grid.rest - grid.centre) * [stretch_ratio, 1.0]
     return positions
 
 
-def _carried(
+def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Guess the next equilibrium: the indentation grows in proportion; the first one is a cone.
+    """Predict the next equilibrium: the indentation scaled with the depth, at first a cone.
 
-    push: depth there, and the further depth of the finger.
+    push: current depth and the depth of the step, m.
     """
     depth, advance = push
     grown = state.copy()
@@ -392,22 +396,22 @@ def _carried(
     return grown
 
 
-def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
-    """Solve the equilibrium near `start` with clamped and sticking nodes fixed."""
-    fixed = grid.clamped if ball is None else grid.clamped | ball.sticking
+def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
+    """Solve for the equilibrium near `start` with clamped and sticking nodes fixed."""
+    fixed = grid.clamped if finger is None else grid.clamped | finger.sticking
     free = np.repeat(~fixed, 3)
     positions, damping = start, 1e-7
     stiffness_scale = grid.force_scale / grid.centre[0]
     added = np.zeros((len(start), 3, 3))
 
     def energy(at: Floats) -> float:
-        return grid.energy(at) + (0.0 if ball is None else ball.energy(at))
+        return grid.energy(at) + (0.0 if finger is None else finger.energy(at))
 
     current, residual = energy(positions), np.inf
     for _ in range(MAX_ITERATIONS):
         push = np.zeros_like(start)
-        if ball is not None:
-            push, added = ball.gradient(positions)
+        if finger is not None:
+            push, added = finger.gradient(positions)
         gradient, matrix = grid.system(positions, added, free, damping * stiffness_scale)
         downhill = -(gradient + push.ravel())[free]
         residual = float(np.linalg.norm(downhill))
@@ -437,5 +441,6 @@ def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats
     if residual < 100.0 * TOLERANCE * grid.force_scale:
         return positions
     raise NoEquilibriumError(
-        f"membrane: residual {residual:.2e} N, wanted {TOLERANCE * grid.force_scale:.2e}"
+        f"membrane: no convergence, residual {residual:.2e} N, tolerance "
+        f"{TOLERANCE * grid.force_scale:.2e} N"
     )

@@ -1,4 +1,4 @@
-"""Describe the rubber of a sheet, the input of every force model."""
+"""Define the sheet's dimensions and material, the input of every force model."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """Hold a sheet clamped along two edges `width_m` apart, each `height_m` long, when slack.
+    """Dimensions and material of a slack sheet, clamped along two edges.
 
-    mooney_share: C2 / (C1 + C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), from 0
-        (neo-Hookean) to below 1.
+    width_m: distance of the clamped edges. height_m: length of an edge. mooney_share: C2 / (C1 +
+    C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), 0 (neo-Hookean) to below 1.
     """
 
     width_m: float
@@ -25,6 +25,9 @@ class Rubber:
         """Raise ValueError for a size, modulus or Mooney fraction outside its range."""
         sizes = (self.width_m, self.height_m, self.thickness_m, self.young_modulus_pa)
         if not (np.isfinite(sizes).all() and min(sizes) > 0.0):
-            raise ValueError(f"sheet's sizes and modulus {sizes} must be finite and above zero")
+            raise ValueError(
+                f"sheet: width_m, height_m, thickness_m and young_modulus_pa {sizes} must be "
+                "finite and above 0"
+            )
         if not 0.0 <= self.mooney_share < 1.0:
-            raise ValueError(f"mooney_share: {self.mooney_share} is not from 0 to below 1")
+            raise ValueError(f"mooney_share: {self.mooney_share} must be at least 0 and below 1")

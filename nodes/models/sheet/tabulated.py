@@ -1,7 +1,6 @@
-"""Correct the scaled force model by a table of measured or computed ratios.
+"""Correct the scaled force model by a table of measured or computed force ratios.
 
-The ratio varies little, so that few entries suffice.  The scaled model interpolates between them,
-and covers other fingertips.
+The ratio varies slowly, so a coarse table suffices. The scaled model covers other fingertips.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 Measure = Callable[[float, Floats, SheetPosition], Floats]
-"""Forces (n,) at a stretch ratio, depths (n,) and a position."""
+"""Function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
 
 
 @dataclass(frozen=True, slots=True)
 class TabulatedSheetModel:
-    """Multiply the scaled model by a tabulated ratio.
+    """Scaled model multiplied by an interpolated table of ratios.
 
-    stretches, depths_m, xs_m, ys_m: ascending axes (a,), (b,), (c,), (d,); positions lie in the
-        quadrant of positive x and y, since the sheet is symmetric.
-    ratios: (a, b, c, d); linear between stretches and positions, a monotone cubic between depths,
-        and constant beyond the ends.
+    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes; positions are in one
+        quadrant, because the sheet is symmetric.
+    ratios (a, b, c, d): interpolated linearly over stretches and positions and by monotone cubics
+        over depths; constant beyond the ends.
     """
 
     base: ScaledSheetModel
@@ -40,16 +39,15 @@ class TabulatedSheetModel:
     name: str = "table"
 
     def __post_init__(self) -> None:
-        """Raise ValueError for axes that do not ascend, or ratios of another shape or not
-        positive."""
+        """Raise ValueError for axes that are not ascending, or ratios that are invalid."""
         axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
         shape = tuple(len(axis) for axis in axes)
         if 0 in shape or any((np.diff(axis) <= 0.0).any() for axis in axes):
-            raise ValueError("a table's stretches, depths and positions must ascend")
+            raise ValueError("force table: stretches, depths and positions must be ascending")
         if self.ratios.shape != shape:
-            raise ValueError(f"a table of {self.ratios.shape} entries for axes of {shape}")
+            raise ValueError(f"force table: expected ratios {shape}, found {self.ratios.shape}")
         if not (np.isfinite(self.ratios).all() and (self.ratios > 0.0).all()):
-            raise ValueError("a table's ratios must be finite and above zero")
+            raise ValueError("force table: ratios must be finite and above 0")
 
     @property
     def rubber(self) -> Rubber:
@@ -63,23 +61,23 @@ class TabulatedSheetModel:
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> SheetForce:
-        pressed = self.base.evaluate(
+        base = self.base.evaluate(
             stretch_ratio, depths_m, position_m=position_m, finger_radius_m=finger_radius_m
         )
-        ratios = _between(self.stretches, stretch_ratio, self.ratios)
-        ratios = _between(self.xs_m, abs(position_m[0]), np.moveaxis(ratios, 1, 0))
-        ratios = _between(self.ys_m, abs(position_m[1]), np.moveaxis(ratios, 1, 0))
+        ratios = _interpolate_linear(self.stretches, stretch_ratio, self.ratios)
+        ratios = _interpolate_linear(self.xs_m, abs(position_m[0]), np.moveaxis(ratios, 1, 0))
+        ratios = _interpolate_linear(self.ys_m, abs(position_m[1]), np.moveaxis(ratios, 1, 0))
         if len(self.depths_m) == 1:
-            ratio, slope = np.full(pressed.force_n.shape, ratios[0]), np.zeros(1)
+            ratio, slope = np.full(base.force_n.shape, ratios[0]), np.zeros(1)
         else:
             curve = PchipInterpolator(self.depths_m, ratios)
             within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
             ratio = curve(within)
             slope = np.where(within == depths_m, curve(within, 1), 0.0)
         return SheetForce(
-            pressed.force_n * ratio,
-            pressed.stiffness_n_per_m * ratio + pressed.force_n * slope,
-            pressed.edge_force_n,
+            base.force_n * ratio,
+            base.stiffness_n_per_m * ratio + base.force_n * slope,
+            base.edge_force_n,
         )
 
     def invalid_reason(
@@ -91,19 +89,19 @@ class TabulatedSheetModel:
         finger_radius_m: float,
     ) -> str:
         x, y = abs(position_m[0]), abs(position_m[1])
-        asked = {
+        inputs = {
             "stretch": (stretch_ratio, self.stretches),
             "depth": (depth_m, self.depths_m),
             "position along x": (x, self.xs_m),
             "position along y": (y, self.ys_m),
         }
-        for what, (value, axis) in asked.items():
+        for what, (value, axis) in inputs.items():
             if not axis[0] - 1e-9 <= value <= axis[-1] + 1e-9:
                 return f"{what} {value:.4g} is not in the table's {axis[0]:.4g} to {axis[-1]:.4g}"
         return ""
 
 
-def _between(axis: Floats, value: float, entries: Floats) -> Floats:
+def _interpolate_linear(axis: Floats, value: float, entries: Floats) -> Floats:
     """Interpolate entries (n, ...) linearly along their first axis; constant beyond the ends."""
     if len(axis) == 1:
         return np.asarray(entries[0])
@@ -124,7 +122,7 @@ def make_tabulated_model(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Make the table from what `measure` returns; `progress` reports each of its calls."""
+    """Make the table by calls of `measure`; `progress` is called after each of them."""
     ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
     total, done = len(stretches) * len(xs_m) * len(ys_m), 0
     for a, stretch in enumerate(stretches):

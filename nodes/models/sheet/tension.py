@@ -1,7 +1,4 @@
-"""Compute the edge force of the unpushed sheet, and the stiffness that follows from it alone.
-
-Planner, arm limiter and force models use these formulas.
-"""
+"""Compute the edge force of the unpushed sheet and the resulting push stiffness."""
 
 from __future__ import annotations
 
@@ -13,23 +10,23 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
-"""Edge force over that of simple tension: the first plus the second times height over width.
+"""Edge force over that of uniaxial tension: the first plus the second times height over width.
 
-It grows with the height, since the clamps prevent the sheet from narrowing.  It is within 0.3 % of
-membrane FE for aspect ratios from 0.5 to 1.5 and stretch to 1.12.
+The clamps prevent the sheet from narrowing. The formula is within 0.3 % of membrane finite elements
+for height over width from 0.5 to 1.5 and stretch ratios up to 1.12.
 """
 
 GRAVITY_M_PER_S2 = 9.81
 """Acceleration towards the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
-"""Stiffness of a small push over edge force per length: 0.9-1.0 for a fingertip of radius 10 mm."""
+"""Stiffness of a small push over edge force per width: 0.9-1.0 for a fingertip radius of 10 mm."""
 
 
 def strain_measure(stretch_ratio: float, mooney_share: float = 0.0) -> float:
-    """Return the nominal stress of simple tension over E: (s - s^-2)/3; 0 when slack.
+    """Return the nominal stress of uniaxial tension over E: (s - s^-2)/3 (1 - m + m/s).
 
-    For Mooney-Rivlin rubber it is that times 1 - m + m/s.
+    s is the stretch ratio and m the Mooney fraction. The result is 0 for a slack sheet.
     """
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_share + mooney_share / s)
@@ -44,10 +41,9 @@ def edge_force_n(
     thickness_m: float,
     mooney_share: float = 0.0,
 ) -> float:
-    """Return the force (N) on each clamped edge of the unpushed sheet; 0 when slack.
+    """Return the force (N) on each clamped edge of the unpushed sheet; 0 for a slack sheet.
 
-    width_m: between the edges, slack.
-    height_m: length of an edge.
+    width_m: distance of the edges when slack. height_m: length of an edge.
     """
     area_modulus = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m)
     return area_modulus * strain_measure(stretch_ratio, mooney_share)
@@ -56,12 +52,12 @@ def edge_force_n(
 def stretch_for_edge_force(
     force_n: float, *, young_modulus_pa: float, width_m: float, height_m: float, thickness_m: float
 ) -> float:
-    """Invert `edge_force_n` of neo-Hookean rubber (Newton's method); 1 for a force below 0."""
+    """Return the stretch ratio for an edge force (N) of neo-Hookean rubber, by Newton's method."""
     scale = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m) / 3.0
-    wanted = max(force_n, 0.0) / scale
-    stretch = 1.0 + wanted / 3.0
+    target = max(force_n, 0.0) / scale
+    stretch = 1.0 + target / 3.0
     for _ in range(20):
-        step = (stretch - stretch**-2 - wanted) / (1.0 + 2.0 * stretch**-3)
+        step = (stretch - stretch**-2 - target) / (1.0 + 2.0 * stretch**-3)
         stretch -= step
         if abs(step) < 1e-14:
             break
@@ -73,12 +69,12 @@ def _clamp_factor(width_m: float, height_m: float) -> float:
 
 
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
-    """Return the force per depth (N/m) of a small push at the centre under that edge force (N)."""
+    """Return the stiffness (N/m) of a small push at the centre for an edge force (N)."""
     return PUSH_FACTOR * edge_force / width_m
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Invert `push_stiffness_n_per_m`."""
+    """Return the edge force (N) for the stiffness (N/m) of a small push at the centre."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR
 
 
