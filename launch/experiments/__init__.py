@@ -1,4 +1,4 @@
-"""Run the paper's experiments on a running graph and evaluate the recorded bags."""
+"""The paper's experiments, run on a graph and evaluated from the recorded bags."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from flexsheet.messages.errors import FlexsheetError
 
 
 class ExperimentError(FlexsheetError, RuntimeError):
-    """Raised for an experiment that failed, or a bag that does not hold its recording."""
+    """Raised for an experiment that failed, or a bag without the expected recording."""
 
     code = "experiment"
-    remedy = "Run it on `launch/demo.yaml` first. A bag must be a recording of the same experiment."
+    remedy = "Try `launch/demo.yaml` first. A bag must be a recording of the same experiment."
