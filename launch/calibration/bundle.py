@@ -1,8 +1,8 @@
 """Fit a stereo rig to all corners of all board poses by least squares, with its covariance.
 
 The unknowns are the rig (22 parameters, `PARAMETERS`) and the board's pose in each pair (6). A
-pair's corners depend only on the rig and on that pose, so the poses are eliminated and a system of
-22 equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern Synthesis, 1999,
+pair's corners depend only on the rig and on that pose, so the poses are eliminated. A system of 22
+equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern Synthesis, 1999,
 section 6). Lens model: pinhole with k1, k2, p1, p2.
 """
 

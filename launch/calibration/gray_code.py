@@ -1,6 +1,6 @@
 """Generate and decode structured light: Gray-code patterns, and camera images of them.
 
-A camera pixel is wider than a projector pixel, so the finest stripes are not resolved, and each
+A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each
 image is decoded to cells of a few projector pixels. A smooth map fitted to the cells around a
 projector pixel gives its image position with subpixel accuracy. Moreno and Taubin (2012) fit local
 homographies instead.

@@ -17,6 +17,7 @@ from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -129,8 +130,7 @@ def stereo(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration import save_calibration
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    check_folder("-o", output)
     _check_single_source(left, right, device_source, twin)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
@@ -357,8 +357,7 @@ def print_board(
     from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    check_folder("-o", output)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     try:
         write_board(described, output)
@@ -446,6 +445,23 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
     yaml.dump(tree, text)
     write_file(copy, text.getvalue())
     load_scene(copy)
+
+
+def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
+    """Load a stereo calibration for the scene's camera, or return None without a path."""
+    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+
+    if path is None:
+        return None
+    try:
+        calibration = load_calibration(path)
+        refuse_other_camera(calibration, scene.camera)
+    except CalibrationFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    except CalibrationMismatchError as error:
+        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
+    return calibration
 
 
 def round_digits(value: float) -> float:

@@ -23,12 +23,14 @@ from flexsheet.launch.commands.calibrate import (
     _parse_board,
     _progress,
     edit_scene,
+    load_optics,
     round_digits,
 )
 from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -127,15 +129,14 @@ def arms(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import save_arms_calibration
 
-    if not output.resolve().parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give --left-arm, --right-arm or both, or else --twin", BAD_INPUT)
     if copy is not None:
         _check_new_file(copy, "--write-scene")
     scene = load_scene(scene_file)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
-    optics = _load_optics(calibration, scene)
+    optics = load_optics(calibration, scene)
     folders: dict[Side, Path | None] = {"left": left_arm, "right": right_arm}
     fits: dict[Side, BaseFit] = {}
     blind: dict[Side, list[tuple[str, str]]] = {}
@@ -232,7 +233,7 @@ def capture(
             f"-o {output}: cannot be created: {error.strerror}; name a new folder", BAD_INPUT
         ) from error
     recorder = PoseRecorder(
-        output, described, make_lens_rig(scene, _load_optics(calibration, scene))
+        output, described, make_lens_rig(scene, load_optics(calibration, scene))
     )
     size = (scene.camera.width_px, scene.camera.height_px)
     run_interruptible(_record_poses(f"arm_{side}", recorder, size, places, run))
@@ -289,24 +290,7 @@ async def _record_poses(
 def _check_new_file(path: Path, option: str) -> None:
     if path.exists():
         raise CommandError(f"{option} {path}: the file exists; name a new file", BAD_INPUT)
-    if not path.resolve().parent.is_dir():
-        raise CommandError(f"{option} {path}: the folder {path.parent} does not exist", BAD_INPUT)
-
-
-def _load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-
-    if path is None:
-        return None
-    try:
-        calibration = load_calibration(path)
-        refuse_other_camera(calibration, scene.camera)
-    except CalibrationFileError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
-    except CalibrationMismatchError as error:
-        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
-    return calibration
+    check_folder(option, path)
 
 
 def _simulate_folder(

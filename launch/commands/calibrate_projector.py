@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.calibrate import edit_scene, round_digits
+from flexsheet.launch.commands.calibrate import edit_scene, load_optics, round_digits
 from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -103,7 +104,7 @@ def projector(
 ) -> None:
     """Calibrate the projector and write the result into a scene.
 
-    The data are stereo images of Gray code on the sheet in at least three poses (--pictures), four
+    The data are stereo images of Gray code on the sheet in three or more poses (--pictures), four
     corners set manually (--corners), or simulated images (--twin).
     """
     from flexsheet.launch.calibration import gray_code
@@ -128,8 +129,8 @@ def projector(
             "the patterns with --write-patterns FOLDER",
             BAD_INPUT,
         )
-    if output is not None and not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    if output is not None:
+        check_folder("-o", output)
     true: Projector | None = None
     try:
         if corners is not None:
@@ -208,16 +209,9 @@ def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Ite
 
 def _load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """Return the scene's camera with the optics of a calibration file."""
-    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-
-    if calibration is None:
+    optics = load_optics(calibration, scene)
+    if optics is None:
         return scene.camera
-    try:
-        optics = load_calibration(calibration)
-        refuse_other_camera(optics, scene.camera)
-    except (CalibrationFileError, CalibrationMismatchError) as error:
-        raise CommandError(f"--calibration {calibration}: {error}", BAD_INPUT) from error
     return scene.camera.model_copy(
         update={
             "left": optics.left,

@@ -13,6 +13,7 @@ from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -91,8 +92,7 @@ def sheet(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    check_folder("-o", output)
     if (rows is None) == (twin is None):
         raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
     command = ["flexsheet", "calibrate", "sheet"]

@@ -15,6 +15,7 @@ from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -107,10 +108,8 @@ def check_scene(
     from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
     from flexsheet.launch.plans.plan import load_scene
 
-    if output is not None and not output.resolve().parent.is_dir():
-        raise CommandError(
-            f"--output {output}: the folder {output.parent} does not exist", BAD_INPUT
-        )
+    if output is not None:
+        check_folder("--output", output)
     scene = load_scene(scene_file)
     with progress_words() as progress:
         layout = check_layout(scene, progress=progress)

@@ -141,7 +141,7 @@ async def _run_until(
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run the graph until `stop_requested`, or `duration_s` after ready; return the exit code."""
+    """Run the graph until `stop_requested`, or until `duration_s` after it is ready."""
     from flexsheet.launch.running.supervisor import NodeFailedError
     from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import replace_non_finite
@@ -29,6 +30,12 @@ class CommandError(FlexsheetError):
     def __init__(self, text: str, exit_code: int = FAILED) -> None:
         super().__init__(text)
         self.exit_code = exit_code
+
+
+def check_folder(option: str, file: Path) -> None:
+    """Raise CommandError if the folder of an output file does not exist."""
+    if not file.resolve().parent.is_dir():
+        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist", BAD_INPUT)
 
 
 class Words:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
@@ -267,13 +267,8 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     moving: list[ForceSample] = []
     for press in make_presses(recorded.scene):
         label = press.path.label
-        if label not in recorded.windows_ns:
-            labels = ", ".join(recorded.windows_ns) or "none"
-            raise ExperimentError(
-                f'the bag does not contain the finger path "{label}"; it contains: {labels}'
-            )
         progress(f"evaluating: {label}")
-        begin_ns, end_ns = recorded.windows_ns[label]
+        begin_ns, end_ns = find_recorded(recorded.windows_ns, "finger path", label)
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, REST_SAMPLES) * 1e9)
             resting.append(

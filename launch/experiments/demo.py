@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.bags.report.strokes import read_followed
-from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.experiments import find_recorded, image, stroke
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
     Progress,
@@ -75,12 +75,7 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
     Raises ExperimentError if the bag does not contain it.
     """
     runs = {run["path"]: run for run in read_followed(bag)}
-    if label not in runs:
-        labels = ", ".join(runs) or "none"
-        raise ExperimentError(
-            f'the bag does not contain the finger path "{label}"; it contains: {labels}'
-        )
-    return runs[label]
+    return find_recorded(runs, "finger path", label)
 
 
 def summarize(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from flexsheet.launch.bags.report.strokes import read_followed
-from flexsheet.launch.experiments import ExperimentError, stroke
+from flexsheet.launch.experiments import ExperimentError, find_recorded, stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.launch.experiments.run import Procedure, Progress
@@ -229,12 +229,7 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
     missing: number of exposures without a fingertip. reasons: counts of the reasons of invalid
     fingertips. jump: between consecutive valid fingertips.
     """
-    if name not in recorded.windows_ns:
-        labels = ", ".join(recorded.windows_ns) or "none"
-        raise ExperimentError(
-            f'the bag does not contain the gesture "{name}"; it contains: {labels}'
-        )
-    begin_ns, end_ns = recorded.windows_ns[name]
+    begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)
     exposures = recorded.truth.times_ns
     exposed = exposures[(exposures >= begin_ns) & (exposures <= end_ns)]
     inside = np.flatnonzero((recorded.times_ns >= begin_ns) & (recorded.times_ns <= end_ns))

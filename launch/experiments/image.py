@@ -15,7 +15,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.stroke import object_pose
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, cylinder_of
@@ -163,12 +163,7 @@ def size_errors_mm(
 
 def find_image(images: dict[str, EyeImage], label: str) -> EyeImage:
     """Return the image with that label. Raises ExperimentError if the bag does not contain it."""
-    if label not in images:
-        labels = ", ".join(images) or "none"
-        raise ExperimentError(
-            f'the bag does not contain the image "{label}"; it contains: {labels}'
-        )
-    return images[label]
+    return find_recorded(images, "image", label)
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:

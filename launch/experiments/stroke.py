@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
@@ -464,13 +464,8 @@ class StrokeErrors:
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
     """Return the start and end of a stroke, ns. Raises ExperimentError if it is not in the bag."""
-    label = stroke_label(seconds)
-    if label not in recording.windows_ns:
-        labels = ", ".join(recording.windows_ns) or "none"
-        raise ExperimentError(
-            f'the bag does not contain the finger path "{label}"; it contains: {labels}'
-        )
-    zero_ns, end_ns = recording.windows_ns[label]
+    windows = recording.windows_ns
+    zero_ns, end_ns = find_recorded(windows, "finger path", stroke_label(seconds))
     begin_s, finish_s = stroke_window_s(seconds)
     return zero_ns + round(begin_s * 1e9), min(zero_ns + round(finish_s * 1e9), end_ns)
 

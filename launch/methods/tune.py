@@ -147,7 +147,7 @@ TWO_PASS_NAMES = {
 
 
 def find_tunables(names: Sequence[str]) -> list[Tunable]:
-    """Return the tunables with these names, or all; in the order of `TUNABLES`."""
+    """Return the tunables with these names, or all of them, in the order of `TUNABLES`."""
     known = [one.name for one in TUNABLES]
     for name in names:
         if name not in known:
