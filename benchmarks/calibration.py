@@ -124,7 +124,7 @@ def compare_finders() -> None:
 
 
 def joint(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> StereoRig:
-    return StereoRig.of(fit_pairs(pairs, points, size).rig)
+    return StereoRig.from_fit(fit_pairs(pairs, points, size).rig)
 
 
 def robust(loss: str, scale_px: float) -> Fitter:
@@ -152,7 +152,7 @@ def robust(loss: str, scale_px: float) -> Fitter:
         found = least_squares(
             shifts, unknown, jac=slopes, loss=loss, f_scale=scale_px, x_scale="jac"
         )
-        return StereoRig.of(found.x[:22])
+        return StereoRig.from_fit(found.x[:22])
 
     return fit
 
@@ -164,7 +164,7 @@ def with_board_shape(
     fit = fit_pairs(pairs, points, size)
     shape = points.copy()
     for _ in range(6):
-        rig, heights = StereoRig.of(fit.rig), np.zeros(len(points))
+        rig, heights = StereoRig.from_fit(fit.rig), np.zeros(len(points))
         for pair, pose in zip(pairs, fit.poses, strict=True):
             ids, left, right = pair.common()
             seen = triangulate_corners(rig, left, right)
@@ -173,7 +173,7 @@ def with_board_shape(
         plane = np.column_stack([np.ones(len(points)), points[:, :2]])
         shape[:, 2] = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
         fit = fit_rig(pairs, shape, rig=fit.rig, poses=fit.poses)
-    return StereoRig.of(fit.rig)
+    return StereoRig.from_fit(fit.rig)
 
 
 FITTERS: dict[str, Fitter] = {

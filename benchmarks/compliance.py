@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import twin_force
+from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.health.compliance import (
     LINEAR_DEPTH_M,
     compute_compliance,
@@ -71,7 +71,7 @@ def errors(
 ) -> Floats:
     """Return the relative force errors (n,) with the sheet pushed in by `pushed_m` (n,)."""
     radius = scene.finger.radius_m
-    true = [twin_force(scene.sheet, stretch, float(depth), place, radius) for depth in pushed_m]
+    true = [simulate_force(scene.sheet, stretch, float(depth), place, radius) for depth in pushed_m]
     error: Floats = (np.array(true) - wanted_n) / np.maximum(wanted_n, FORCE_JND_FLOOR_N)
     return error
 

@@ -23,7 +23,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import true_sheet
+from flexsheet.launch.calibration.simulated_sheet import solve_sheet
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display
@@ -82,7 +82,7 @@ class CorrectionBench:
             finger_tip=tip,
         )
         assert predicted is not None
-        return predicted, true_sheet(self.scene, *edges, tip)
+        return predicted, solve_sheet(self.scene, *edges, tip)
 
     def pushed(
         self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)

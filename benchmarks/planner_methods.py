@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.methods.charts import chart_result, measure_family, write_chart
+from flexsheet.launch.methods.charts import make_chart_result, measure_family, write_chart
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Case, Family, Trial
@@ -314,7 +314,7 @@ def main() -> None:
     given = parser.parse_args()
     scene = load_scene(given.scene)
     for family in (MESH_NORMAL, ROLLING):
-        result = chart_result(family, scene, measure_family(family, scene, progress=print))
+        result = make_chart_result(family, scene, measure_family(family, scene, progress=print))
         print(*write_chart(result, given.output))
 
 

@@ -39,7 +39,7 @@ async def kill_during_stroke(bag: Path) -> int:
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
         async with Driver(plan, graph.run) as driver:
-            await driver.wait_until_up()
+            await driver.wait_ready()
             driver.move_finger(stroke.stroke_path(scene, STROKE_S))
 
             def is_half_way() -> bool:

@@ -300,7 +300,7 @@ class Soak:
             async with self.graph:
                 await self.graph.wait_ready()
                 async with Driver(self.plan, self.graph.run) as driver:
-                    await driver.wait_until_up()
+                    await driver.wait_ready()
                     await self._use(driver, scene)
         except asyncio.CancelledError:
             self.problems.append(f"interrupted after {self.lasted_s / 60.0:.1f} minutes")

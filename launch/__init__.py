@@ -1,1 +1,1 @@
-"""Launch files, scenes, supervisor, experiments, benchmarks of methods, and command line."""
+"""Launch files, scenes, supervision, experiments, method benchmarks and the command line."""

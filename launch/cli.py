@@ -41,15 +41,14 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
 }
-"""Modules of `flexsheet.launch.commands` by name of command, in the order of `--help`.
+"""Map each command to its modules in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first one has the typer app `app`, of one command or of many; the others have `register(app)`
-and add to it.
+The first module defines the typer app `app`; the others add to it with `register(app)`.
 """
 
 
 FORMER_NAMES = {"prepare": "precompute", "service": "systemd"}
-"""Commands by the names that they had before; help does not list these."""
+"""Former command names with their current names; hidden in the help."""
 
 
 @cache
@@ -68,12 +67,12 @@ def load_command(name: str) -> Any:
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "topic", "arms"})
 """Commands that SIGINT may end without cleanup until their event loop handles it.
 
-In the others Python's own handler raises KeyboardInterrupt, and they clean up.
+The other commands clean up after the KeyboardInterrupt that Python's handler raises.
 """
 
 
 class CommandTable(Mapping[str, Any]):
-    """Map names to commands, and import each command on first use."""
+    """Read-only table of commands by name; imports each command on first use."""
 
     def __getitem__(self, name: str) -> Any:
         return load_command(FORMER_NAMES.get(name, name))
@@ -86,14 +85,14 @@ class CommandTable(Mapping[str, Any]):
 
 
 class CommandGroup(TyperGroup):
-    """Define a typer group whose commands are those of `CommandTable`."""
+    """Typer group with the commands of `CommandTable`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.commands = CommandTable()  # type: ignore[assignment]  # a read-only mapping
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; after its import Python's interrupt handler is active."""
+        """Find the command, and restore Python's SIGINT handler for commands that need it."""
         found = super().resolve_command(ctx, args)
         if found[0] not in INTERRUPTED_AT_ONCE:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -105,7 +104,7 @@ app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    # Commands take it from their parent.
+    # Subcommands inherit this setting.
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples("flexsheet try", "flexsheet launch launch/demo.yaml", "flexsheet topic list"),
 )
@@ -125,7 +124,7 @@ def flexsheet(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", help="Print the version.", callback=_print_version, is_eager=True
+            "--version", help="Print the version and exit.", callback=_print_version, is_eager=True
         ),
     ] = False,
 ) -> None:
@@ -142,12 +141,12 @@ def main() -> None:
             raise
         words.print(f"flexsheet: {error_text(error)}", markup=False)
         if "--json" not in sys.argv and (more := explained_by(error)):
-            words.print(f"what that means: {more}", markup=False, style="dim")
+            words.print(f"explanation: {more}", markup=False, style="dim")
         sys.exit(code)
 
 
 def error_text(error: Exception) -> str:
-    """The sentence about an error; for one of the disk, with path and remedy."""
+    """Return the text of an error; for a disk error, with the path and the remedy."""
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))
@@ -163,7 +162,7 @@ def explained_by(error: Exception) -> str | None:
 
 
 def exit_code(error: Exception) -> int | None:
-    """Return the exit code of an error that the user can put right; None for a program error."""
+    """Return the exit code of an error that the user can correct; None for a program error."""
     if isinstance(error, FlexsheetError):
         return error.exit_code
     return FAILED if isinstance(error, OSError) and error.errno in DISK_ERRORS else None

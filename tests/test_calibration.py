@@ -13,17 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.check import check_stereo, cross_check, rigid_fit_residuals
+from flexsheet.launch.calibration.check import check_stereo, compute_rigid_residuals, cross_check
 from flexsheet.launch.calibration.corners import (
     BoardPair,
     CalibrationError,
+    align_numbering,
     board_points,
     find_pairs,
-    same_order,
 )
 from flexsheet.launch.calibration.selection import fit_pairs
 from flexsheet.launch.calibration.stereo import calibrate_stereo
-from flexsheet.launch.calibration.uncertainty import position_slopes, view_of_work
+from flexsheet.launch.calibration.uncertainty import compute_position_jacobian, sample_working_plane
 from flexsheet.messages.calibration import (
     Board,
     StereoCalibration,
@@ -167,7 +167,7 @@ def test_a_wrong_pair_is_left_out_with_its_reason(rendered: Pictures) -> None:
     right = [*rendered.right[:8], rendered.right[3]]
     calibration = calibrate(rendered.left[:9], right)
     assert [pair.used for pair in calibration.pairs] == [True] * 8 + [False]
-    assert "does not go with the other pairs" in calibration.pairs[8].reason
+    assert "inconsistent with the other pairs" in calibration.pairs[8].reason
     assert calibration.reprojection_rms_px < 0.1
 
 
@@ -177,9 +177,13 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
     calibration = calibrate([*rendered.left[:6], blank], rendered.right[:7])
     assert calibration.pairs[6].reason == "no chessboard of 7x5 inner corners in blank.png"
     assert calibration.pairs[6].left_rms_px is None
-    with pytest.raises(CalibrationError, match=r"4 usable pairs of 5.*\n  blank\.png: no chess"):
+    with pytest.raises(
+        CalibrationError, match=r"4 of 5 pairs are usable.*\n  blank\.png: no chess"
+    ):
         calibrate([*rendered.left[:4], blank], rendered.right[:5])
-    with pytest.raises(CalibrationError, match="no usable pair of 1: no chessboard"):
+    with pytest.raises(
+        CalibrationError, match="none of the 1 pairs is usable; the first: no chessboard"
+    ):
         check_stereo(calibration, [blank], [blank], board=BOARD)
 
 
@@ -191,16 +195,18 @@ def test_unusable_pictures_are_named(
     cv2.imwrite(str(small), np.zeros((90, 120), np.uint8))
     left, right = rendered.left, rendered.right
     for bad_left, bad_right, said in (
-        (left[:3], right[:2], "3 left and 2 right pictures"),
-        ([], [], "no pictures"),
-        ([text], right[:1], r"text\.png: not a picture"),
-        ([tmp_path / "absent.png"], right[:1], r"absent\.png: not a picture"),
-        ([left[0], small], right[:2], r"small\.png: 120x90 px, the others 480x360"),
+        (left[:3], right[:2], "3 left and 2 right images"),
+        ([], [], "no images"),
+        ([text], right[:1], r"text\.png: missing or unreadable"),
+        ([tmp_path / "absent.png"], right[:1], r"absent\.png: missing or unreadable"),
+        ([left[0], small], right[:2], r"small\.png: 120x90 px, expected 480x360"),
     ):
         with pytest.raises(CalibrationError, match=said):
             calibrate(bad_left, bad_right)
     other = calibration.model_copy(update={"width_px": 640})
-    with pytest.raises(CalibrationError, match="480x360 px, calibration of made for 640x360"):
+    with pytest.raises(
+        CalibrationError, match="480x360 px, but the calibration of made is for 640x360"
+    ):
         check_stereo(other, left[:1], right[:1], board=BOARD)
 
 
@@ -213,7 +219,7 @@ def test_corners_numbered_from_another_end_are_brought_into_order(columns: int, 
     grid = right.reshape(rows, columns, 2)
     for quarter in (0, 1, 2, 3) if rows == columns else (0, 2):
         numbered = np.rot90(grid, quarter).reshape(-1, 2)
-        assert np.array_equal(same_order(left, numbered, board), right)
+        assert np.array_equal(align_numbering(left, numbered, board), right)
 
 
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), move=st.tuples(*[st.floats(-5, 5)] * 3))
@@ -223,10 +229,10 @@ def test_rigid_fit_recovers_a_moved_board(
 ) -> None:
     model = board_points(BOARD)
     moved = model @ rigid.rotation_from_vector(turn).T + move
-    assert rigid_fit_residuals(moved, model).max() < 1e-12
+    assert compute_rigid_residuals(moved, model).max() < 1e-12
     bumped = moved.copy()
     bumped[0] += 1e-3
-    assert 5e-4 < rigid_fit_residuals(bumped, model).max() < 2e-3
+    assert 5e-4 < compute_rigid_residuals(bumped, model).max() < 2e-3
 
 
 def test_file_round_trip_keeps_every_digit(tmp_path: Path, calibration: StereoCalibration) -> None:
@@ -328,8 +334,8 @@ def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
     order = [0, 1, 2, 3, 4, 5, 0, 1, 2]
     calibration = calibrate([rendered.left[i] for i in order], [rendered.right[i] for i in order])
     assert [pair.used for pair in calibration.pairs] == [True] * 6 + [False] * 3
-    assert calibration.pairs[7].reason == "shows the board where left01.png does"
-    with pytest.raises(CalibrationError, match=r"1 usable pairs of 6"):
+    assert calibration.pairs[7].reason == "same board pose as left01.png"
+    with pytest.raises(CalibrationError, match=r"1 of 6 pairs are usable"):
         calibrate([rendered.left[0]] * 6, [rendered.right[0]] * 6)
 
 
@@ -399,8 +405,8 @@ def test_real_halves_differ_by_what_they_state() -> None:
         )
         for i in (0, 1)
     ]
-    points = view_of_work(halves[0].fit.rig, halves[0].size, 0.4)
-    slopes = position_slopes(halves[0].fit.rig, points)
+    points = sample_working_plane(halves[0].fit.rig, halves[0].size, 0.4)
+    slopes = compute_position_jacobian(halves[0].fit.rig, points)
     shift = slopes @ (halves[0].fit.rig - halves[1].fit.rig)
     stated = [half.calibration.uncertainty for half in halves]
     assert stated[0] is not None

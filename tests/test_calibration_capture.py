@@ -17,7 +17,14 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch import cli
 from flexsheet.launch.calibration.bundle import pose_vector
-from flexsheet.launch.calibration.capture import TILTS, Bin, Capture, classify_tilt, needed, place
+from flexsheet.launch.calibration.capture import (
+    TILTS,
+    Bin,
+    Capture,
+    _describe_cell,
+    classify_tilt,
+    compute_required_counts,
+)
 from flexsheet.launch.calibration.check import check_stereo
 from flexsheet.launch.calibration.corners import (
     BoardPair,
@@ -26,9 +33,9 @@ from flexsheet.launch.calibration.corners import (
     board_points,
     match_views,
 )
-from flexsheet.launch.calibration.printing import raster, svg, write_board
+from flexsheet.launch.calibration.printing import make_svg, rasterize, write_board
 from flexsheet.launch.calibration.stereo import calibrate_stereo
-from flexsheet.launch.commands.capture import coverage_view, take_pairs
+from flexsheet.launch.commands.capture import coverage_view, write_pairs
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.calibration import Board, load_calibration
@@ -76,7 +83,7 @@ def camera() -> StereoCamera:
 @pytest.mark.parametrize("board", BOARDS, ids=["chessboard", "charuco"])
 def test_a_printed_board_is_found_where_it_was_printed(board: Board) -> None:
     dots_per_m = 1500.0
-    picture = raster(board, dots_per_m)
+    picture = rasterize(board, dots_per_m)
     squares = np.array([board.rows + 3, board.columns + 3])
     assert picture.shape == pytest.approx(tuple(squares * board.square_m * dots_per_m), abs=1)
     view = CornerFinder(board).find(cv2.GaussianBlur(picture, (0, 0), 0.8))
@@ -89,7 +96,7 @@ def test_a_printed_board_is_found_where_it_was_printed(board: Board) -> None:
 
 
 def test_the_printed_markers_are_those_that_opencv_draws() -> None:
-    ours = raster(CHARUCO, 2000.0)
+    ours = rasterize(CHARUCO, 2000.0)
     side = round(2000.0 * CHARUCO.square_m)
     inner = ours[side:-side, side:-side]
     theirs = cv2.aruco.CharucoBoard(
@@ -99,7 +106,7 @@ def test_the_printed_markers_are_those_that_opencv_draws() -> None:
 
 
 def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
-    drawing = svg(CHARUCO)
+    drawing = make_svg(CHARUCO)
     assert 'width="360mm" height="296mm" viewBox="0 0 360 296"' in drawing
     assert "markers of 25 mm, DICT_4X4_50" in drawing
     write_board(CHESSBOARD, tmp_path / "board.png")
@@ -114,9 +121,9 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
     ("change", "said"),
     [
         ({"marker_m": 0.04}, "markers of 40 mm do not fit into squares of 40 mm"),
-        ({"dictionary": "DICT_9X9"}, "a name of OpenCV's, as DICT_4X4_50"),
-        ({"marker_m": None}, "give the markers' side"),
-        ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 holds 50"),
+        ({"dictionary": "DICT_9X9"}, "an OpenCV dictionary, such as DICT_4X4_50"),
+        ({"marker_m": None}, "give the marker size"),
+        ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 contains 50"),
     ],
 )
 def test_impossible_charuco_boards_are_refused(change: dict[str, Any], said: str) -> None:
@@ -211,61 +218,61 @@ def test_names_of_tilts(turn: list[float], tilt: str) -> None:
         assert np.sign(furthest[axis]) == sign
 
 
-def watching(camera: StereoCamera, *, pairs: int, still_pictures: int) -> Capture:
+def watching(camera: StereoCamera, *, pairs: int, still_images: int) -> Capture:
     return Capture(
         CHESSBOARD,
         lens=camera.left,
         size=(camera.width_px, camera.height_px),
         pairs=pairs,
-        still_pictures=still_pictures,
+        still_images=still_images,
     )
 
 
 def test_pair_is_taken_when_the_board_rests_at_a_new_place(camera: StereoCamera) -> None:
     first, second = shown(CHESSBOARD, camera, 2, seed=6)
     blank = (np.full_like(first[0], 60), np.full_like(first[1], 60))
-    capture = watching(camera, pairs=8, still_pictures=3)
-    seen = capture.see(*blank)
-    assert not seen.taken
-    assert "no chessboard of 7x5 inner corners in the left picture and the right" in seen.hint
-    hints = [capture.see(*picture) for picture in (first, first, second, second, second)]
-    assert [one.taken for one in hints] == [False, False, False, False, True]
-    assert hints[0].hint == "hold still"
+    capture = watching(camera, pairs=8, still_images=3)
+    seen = capture.add_pair(*blank)
+    assert not seen.accepted
+    assert "no chessboard of 7x5 inner corners found in the left image and the right" in seen.hint
+    hints = [capture.add_pair(*picture) for picture in (first, first, second, second, second)]
+    assert [one.accepted for one in hints] == [False, False, False, False, True]
+    assert hints[0].hint == "keep the board still"
     assert capture.counts[Bin("pairs", "")] == 1
-    assert not capture.see(*second).taken
-    assert capture.see(*second).hint.startswith("taken from here; show the board")
-    assert [capture.see(*first).taken for _ in range(3)] == [False, False, True]
+    assert not capture.add_pair(*second).accepted
+    assert capture.add_pair(*second).hint.startswith("pose already captured; show the board")
+    assert [capture.add_pair(*first).accepted for _ in range(3)] == [False, False, True]
     assert capture.counts[Bin("pairs", "")] == 2
     assert not capture.complete
 
 
 def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
-    capture = watching(camera, pairs=8, still_pictures=1)
-    wanted = needed(8)
+    capture = watching(camera, pairs=8, still_images=1)
+    wanted = compute_required_counts(8)
     assert {one.name for one in wanted if one.group == "tilt"} == set(TILTS)
     assert Bin("left cell", "0,0") not in wanted
     capture.counts.update(dict.fromkeys(wanted, 8))
     assert capture.complete
     for one, said in (
         (Bin("tilt", "left side back"), "with its left side tilted back"),
-        (Bin("tilt", "upright"), "straight on"),
+        (Bin("tilt", "upright"), "facing the camera"),
         (Bin("distance", "far"), "further away"),
-        (Bin("left cell", "3,2"), "at the bottom right of the left picture"),
-        (Bin("pairs", ""), "somewhere else"),
+        (Bin("left cell", "3,2"), "at the bottom right of the left image"),
+        (Bin("pairs", ""), "in another pose"),
     ):
         capture.counts[one] = 0
         assert capture.missing() == [one]
         (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
-        assert said in capture.advice("")
+        assert said in capture._make_hint("")
         capture.counts[one] = 8
         assert picture[0].shape == (camera.height_px, camera.width_px)
-    assert place(Bin("right cell", "0,0")) == "at the top left of"
+    assert _describe_cell(Bin("right cell", "0,0")) == "at the top left of"
 
 
 def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:
-    capture = watching(camera, pairs=20, still_pictures=1)
+    capture = watching(camera, pairs=20, still_images=1)
     (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
-    assert capture.see(*picture).taken
+    assert capture.add_pair(*picture).accepted
     console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(coverage_view(capture, "tilt it"))
     drawn = console.export_text()
@@ -284,8 +291,8 @@ def test_ctrl_c_keeps_the_pictures_taken(camera: StereoCamera, tmp_path: Path) -
         raise KeyboardInterrupt
 
     folder = tmp_path / "taken"
-    capture = watching(camera, pairs=8, still_pictures=1)
-    assert take_pairs(until_interrupted(), capture, folder) == 3
+    capture = watching(camera, pairs=8, still_images=1)
+    assert write_pairs(until_interrupted(), capture, folder) == 3
     assert sorted(path.name for path in folder.iterdir()) == [
         f"{side}{number:02}.png" for side in ("left", "right") for number in (1, 2, 3)
     ]
@@ -335,7 +342,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert calibration.left.fx_px == pytest.approx(make_true_camera(camera).left.fx_px, rel=5e-3)
 
     page = (report / "index.html").read_text()
-    for word in ("Calibration of twin-bumblebee", "right_from_left.tx_m", "mm in depth"):
+    for word in ("Calibration of twin-bumblebee", "right_from_left.tx_m", "mm depth"):
         assert word in page
     assert page.count("data:image/png;base64,") == 4
     assert 'src="http' not in page
@@ -351,14 +358,15 @@ def test_the_twin_is_calibrated_by_the_command(
     assert checked["pairs"] == len(left) == len(right)
     assert checked["rigid_fit_rms_mm"] < 1.0
     assert checked["used_to_calibrate"] == []  # the same names, but other pictures
-    assert "flatter" not in err
+    assert "underestimated" not in err
 
     given = ("--left", taken / "left*.png", "--right", taken / "right*.png", *GIVEN)
     code, out, err = flexsheet("calibrate", "check", "--calibration", output, *given, "--json")
     assert code == 0, err
     again = json.loads(out)["used_to_calibrate"]
     assert {"left01.png", "left02.png"} <= set(again)
-    assert "pictures that made this calibration flatter it: left01.png" in err
+    assert "left01.png" in err
+    assert "errors are underestimated" in err
 
     code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 2, "--json")
     assert code == 0, err
@@ -394,13 +402,16 @@ def test_pictures_are_taken_from_the_camera_source(
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ((), "one of the three"),
-        (("--left", "a*.png"), "one of the three"),
-        (("--twin", "SCENE", "--left", "a", "--right", "b"), "one of the three"),
-        (("--device-source", "{kind: opencv, left: 0}"), "name the scene with --scene"),
+        ((), "exactly one source of images"),
+        (("--left", "a*.png"), "exactly one source of images"),
+        (("--twin", "SCENE", "--left", "a", "--right", "b"), "exactly one source of images"),
+        (("--device-source", "{kind: opencv, left: 0}"), "missing --scene"),
         (("--device-source", "{kind: opencv}", "--scene", "SCENE"), "opencv.left: Field required"),
         (("--device-source", "twin", "--scene", "SCENE"), "use --twin SCENE"),
-        (("--device-source", "[1,", "--scene", "SCENE"), "describe it as a camera node's source"),
+        (
+            ("--device-source", "[1,", "--scene", "SCENE"),
+            "use the format of a camera node's source",
+        ),
         (("--twin", "SCENE", "--pictures", "."), "name a new folder"),
         (("--twin", "SCENE", "--marker-mm", "40"), "do not fit"),
         (("--twin", "nowhere.yaml"), "cannot be read"),
@@ -425,7 +436,7 @@ def test_a_board_to_print_is_written(flexsheet: Flexsheet, tmp_path: Path) -> No
     assert path.read_text().startswith("<svg")
     code, _, err = flexsheet("calibrate", "board", *GIVEN, "-o", tmp_path / "board.txt")
     assert code == 2
-    assert "write the board as .svg or .png" in err
+    assert "use .svg or .png" in err
 
 
 def launch_file(folder: Path, calibration: Path) -> Path:

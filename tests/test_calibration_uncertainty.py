@@ -22,12 +22,12 @@ from flexsheet.launch.calibration.corners import (
     match_views,
 )
 from flexsheet.launch.calibration.selection import PairSelection, fit_pairs, fit_selection
-from flexsheet.launch.calibration.stereo import state_uncertainty
+from flexsheet.launch.calibration.stereo import compute_uncertainty
 from flexsheet.launch.calibration.uncertainty import (
-    jackknife_covariance,
-    position_slopes,
-    position_spread,
-    view_of_work,
+    compute_jackknife_covariance,
+    compute_position_jacobian,
+    compute_position_std,
+    sample_working_plane,
 )
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
@@ -97,7 +97,7 @@ def calibrated(
     size, points = (camera.width_px, camera.height_px), board_points(board)
     fit = fit_selection(selection, points, size)
     assert len(selection.good) >= 0.75 * count
-    uncertainty = state_uncertainty(
+    uncertainty = compute_uncertainty(
         fit, selection.pairs(), points, size=size, distance_m=distance_m
     )
     return fit, uncertainty
@@ -161,10 +161,10 @@ def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floa
 
 def test_derivatives_of_positions_equal_differences() -> None:
     rig = numbers_of(make_true_camera(scene_camera()))
-    grid = view_of_work(rig, (640, 480), 0.5)
+    grid = sample_working_plane(rig, (640, 480), 0.5)
     assert grid[:, 2] == pytest.approx(0.5)
     points = grid[[0, 12]]
-    slopes = position_slopes(rig, points)
+    slopes = compute_position_jacobian(rig, points)
     left, right = drawn(rig, points)
     for index in range(len(rig)):
         step = np.zeros(len(rig))
@@ -186,7 +186,7 @@ def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
 def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
     """Corners with independent noise: the errors of 40 fits scatter as each of them states."""
     true = numbers_of(make_true_camera(scene_camera()))
-    slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
+    slopes = compute_position_jacobian(true, sample_working_plane(true, (640, 480), 0.5))
     scores, shifts, stated = [], [], []
     for seed in range(40):
         pairs = noisy(seed=seed, sigma_px=0.05)
@@ -194,7 +194,7 @@ def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
         off = fit.rig - true
         scores.append(off @ np.linalg.solve(fit.covariance, off))
         shifts.append(slopes @ off)
-        stated.append(position_spread(slopes, fit.covariance))
+        stated.append(compute_position_std(slopes, fit.covariance))
         assert fit.sigma_px == pytest.approx(0.05, rel=0.1)
     assert np.mean(scores) == pytest.approx(22.0, rel=0.2)
     variances = np.mean(np.square(shifts), axis=(0, 1))
@@ -205,16 +205,16 @@ def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
 
 def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
     true = numbers_of(make_true_camera(scene_camera()))
-    slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
+    slopes = compute_position_jacobian(true, sample_working_plane(true, (640, 480), 0.5))
     pairs = noisy(seed=3, sigma_px=0.05, count=20)
     fit = fit_pairs(pairs, POINTS, (640, 480))
     told: list[tuple[int, int]] = []
-    refits = jackknife_covariance(
+    refits = compute_jackknife_covariance(
         fit, pairs, POINTS, lambda done, total, _: told.append((done, total))
     )
     assert told == [(number, 20) for number in range(1, 21)]
-    ratio = np.hypot(*position_spread(slopes, refits)) / np.hypot(
-        *position_spread(slopes, fit.covariance)
+    ratio = np.hypot(*compute_position_std(slopes, refits)) / np.hypot(
+        *compute_position_std(slopes, fit.covariance)
     )
     assert 0.6 < ratio < 1.6
 
@@ -237,10 +237,10 @@ def test_only_the_jackknife_detects_bent_boards() -> None:
             )
         )
     fit = fit_pairs(pairs, POINTS, (640, 480))
-    uncertainty = state_uncertainty(fit, pairs, POINTS, size=(640, 480), distance_m=0.5)
+    uncertainty = compute_uncertainty(fit, pairs, POINTS, size=(640, 480), distance_m=0.5)
     assert uncertainty.jackknife_ratio > 1.3
-    slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), 0.5))
-    alone = position_spread(slopes, fit.covariance)
+    slopes = compute_position_jacobian(fit.rig, sample_working_plane(fit.rig, (640, 480), 0.5))
+    alone = compute_position_std(slopes, fit.covariance)
     stated = (uncertainty.depth_std_m, uncertainty.lateral_std_m)
     assert np.divide(stated, alone) == pytest.approx(uncertainty.jackknife_ratio, rel=1e-6)
 
@@ -249,12 +249,12 @@ def test_fingertip_errors_agree_with_the_stated_uncertainty() -> None:
     """Six calibrations from pictures, each of other poses and noise, judged by the true rig."""
     camera = small_camera()
     true = numbers_of(camera)
-    points = view_of_work(true, (320, 240), 0.5)
+    points = sample_working_plane(true, (320, 240), 0.5)
     left, right = drawn(true, points)
     errors, stated = [], []
     for seed in range(6):
         fit, uncertainty = calibrated(camera, COARSE, seed=seed, count=12, distance_m=0.5)
-        errors.append(triangulate_corners(StereoRig.of(fit.rig), left, right) - points)
+        errors.append(triangulate_corners(StereoRig.from_fit(fit.rig), left, right) - points)
         stated.append((uncertainty.depth_std_m, uncertainty.lateral_std_m))
     variances = np.mean(np.square(errors), axis=(0, 1))
     depth_m, lateral_m = np.sqrt(np.mean(np.square(stated), axis=0))
@@ -269,8 +269,8 @@ def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
     off = measured - true
     score = off @ np.linalg.solve(shipped.uncertainty.covariance, off)
     assert score < 22 + 3 * np.sqrt(2 * 22)
-    points = view_of_work(true, (640, 480), shipped.uncertainty.working_distance_m)
-    errors = triangulate_corners(StereoRig.of(measured), *drawn(true, points)) - points
+    points = sample_working_plane(true, (640, 480), shipped.uncertainty.working_distance_m)
+    errors = triangulate_corners(StereoRig.from_fit(measured), *drawn(true, points)) - points
     assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 2.5 * shipped.uncertainty.depth_std_m
     # And good enough to reach 0.3 mm near the sheet with what marks add.
     assert np.linalg.norm(errors, axis=1).max() < 2.5e-4
@@ -284,7 +284,9 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
     fit, again = calibrated(
         make_true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
     )
-    slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
+    slopes = compute_position_jacobian(
+        fit.rig, sample_working_plane(fit.rig, (640, 480), distance_m)
+    )
     shifts = slopes @ (fit.rig - numbers_of(shipped))
     depth_m = np.hypot(again.depth_std_m, shipped.uncertainty.depth_std_m)
     lateral_m = np.hypot(again.lateral_std_m, shipped.uncertainty.lateral_std_m)

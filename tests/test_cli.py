@@ -250,13 +250,13 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
     [
         (("echo", "twin/fingr"), 2, 'did you mean "twin/finger"?'),
         (("echo", "twin/finger", "--field", "path_tim_s"), 2, 'did you mean "path_time_s"?'),
-        (("echo", "fingertip"), 1, 'nobody writes "fingertip"'),
-        (("echo", "display", "--once", "--timeout", "0.2"), 1, 'nothing came on "display"'),
-        (("hz", "display", "--duration", "0.2"), 1, 'nothing came on "display"'),
+        (("echo", "fingertip"), 1, '"fingertip" has no writer'),
+        (("echo", "display", "--once", "--timeout", "0.2"), 1, 'no message on "display"'),
+        (("hz", "display", "--duration", "0.2"), 1, 'no message on "display"'),
         (("pub", "estop", "{engaged: maybe}"), 2, "MESSAGE (EStop): engaged"),
         (("pub", "estop", "{engaged: ["), 2, "not valid YAML or JSON"),
         (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
-        (("echo", "estop", "--run", "/nowhere"), 2, "no plan.json"),
+        (("echo", "estop", "--run", "/nowhere"), 2, "does not contain plan.json"),
     ],
 )
 def test_wrong_words_to_topics(
@@ -330,9 +330,9 @@ def test_a_running_graph_can_be_recorded(flexsheet: Command, running: Path, tmp_
     assert info["complete"]
     assert [topic["name"] for topic in info["topics"]] == ["twin/finger"]
     said = flexsheet("bag", "record", bag)
-    assert (said.code, "exists already" in said.err) == (2, True)
+    assert (said.code, "the file exists" in said.err) == (2, True)
     said = flexsheet("bag", "record", tmp_path / "c.mcap", "--topic", "stereo")
-    assert (said.code, "nobody writes it" in said.err) == (2, True)
+    assert (said.code, "has no writer" in said.err) == (2, True)
 
 
 def test_verify_steps_a_node_and_compares(
@@ -472,7 +472,7 @@ def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> Non
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        ({"--board": "9by6"}, "give the inner corners"),
+        ({"--board": "9by6"}, "expected COLUMNSxROWS"),
         ({"--left": "/nowhere/*.jpg"}, "no file matches"),
         ({"-o": "/nowhere/c.yaml"}, "does not exist"),
     ],

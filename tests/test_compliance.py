@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from flexsheet.launch.calibration.simulated_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.plan import load_scene
@@ -74,7 +74,7 @@ def test_the_twins_sheet_answers_as_the_object(scale: float, place: tuple[float,
     assert shown.note == ""
     depths = np.array([0.005, 0.015, 0.04])
     true = [
-        twin_push(SHEET, shown.stretch_ratio, float(pushed), place, RADIUS, cells=24)
+        simulate_push(SHEET, shown.stretch_ratio, float(pushed), place, RADIUS, cells=24)
         for pushed in shown.indentation_m(depths, place)
     ]
     assert [one[0] for one in true] == pytest.approx(curve.force_n(depths), rel=TARGET_ERROR_RATIO)

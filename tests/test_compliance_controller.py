@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.messages.types import SheetTarget, SoftBody
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import moved
@@ -76,7 +76,7 @@ async def test_a_finger_meets_the_objects_force_by_the_twins_sheet(
     assert target.push_depth_m == pytest.approx(depth_m, abs=1e-9)
     indentation_m = depth_m - stands_behind_m(target)
     x, y = target.contact_sheet_m
-    force_n, pull_n = twin_push(
+    force_n, pull_n = simulate_push(
         SCENE.sheet, target.stretch_ratio, indentation_m, (float(x), float(y)), RADIUS, cells=24
     )
     assert force_n == pytest.approx(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import twin_force
+from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.compliance import (
     DEPTH_RATIOS,
@@ -17,7 +17,7 @@ from flexsheet.launch.experiments.compliance import (
     HOLD_S,
     ComplianceRecording,
     ForceReference,
-    PresentedForce,
+    ForceSample,
     Press,
     make_presses,
     read_bag,
@@ -70,7 +70,7 @@ def test_the_twins_sheet_says_what_was_felt(
     assert felt.depth_m == pytest.approx(depth_m, abs=1e-9)
     assert felt.normal_offset_m == pytest.approx(normal_offset_m, abs=1e-9)
     assert felt.wanted_n == pytest.approx(50.0 * depth_m, rel=1e-6)
-    alone = twin_force(
+    alone = simulate_force(
         SCENE.sheet, STRETCH, depth_m - normal_offset_m, (float(press.surface[0]), 0.0), 0.007
     )
     assert felt.presented_n == pytest.approx(alone, rel=0.02)
@@ -85,10 +85,8 @@ def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
 
 
 def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
-    assert PresentedForce(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
-    assert PresentedForce(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0).error_ratio == pytest.approx(
-        0.5
-    )
+    assert ForceSample(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
+    assert ForceSample(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0).error_ratio == pytest.approx(0.5)
 
 
 def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:
@@ -116,7 +114,7 @@ def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
     bag = tmp_path / "bare.mcap"
     with BagWriter(bag):
         pass
-    with pytest.raises(ExperimentError, match="no scene or no force curve"):
+    with pytest.raises(ExperimentError, match="does not contain a scene and a force curve"):
         read_bag(bag)
 
 

@@ -393,7 +393,7 @@ def test_which_host_this_is(
     )
     assert find_host(two, None, None) == MAIN
     assert find_host(two, None, "left") == "left"
-    with pytest.raises(CommandError, match="none of the addresses"):
+    with pytest.raises(CommandError, match="no address of this computer"):
         find_host(three, None, None)
     with pytest.raises(CommandError, match='did you mean "left"'):
         find_host(two, None, "lef")

@@ -20,8 +20,8 @@ from flexsheet.launch.experiments import ExperimentError, image, stroke
 from flexsheet.launch.methods.charts import (
     FAMILIES,
     UnknownFamilyError,
-    chart_result,
-    family_named,
+    find_family,
+    make_chart_result,
     measure_family,
     write_chart,
 )
@@ -93,7 +93,7 @@ def test_times_keep_their_digits_on_a_machine_that_is_long_up() -> None:
     samples = stroke.SampledMotion(
         start_ns + np.array([0, 1_000_000], dtype=np.int64), np.array([[0.0], [1.0]])
     )
-    middle = samples.at(np.array([start_ns + 500_000], dtype=np.int64))
+    middle = samples.interpolate(np.array([start_ns + 500_000], dtype=np.int64))
     assert middle[0, 0] == 0.5
 
 
@@ -190,7 +190,7 @@ def make_family() -> Family:
 def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
     family = make_family()
     points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
-    result = chart_result(family, SCENE, points)
+    result = make_chart_result(family, SCENE, points)
     assert [point["error"] for point in result["points"]] == [0.0, 2.0]
     assert result["front"] == ["good"]
     picture, numbers = write_chart(result, tmp_path / "charts")
@@ -221,7 +221,7 @@ def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:
     trial = next(iter(family.trials(SCENE)))
     whether = np.array([1.0])[0] > 0.5
     points = [measure(replace(trial, in_range=whether, in_scene=whether), repeats=3)]
-    _, numbers = write_chart(chart_result(family, SCENE, points), tmp_path)
+    _, numbers = write_chart(make_chart_result(family, SCENE, points), tmp_path)
     assert json.loads(numbers.read_text())["points"][0]["in_range"] is True
 
 
@@ -249,7 +249,7 @@ def test_charts_are_gathered_on_a_page_and_drawn_anew(
     monkeypatch.setitem(FAMILIES, "made-up", "nowhere")
     family = make_family()
     points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
-    result = chart_result(family, SCENE, points)
+    result = make_chart_result(family, SCENE, points)
     result["family"] = "made-up"
     older = {name: value for name, value in result.items() if name not in ("sweep_key", "code")}
     newer = ("extra_metrics", "reference_uncertainty")
@@ -269,7 +269,7 @@ def test_charts_are_gathered_on_a_page_and_drawn_anew(
 
 def test_an_unknown_family_gets_a_suggestion() -> None:
     with pytest.raises(UnknownFamilyError, match='did you mean "triangulation"'):
-        family_named("triangulaton")
+        find_family("triangulaton")
 
 
 def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -> None:

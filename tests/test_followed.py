@@ -156,7 +156,9 @@ def test_the_demo_takes_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixtu
     json.dumps(row, allow_nan=False)
     print_followed([row])
     assert LABEL in capsys.readouterr().out
-    with pytest.raises(ExperimentError, match='no finger on a path "wave"; it has: hand'):
+    with pytest.raises(
+        ExperimentError, match='does not contain the finger path "wave"; it contains: hand'
+    ):
         read_followed_path(bag, "wave")
 
 

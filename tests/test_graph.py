@@ -96,7 +96,7 @@ async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
         )  # fmt: skip
         frames.start()
         async with Driver(plan, graph.run) as driver:
-            await driver.wait_until_up()
+            await driver.wait_ready()
             await driver.follow(stroke.stroke_path(scene, STROKE_S))
             path = stroke.stroke_path(scene, STROKE_S + 1.0)
             driver.move_finger(path)

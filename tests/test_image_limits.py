@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import true_sheet
+from flexsheet.launch.calibration.simulated_sheet import solve_sheet
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.types import Display
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
@@ -146,7 +146,7 @@ def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
     pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])
     edges = edge_poses(pose, STRETCH * SCENE.sheet.width_m)
-    truth = true_sheet(SCENE, *edges, tip)
+    truth = solve_sheet(SCENE, *edges, tip)
     mesh = SheetMesh(truth.positions.reshape(-1, 3), truth.triangles().astype(np.int32))
     found = []
     for pattern in COORDINATE_RAMPS:

@@ -83,7 +83,7 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("--scheduler", "tcp://127.0.0.1:9"), "is used for the nonlinear table only"),
+        (("--scheduler", "tcp://127.0.0.1:9"), "applies to the nonlinear table only"),
         (("--skin-spacing", "0.009"), "skin_spacing_m: 0.009 is more than finger.radius_m"),
         (
             ("--skin-spacing", str(SPACING_M), "--scheduler", "tcp://127.0.0.1:9"),

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from flexsheet.launch.calibration.simulated_sheet import twin_points
+from flexsheet.launch.calibration.simulated_sheet import simulate_points
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.types import Correction, Display
 from flexsheet.nodes.cache import load_cached
@@ -224,7 +224,7 @@ def test_the_family_of_shapes_tells_them_apart(monkeypatch: pytest.MonkeyPatch) 
     spec = SCENE.sheet.model_copy(update={"min_stretch_ratio": 1.04, "max_stretch_ratio": 1.06})
     scene = SCENE.model_copy(update={"working_range": shallow, "sheet": spec})
     errors: dict[str, float] = {}
-    for trial in sheet_shape_family(twin_points).trials(scene):
+    for trial in sheet_shape_family(simulate_points).trials(scene):
         if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "place": "centre"}:
             errors[trial.method] = trial.error(trial.run())
             assert trial.in_range == (trial.method in ("reduced_order", "membrane"))

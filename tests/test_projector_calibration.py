@@ -14,13 +14,13 @@ from flexsheet.launch.calibration.gray_code import (
     DecodeError,
     decode_patterns,
     find_pixels,
-    patterns,
+    make_patterns,
 )
 from flexsheet.launch.calibration.projector import (
     ProjectorError,
     ProjectorPoints,
     calibrate_projector,
-    keystone,
+    fit_keystone,
     measure_points,
     project_points,
 )
@@ -88,13 +88,13 @@ def true(scene: Scene) -> Projector:
 def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> ProjectorPoints:
     """What the rig, its optics known, measures of the true projector's light."""
     lit = LitSheet(scene, true_rig, true, seed=3)
-    shown = patterns(scene.projector.width_px, scene.projector.height_px)
+    shown = make_patterns(scene.projector.width_px, scene.projector.height_px)
     views = [lit.pair(shown, pose) for pose in sheet_poses(4)]
     return measure_points(views, true_rig, scene.projector)
 
 
 def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
-    shown = patterns(70, 50)
+    shown = make_patterns(70, 50)
     assert len(shown) == 2 * (7 + 6) + 2
     view = decode_patterns(shown, 70, 50)
     assert len(view.pixels) == 70 * 50
@@ -108,7 +108,7 @@ def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
 
 def test_a_pixel_is_found_between_the_cameras_pixels() -> None:
     """A camera that sees the projector's picture turned, shrunk and bent."""
-    shown = patterns(256, 192)
+    shown = make_patterns(256, 192)
     rows, columns = np.mgrid[:110, :140].astype(np.float64)
 
     def lit_by(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -153,7 +153,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
     with pytest.raises(ProjectorError, match="in 2 poses"):
         calibrate_projector(some(points.pose < 2), scene.projector)
     flat = points.world * [1.0, 1.0, 0.0]
-    with pytest.raises(ProjectorError, match="nearer and farther"):
+    with pytest.raises(ProjectorError, match="the depth range of the points"):
         calibrate_projector(
             ProjectorPoints(flat, points.pixels, points.pose, points.skew_m), scene.projector
         )
@@ -163,7 +163,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
     with pytest.raises(ProjectorError, match="% of the projector's image"):
         calibrate_projector(corner, scene.projector)
     moved = points.world + np.where(points.pose == 1, 0.01, 0.0)[:, None]
-    with pytest.raises(ProjectorError, match="not one projector"):
+    with pytest.raises(ProjectorError, match="keep the sheet still"):
         calibrate_projector(
             ProjectorPoints(moved, points.pixels, points.pose, points.skew_m), scene.projector
         )
@@ -173,9 +173,11 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
 
 def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
-    with pytest.raises(DecodeError, match="5 images; the patterns are 38"):
+    with pytest.raises(DecodeError, match="expected 38 images, one per pattern, found 5"):
         decode_patterns(dark[:5], 400, 300)
-    with pytest.raises(ProjectorError, match="pose 1, left camera: 0 of the camera's pixels"):
+    with pytest.raises(
+        ProjectorError, match="pose 1, left camera: the projector lights only 0 camera pixels"
+    ):
         measure_points([(dark, dark)], scene.camera, scene.projector)
 
 
@@ -184,18 +186,18 @@ def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
     guess = load_scene(SCENE_FILE).projector
     world = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
     wanted = project_points(guess, world) + np.reshape(off, (4, 2))
-    fit = keystone(wanted, 0.1, 0.1, guess)
+    fit = fit_keystone(wanted, 0.1, 0.1, guess)
     assert np.abs(project_points(fit.projector, world) - wanted).max() < 0.2
 
 
 def test_corners_in_no_order_are_refused() -> None:
     guess = load_scene(SCENE_FILE).projector
     crossed = np.array([[599.0, 499], [199, 99], [199, 499], [599, 99]])
-    with pytest.raises(ProjectorError, match="no convex quadrangle"):
-        keystone(crossed, 0.1, 0.1, guess)
+    with pytest.raises(ProjectorError, match="not a convex quadrangle"):
+        fit_keystone(crossed, 0.1, 0.1, guess)
     mirrored = np.array([[199.0, 499], [599, 499], [599, 99], [199, 99]])
-    with pytest.raises(ProjectorError, match="no projector near"):
-        keystone(mirrored, 0.1, 0.1, guess)
+    with pytest.raises(ProjectorError, match="no projector pose near"):
+        fit_keystone(mirrored, 0.1, 0.1, guess)
 
 
 def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) -> None:
@@ -223,11 +225,13 @@ def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
         assert result.exit_code != 0
         return str(result.exception)
 
-    assert "one of the three" in failing()
-    assert "no folders in it" in failing("--pictures", str(tmp_path))
+    assert "exactly one of" in failing()
+    assert "does not contain a subfolder" in failing("--pictures", str(tmp_path))
     (tmp_path / "pose1").mkdir()
-    assert "0 pictures left*.png, the patterns are 42" in failing("--pictures", str(tmp_path))
-    assert "four pairs" in failing("--corners", "1,2 3,4")
+    assert "expected 42 files left*.png, one per pattern, found 0" in failing(
+        "--pictures", str(tmp_path)
+    )
+    assert "four pixel pairs" in failing("--corners", "1,2 3,4")
 
 
 def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projector) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.calibration.simulated_sheet import twin_errors
+from flexsheet.launch.calibration.simulated_sheet import make_error_function
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.nodes.methods import Point, measure, pareto_front
 from flexsheet.nodes.renderer import benchmarks, deflection_cache
@@ -19,7 +19,7 @@ SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.y
 
 @pytest.fixture(scope="module")
 def points() -> list[Point]:
-    family = correction_family(twin_errors)
+    family = correction_family(make_error_function)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
         patch.setattr(benchmarks, "CASES", ((-50, 0), (0, 25)))

@@ -161,7 +161,7 @@ def test_what_can_be_repaired_is_and_it_is_told(tmp_path: Path) -> None:
         (
             trimesh.util.concatenate([ball(), ball().apply_translation([17.0, 1.0, 2.0])]),
             0.001,
-            "intersects itself",
+            "pairs of triangles intersect",
         ),
         (
             trimesh.Trimesh([[0, 0, 0], [30, 0, 0], [0, 30, 0]], [[0, 1, 2]], process=False),

@@ -19,9 +19,9 @@ from flexsheet.launch.calibration.sheet_fit import (
     tabulate_pushes,
 )
 from flexsheet.launch.calibration.sheet_rows import read_rows, simulate_rows
-from flexsheet.launch.calibration.simulated_sheet import twin_force
+from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.calibrate_sheet import fitted
+from flexsheet.launch.commands.calibrate_sheet import make_calibration
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
@@ -172,10 +172,10 @@ def test_a_table_needs_all_combinations() -> None:
         rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, position_m=(0.03, 0.0)
     )
     used = np.ones(len(rows) + 1, dtype=bool)
-    with pytest.raises(SheetModelFitError, match="every combination"):
+    with pytest.raises(SheetModelFitError, match="all combinations"):
         tabulate_pushes(ScaledSheetModel(NOMINAL), [*rows, moved], used, NOMINAL.width_m)
     apart = [push for push in rows if (push.depth_m < 0.01) == (push.edge_distance_m < 0.25)]
-    with pytest.raises(SheetModelFitError, match="in common"):
+    with pytest.raises(SheetModelFitError, match="no common depth range"):
         tabulate_pushes(ScaledSheetModel(NOMINAL), apart, used[: len(apart)], NOMINAL.width_m)
 
 
@@ -203,19 +203,31 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("", "rows.csv: is empty"),
-        ("stretch_ratio,depth_mm,force_n\n", "has no rows"),
+        ("stretch_ratio,depth_mm,force_n\n", "does not contain rows"),
         ("stretch_ratio,depth_mm,forse_n\n1.02,5,0.1", 'did you mean "force_n"'),
-        ("stretch_ratio,depth_mm\n1.02,5", "force_n: column is missing"),
-        ("depth_mm,force_n\n5,1", "needs one of the columns"),
-        ("stretch_ratio,depth_mm,force_n,depth_mm\n", "column is given twice"),
-        ("stretch_ratio,depth_mm,force_n\n1.02,5", "rows.csv:2: 2 values for 3 columns"),
-        ("stretch_ratio,depth_mm,force_n\n1.02,five,1", 'rows.csv:2: depth_mm: "five"'),
-        ("stretch_ratio,depth_mm,force_n\n1.02,,1", 'depth_mm: "" is not a number'),
-        ("stretch_ratio,depth_mm,force_n\n1.02,nan,1", "depth_mm: nan is not positive"),
-        ("stretch_ratio,depth_mm,force_n\n1.02,-5,1", "-5 is not positive"),
-        ("stretch_ratio,depth_mm,force_n\n2.5e2,5,1", "stretch_ratio: 2.5e2 is not near 1"),
-        ("stretch_ratio,depth_mm,force_n\n1.02,5000,1", "lengths are in mm"),
-        ("stretch_ratio,depth_mm,force_n,y_mm\n1.02,5,1,130", "y_mm: 130 is not on the sheet"),
+        ("stretch_ratio,depth_mm\n1.02,5", "force_n: missing column"),
+        ("depth_mm,force_n\n5,1", "expected one of the columns"),
+        ("stretch_ratio,depth_mm,force_n,depth_mm\n", "duplicate column"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,5", "rows.csv:2: expected 3 values, found 2"),
+        (
+            "stretch_ratio,depth_mm,force_n\n1.02,five,1",
+            'rows.csv:2: depth_mm: expected a number, found "five"',
+        ),
+        ("stretch_ratio,depth_mm,force_n\n1.02,,1", 'depth_mm: expected a number, found ""'),
+        (
+            "stretch_ratio,depth_mm,force_n\n1.02,nan,1",
+            "depth_mm: expected a positive finite number, found nan",
+        ),
+        (
+            "stretch_ratio,depth_mm,force_n\n1.02,-5,1",
+            "expected a positive finite number, found -5",
+        ),
+        (
+            "stretch_ratio,depth_mm,force_n\n2.5e2,5,1",
+            "stretch_ratio: expected a ratio near 1, found 2.5e2",
+        ),
+        ("stretch_ratio,depth_mm,force_n\n1.02,5000,1", "give lengths in mm"),
+        ("stretch_ratio,depth_mm,force_n,y_mm\n1.02,5,1,130", "y_mm: 130 mm is outside the sheet"),
         ("stretch_ratio,depth_mm,force_n\n" + "x,5,1\n" * 25, "and 5 more"),
     ],
 )
@@ -241,7 +253,7 @@ def twin_calibration() -> SheetCalibration:
         update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.02})}
     )
     rows = simulate_rows(small, places=False, noise_n=0.003, seed=2)
-    return fitted(
+    return make_calibration(
         small, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=True
     )
 
@@ -255,7 +267,7 @@ def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibra
     law = make_force_model(SCENE.sheet, found)
     assert isinstance(law, TabulatedSheetModel)
     for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
-        true = twin_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
+        true = simulate_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
         pressed = law.evaluate(
             stretch, np.array([depth]), position_m=CENTRE, finger_radius_m=RADIUS
         )

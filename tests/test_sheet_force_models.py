@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
@@ -56,7 +56,7 @@ def force(
 
 def true_push(stretch: float, depth: float, place: SheetPosition = CENTRE) -> tuple[float, float]:
     """Force and edge force by the twin, on a mesh that is good to 1.5 % and quick."""
-    return twin_push(SHEET, stretch, depth, place, RADIUS, cells=24)
+    return simulate_push(SHEET, stretch, depth, place, RADIUS, cells=24)
 
 
 CASES: tuple[tuple[float, float, SheetPosition], ...] = (

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.simulated_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet import membrane
 from flexsheet.nodes.models.sheet.force_models import MembraneSheetModel
@@ -45,7 +45,9 @@ def test_it_agrees_with_the_twins_elements(stretch: float, place: tuple[float, f
     path = push_path(
         RUBBER, stretch_ratio=stretch, depths_m=depths, position_m=place, finger_radius_m=RADIUS
     )
-    true = [twin_push(SHEET, stretch, float(depth), place, RADIUS, cells=24) for depth in depths]
+    true = [
+        simulate_push(SHEET, stretch, float(depth), place, RADIUS, cells=24) for depth in depths
+    ]
     assert path.forces_n == pytest.approx([one[0] for one in true], rel=0.04)
     assert path.edge_forces_n == pytest.approx([one[1] for one in true], rel=0.02)
 

@@ -21,8 +21,8 @@ from flexsheet.launch.methods.tune import (
     Tunable,
     choose,
     evaluate_methods,
+    find_tunables,
     insert_choices,
-    tunables_named,
     write_choices,
 )
 from flexsheet.launch.plans.documents import BadInputError
@@ -151,7 +151,7 @@ def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
         stand_ins.extend(new)
         return [point(name, errors[name]) for name in new]
 
-    (choice,) = tune.tune(SCENE, [STAGED], measured=measured)
+    (choice,) = tune.tune(SCENE, [STAGED], measure=measured)
     assert stand_ins == methods
     assert choice.chosen.method == chosen
     assert choice.met
@@ -164,21 +164,21 @@ def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
 
 def test_a_sentence_says_why() -> None:
     met = choice_of([point("cheap", 4.2), point("dear", 0.25)])
-    assert met.sentence() == (
-        "made-up: dear (1 ms) leaves 0.25 of 1 mm allowed; "
-        "cheap is cheaper (10 µs), but leaves 4.2 mm at depth_mm 1"
+    assert met.explain() == (
+        "made-up: dear (1 ms), error 0.25, tolerance 1 mm; "
+        "cheap is faster (10 µs), but its error is 4.2 mm at depth_mm 1"
     )
     assert met.spare_ratio == pytest.approx(0.75)
     alone = choice_of([point("cheap", 0.1), point("dear", 0.05)])
-    assert alone.sentence().endswith("nothing is cheaper")
+    assert alone.explain().endswith("no method is faster")
 
 
 def test_a_miss_is_said_with_how_far_it_misses() -> None:
     missed = choice_of([point("cheap", 4.2), point("dear", 2.5), point("dear", 0.1, depth=2)])
     assert not missed.met
-    assert missed.sentence() == (
-        "made-up: no method keeps 1 mm; the nearest is dear (1 ms): 1 of 2 cases missed, "
-        "leaves 2.5 mm at depth_mm 1"
+    assert missed.explain() == (
+        "made-up: no method meets the tolerance 1 mm; best is dear (1 ms), outside in 1 of 2 "
+        "cases: its error is 2.5 mm at depth_mm 1"
     )
 
 
@@ -198,12 +198,12 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
         return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
 
-    tunables = tunables_named(["correction", "sheet-shape"])
-    shape, correction = tune.tune(SCENE, tunables, measured=measured)
+    tunables = find_tunables(["correction", "sheet-shape"])
+    shape, correction = tune.tune(SCENE, tunables, measure=measured)
     assert shape.chosen.setting == "reduced_order"  # as quick as the others, and more exact
     assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
     errors["reduced_order"] = 9.0
-    shape, correction = tune.tune(SCENE, tunables, measured=measured)
+    shape, correction = tune.tune(SCENE, tunables, measure=measured)
     assert shape.chosen.setting == "four_triangles"
     assert correction.chosen.method == "two_pass_triangles"
     assert correction.chosen.setting == "two_pass"
@@ -221,8 +221,8 @@ def test_choices_are_added_to_a_file_and_all_else_is_left_as_it_was() -> None:
     text = put(FILE, GOOD, BAD)
     assert text.startswith(FILE)
     assert "# Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.\n" in text
-    assert "  marker: cheap  # 10 µs, leaves 0.1 of 1 mm\n" in text
-    assert "  tracking: cheap  # NOT GOOD ENOUGH, the nearest miss: 10 µs" in text
+    assert "  marker: cheap  # 10 µs, error 0.1, tolerance 1 mm\n" in text
+    assert "  tracking: cheap  # INSUFFICIENT: 10 µs" in text
     assert YAML(typ="safe").load(text)["methods"] == {"marker": "cheap", "tracking": "cheap"}
 
 
@@ -231,7 +231,7 @@ def test_choices_are_written_over_and_other_families_stay() -> None:
     again = put(text, choice_of([point("dear", 0.2)]))
     assert again.count("methods:") == again.count("Chosen by") == 1
     assert YAML(typ="safe").load(again)["methods"] == {"marker": "dear", "tracking": "cheap"}
-    assert "NOT GOOD ENOUGH" in again  # of the one that was not tuned again
+    assert "INSUFFICIENT" in again  # of the one that was not tuned again
     assert again.startswith(FILE)
     assert again.endswith("# behind\nlast: 2\n")
     assert put(again, choice_of([point("dear", 0.2)])) == again
@@ -264,7 +264,7 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
     with pytest.raises(BadInputError, match="marker") as refused:  # no method's name
         write_choices(source, source, [GOOD])
-    assert str(refused.value).startswith(f"{source}: methods.marker: with the choices put in, ")
+    assert str(refused.value).startswith(f"{source}: methods.marker: with the choices inserted: ")
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     write_choices(source, source, [scene_choice()])
     assert load_scene(source).methods.soft_body == wanted
@@ -298,7 +298,7 @@ def test_all_else_stays_to_the_byte(before: str, after: str) -> None:
     text = text.replace(
         "Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.", "C"
     )
-    assert text.replace("  # 10 µs, leaves 0.1 of 1 mm", "") == after
+    assert text.replace("  # 10 µs, error 0.1, tolerance 1 mm", "") == after
 
 
 @pytest.mark.parametrize("quote", ["", "'", '"'])
@@ -342,7 +342,7 @@ def test_a_files_name_that_cannot_be_put_in_is_refused(tmp_path: Path) -> None:
     text = (SCENES / "palpation.yaml").read_text()
     source.write_text(text.replace("organ.obj", r'"orga\x6e.obj"'))
     (tmp_path / "far").mkdir()
-    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*absolute path"):
+    with pytest.raises(BadInputError, match=r"geometry\.file: contains .organ\.obj.*absolute path"):
         tune.check_target(source, tmp_path / "far" / "copy.yaml")
 
 
@@ -390,15 +390,15 @@ def test_a_miss_has_an_exit_code_of_its_own(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: [missed])
     outcome = run(SCENES / "demanding.yaml", "--dry-run")
     assert outcome.exit_code == NOT_MET
-    assert "no method keeps 1 mm; the nearest is cheap" in outcome.output
-    assert "written: nothing" in outcome.output
+    assert "no method meets the tolerance 1 mm; best is cheap" in outcome.output
+    assert "no file written" in outcome.output
 
 
 def test_an_unknown_family_is_named_with_the_nearest() -> None:
     outcome = run(SCENES / "cylinder.yaml", "--family", "corection")
     assert isinstance(outcome.exception, CommandError)
     assert 'did you mean "correction"?' in str(outcome.exception)
-    assert "no node takes a choice" in str(
+    assert 'unknown family "kinematics"' in str(
         run(SCENES / "sphere.yaml", "--family", "kinematics").exception
     )
 
@@ -429,7 +429,7 @@ def test_scenes_that_come_tuned_say_whether_it_is_enough(name: str, missed: bool
     text = (SCENES / f"{name}.yaml").read_text()
     methods = Methods.model_validate(YAML(typ="safe").load(text)["methods"])
     assert methods.tracking is not None
-    assert ("NOT GOOD ENOUGH" in text) == missed
+    assert ("INSUFFICIENT" in text) == missed
     assert (None not in dict(methods).values()) or missed
 
 

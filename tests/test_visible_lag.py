@@ -76,7 +76,7 @@ def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
         true_edges=edges,
         delays_s={},
         drops=0,
-        pictures=pictures,
+        frames=pictures,
     )
 
 

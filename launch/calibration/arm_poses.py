@@ -1,10 +1,10 @@
 """Read, record and simulate poses of an arm with a board on its flange.
 
-A folder for `flexsheet calibrate arms` holds `joints.csv` and the images that it names.  A row is a
-pose at rest: the six joints (`j1_deg` ... `j6_deg`, or `j1_rad` ...), and either two images
-(`left`, `right`: file names in the folder) or the board's pose in the left camera's frame
-(`board_x_m`, `board_y_m`, `board_z_m`: its first corner; `board_rx_rad`, `board_ry_rad`,
-`board_rz_rad`: a rotation vector).
+The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row is a pose at
+rest: six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) with two image files (`left`,
+`right`). Instead of images it may give the board's pose in the left camera's frame (`board_x_m`,
+`board_y_m`, `board_z_m`: first corner; `board_rx_rad`, `board_ry_rad`, `board_rz_rad`: rotation
+vector).
 """
 
 from __future__ import annotations
@@ -64,55 +64,55 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""Joints are at rest if they stayed within the angle for the time."""
+"""Maximum motion of joints at rest, and minimum duration of the rest."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""A pose is new if the board is rotated or translated at least this much from all others."""
+"""Minimum rotation or translation of the board between recorded poses."""
 
-TWIN_BASE_M, TWIN_BASE_RAD, TWIN_JOINT_RAD = 0.005, 0.01, 2e-4
+SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
 """Standard deviations of the simulated bases from the scene's, and of the joint errors."""
 
 
 class ArmPosesError(FlexsheetError, ValueError):
-    """Raised for a folder of arm poses that cannot be used; the text names file, row and column."""
+    """Raised for a folder of arm poses that cannot be used."""
 
     code = "arm-poses"
-    remedy = "Correct the row of joints.csv that the text names, or measure that pose again."
+    remedy = "Correct the row of joints.csv that the error names, or record that pose again."
 
 
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
-    """Make the stereo rig at the scene's pose, with the calibration's optics or the scene's."""
+    """Make the stereo rig at the scene's pose, with the calibration's or the scene's optics."""
     measured = scene.camera if calibration is None else calibration
-    place = scene.camera.world_from_left
+    pose = scene.camera.world_from_left
     return LensRig(
-        _lens(measured.left),
-        _lens(measured.right),
+        _make_camera_lens(measured.left),
+        _make_camera_lens(measured.right),
         measured.right_from_left,
-        transform_from_rpy(place.position_m, place.rpy_rad),
+        transform_from_rpy(pose.position_m, pose.rpy_rad),
     )
 
 
-def _lens(lens: SceneLens) -> CameraLens:
+def _make_camera_lens(lens: SceneLens) -> CameraLens:
     return CameraLens(
         camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px), np.array(lens.distortion)
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """Hold one row of the arm-pose table.
+class PoseRow:
+    """Row of a table of arm poses.
 
-    The row holds the joint angles (6,) in rad, and either images or the board pose (4, 4).
+    joints_rad: (6,). images, left_from_board: either image files or the board pose (4, 4).
     """
 
     name: str
     joints_rad: Floats
-    pictures: tuple[Path, Path] | None
+    images: tuple[Path, Path] | None
     left_from_board: Floats | None
 
 
-def read_pose_table(folder: Path) -> list[Row]:
-    """Return the rows of a folder's table; ArmPosesError names the wrong cell."""
+def read_pose_table(folder: Path) -> list[PoseRow]:
+    """Read the rows of a folder's table. Raises ArmPosesError with row and column."""
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -125,38 +125,38 @@ def read_pose_table(folder: Path) -> list[Row]:
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArmPosesError(
-            f"{path}: is not CSV: {error}; save it as comma-separated values"
+            f"{path}: invalid CSV: {error}; save it as comma-separated values"
         ) from error
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
     if unit is None:
         raise ArmPosesError(
-            f"{path}: columns {', '.join(columns) or 'none'}; add j1_deg to j6_deg, or j1_rad to "
-            "j6_rad"
+            f"{path}: found columns {', '.join(columns) or 'none'}; add j1_deg to j6_deg, or "
+            "j1_rad to j6_rad"
         )
     by_pose = all(name in columns for name in BOARD_COLUMNS)
     if not by_pose and not {"left", "right"} <= set(columns):
         raise ArmPosesError(
-            f"{path}: add the columns left and right (images), or {', '.join(BOARD_COLUMNS)}"
+            f"{path}: missing columns; add left and right (images), or {', '.join(BOARD_COLUMNS)}"
         )
     rows = []
     for number, line in enumerate(lines, start=2):
-        joints = _numbers(path, number, line, [f"{joint}_{unit}" for joint in JOINTS])
+        joints = _parse_numbers(path, number, line, [f"{joint}_{unit}" for joint in JOINTS])
         joints_rad = np.radians(joints) if unit == "deg" else joints
         if by_pose:
-            pose = _numbers(path, number, line, BOARD_COLUMNS)
+            pose = _parse_numbers(path, number, line, BOARD_COLUMNS)
             board = transform(rotation_from_vector(pose[3:]), pose[:3])
-            rows.append(Row(f"row {number}", joints_rad, None, board))
+            rows.append(PoseRow(f"row {number}", joints_rad, None, board))
         else:
-            pictures = (folder / (line["left"] or ""), folder / (line["right"] or ""))
-            rows.append(Row(line["left"] or f"row {number}", joints_rad, pictures, None))
+            images = (folder / (line["left"] or ""), folder / (line["right"] or ""))
+            rows.append(PoseRow(line["left"] or f"row {number}", joints_rad, images, None))
     if not rows:
-        raise ArmPosesError(f"{path}: holds no rows; add one for each pose of the arm")
+        raise ArmPosesError(f"{path}: does not contain rows; add one per pose of the arm")
     return rows
 
 
-def _numbers(
+def _parse_numbers(
     path: Path, number: int, line: dict[str, str | None], columns: list[str] | tuple[str, ...]
 ) -> Floats:
     values = []
@@ -167,7 +167,9 @@ def _numbers(
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ArmPosesError(f"{path}: row {number}, column {column}: {text!r} is not a number")
+            raise ArmPosesError(
+                f"{path}: row {number}, column {column}: expected a number, found {text!r}"
+            )
         values.append(value)
     return np.array(values)
 
@@ -175,29 +177,29 @@ def _numbers(
 def read_detections(
     folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
-    """Return a folder's detections, and the names of poses without one with the reasons.
+    """Return a folder's detections, and the poses without one as (name, reason).
 
-    size: required (width, height) px of the images.  Raises ArmPosesError and CalibrationError.
+    size: required (width, height) of the images, px. Raises ArmPosesError and CalibrationError.
     """
     rows = read_pose_table(folder)
-    if rows[0].pictures is None:
+    if rows[0].images is None:
         return [_project_board(row, board, rig) for row in rows], []
-    pictures = [row.pictures for row in rows if row.pictures is not None]
+    images = [row.images for row in rows if row.images is not None]
     pairs, found_size = find_pairs(
-        [left for left, _ in pictures], [right for _, right in pictures], board, progress
+        [left for left, _ in images], [right for _, right in images], board, progress
     )
     if found_size != size:
         raise ArmPosesError(
-            f"{folder}: images of {found_size[0]}x{found_size[1]} px, the camera's calibration "
-            f"is for {size[0]}x{size[1]}: take them at that size"
+            f"{folder}: images of {found_size[0]}x{found_size[1]} px, but the camera's "
+            f"calibration is for {size[0]}x{size[1]}; capture images of that size"
         )
-    seen, blind = [], []
+    detections, missing = [], []
     for row, pair in zip(rows, pairs, strict=True):
         if isinstance(pair, str):
-            blind.append((row.name, pair))
+            missing.append((row.name, pair))
         else:
-            seen.append(_make_detection(row.name, row.joints_rad, pair, board))
-    return seen, blind
+            detections.append(_make_detection(row.name, row.joints_rad, pair, board))
+    return detections, missing
 
 
 def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board) -> BoardDetection:
@@ -210,7 +212,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
     )
 
 
-def _project_board(row: Row, board: Board, rig: LensRig) -> BoardDetection:
+def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
     """Project the board of a row with a board pose into both images, without noise."""
     assert row.left_from_board is not None
     points = board_points(board)
@@ -218,19 +220,19 @@ def _project_board(row: Row, board: Board, rig: LensRig) -> BoardDetection:
     for lens, eye_from_left in ((rig.left, np.eye(4)), (rig.right, rig.right_from_left)):
         in_eye = apply(eye_from_left @ row.left_from_board, points)
         if in_eye[:, 2].min() <= 0.0:
-            raise ArmPosesError(f"{row.name}: the board lies behind a camera; check its pose")
+            raise ArmPosesError(f"{row.name}: the board is behind a camera; check its pose")
         views.append(CornerView(points, project(in_eye, lens.matrix, lens.distortion)))
     return BoardDetection(row.name, row.joints_rad, views[0], views[1])
 
 
 class PoseRecorder:
-    """Record a pose into a folder whenever the arm rests and the board has a new pose.
+    """Recorder of poses to a folder, whenever the arm is at rest and the board's pose is new.
 
-    Joints and images must be given in the order of their times (s, of one clock).
+    Joints and images must be added in the order of their times (s, of one clock).
     """
 
     def __init__(self, folder: Path, board: Board, rig: LensRig) -> None:
-        self.taken = 0
+        self.count = 0
         self._folder, self._board, self._rig = folder, board, rig
         self._finder = CornerFinder(board, quick=True)
         self._joints: Floats | None = None
@@ -238,74 +240,78 @@ class PoseRecorder:
         self._poses: list[Floats] = []
 
     def update_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joints (6,) rad."""
+        """Add measured joints (6,), rad."""
         moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w) each; return a hint for the operator."""
+        """Add an image pair (h, w) each, record it if it is new, and return a hint for the
+        operator.
+        """
         joints = self._joints
         if joints is None:
             return "no message from the arm yet"
         if exposed_s - self._still_since_s < MIN_STILL_S:
-            return "the arm moves"
+            return "the arm is moving"
         pair = match_views(
             self._finder.find(left), self._finder.find(right), self._board, ("left", "right")
         )
         if isinstance(pair, str):
             return pair
-        pose = self._pose(pair)
+        pose = self._estimate_pose(pair)
         if any(_is_same_pose(pose, other) for other in self._poses):
-            return "a similar pose is recorded already; rotate and move the flange"
+            return "a similar pose is already recorded; rotate and move the flange"
         self._write(left, right, joints)
         self._poses.append(pose)
-        return f"pose {self.taken} recorded; rotate and move the flange"
+        return f"pose {self.count} recorded; rotate and move the flange"
 
-    def _pose(self, pair: BoardPair) -> Floats:
-        """Return left_from_board (4, 4) from the left image, to compare poses."""
+    def _estimate_pose(self, pair: BoardPair) -> Floats:
+        """Estimate left_from_board (4, 4) from the left image, to compare poses."""
         points = board_points(self._board)[pair.left.ids]
         lens = self._rig.left
-        _, turn, shift = cv2.solvePnP(points, pair.left.pixels, lens.matrix, lens.distortion)
+        _, rotation, shift = cv2.solvePnP(points, pair.left.pixels, lens.matrix, lens.distortion)
         return transform(
-            rotation_from_vector(np.asarray(turn, np.float64).ravel()),
+            rotation_from_vector(np.asarray(rotation, np.float64).ravel()),
             np.asarray(shift, np.float64).ravel(),
         )
 
     def _write(self, left: Image, right: Image, joints_rad: Floats) -> None:
-        self.taken += 1
-        names = [f"{side}{self.taken:02}.png" for side in ("left", "right")]
-        for name, picture in zip(names, (left, right), strict=True):
-            write_file(self._folder / name, encode_png(picture))
+        self.count += 1
+        names = [f"{side}{self.count:02}.png" for side in ("left", "right")]
+        for name, image in zip(names, (left, right), strict=True):
+            write_file(self._folder / name, encode_png(image))
         add_row(self._folder, names, joints_rad)
 
 
 def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
     """Append a pose to a folder's table; create the table if needed."""
     path = folder / TABLE
-    begun = path.exists()
+    exists = path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        if not begun:
+        if not exists:
             writer.writerow(["left", "right", *(f"{joint}_rad" for joint in JOINTS)])
         writer.writerow([*names, *(repr(float(angle)) for angle in joints_rad)])
 
 
 def _is_same_pose(pose: Floats, other: Floats) -> bool:
-    turn = float(np.linalg.norm(vector_from_rotation(pose[:3, :3].T @ other[:3, :3])))
+    rotation = float(np.linalg.norm(vector_from_rotation(pose[:3, :3].T @ other[:3, :3])))
     return (
-        turn < MIN_NEW_ROTATION_RAD
+        rotation < MIN_NEW_ROTATION_RAD
         and float(np.linalg.norm(pose[:3, 3] - other[:3, 3])) < MIN_NEW_SHIFT_M
     )
 
 
-def true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """Return world_from_base (4, 4) of the simulated arm, which differs from the scene's."""
-    place: Pose = getattr(scene.arms, side).world_from_base
-    given = transform_from_rpy(place.position_m, place.rpy_rad)
+def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
+    """Return world_from_base (4, 4) of the simulated arm, which deviates from the scene's."""
+    pose: Pose = getattr(scene.arms, side).world_from_base
+    nominal = transform_from_rpy(pose.position_m, pose.rpy_rad)
     random = np.random.default_rng([seed, side == "left"])
-    turn = rotation_from_vector(random.normal(0.0, TWIN_BASE_RAD, 3))
-    return transform(turn @ given[:3, :3], given[:3, 3] + random.normal(0.0, TWIN_BASE_M, 3))
+    rotation = rotation_from_vector(random.normal(0.0, SIMULATED_BASE_RAD, 3))
+    return transform(
+        rotation @ nominal[:3, :3], nominal[:3, 3] + random.normal(0.0, SIMULATED_BASE_M, 3)
+    )
 
 
 def simulate_poses(
@@ -313,27 +319,27 @@ def simulate_poses(
 ) -> Iterator[int]:
     """Write images of a board on the simulated arm to a folder; yield the count after each pose.
 
-    The joints have errors of TWIN_JOINT_RAD each, the images blur and noise.  Raises BoardError for
-    a board that cannot be drawn.
+    The joints have errors of SIMULATED_JOINT_RAD, the images blur and noise. Raises BoardError for
+    a board that cannot be rendered.
     """
     random = np.random.default_rng([seed, side == "left", 1])
     camera = make_true_camera(scene.camera)
-    shown = TwinBoard(camera, board, seed=seed)
-    base = true_base(scene, side, seed=seed)
-    place = scene.camera.world_from_left
-    world_from_left = transform_from_rpy(place.position_m, place.rpy_rad)
+    simulated = TwinBoard(camera, board, seed=seed)
+    base = draw_true_base(scene, side, seed=seed)
+    camera_pose = scene.camera.world_from_left
+    world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     ready = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-    # The board is 60 mm before the flange and faces the camera while the arm reaches forward.
+    # Put the board 60 mm in front of the flange, facing the camera while the arm reaches forward.
     flange = base @ twin_forward(ready)
-    held = flange[:3, 3] + 0.06 * flange[:3, 2]
-    facing = transform(world_from_left[:3, :3], held - world_from_left[:3, :3] @ middle)
+    position = flange[:3, 3] + 0.06 * flange[:3, 2]
+    facing = transform(world_from_left[:3, :3], position - world_from_left[:3, :3] @ middle)
     flange_from_board = inverse(flange) @ facing
     done = 0
     while done < places:
-        turn = world_from_left[:3, :3] @ rotation_from_vector(random.normal(0.0, 0.3, 3))
-        centre = held + random.uniform(-0.06, 0.06, 3)
-        board_pose = transform(turn, centre - turn @ middle)
+        rotation = world_from_left[:3, :3] @ rotation_from_vector(random.normal(0.0, 0.3, 3))
+        centre = position + random.uniform(-0.06, 0.06, 3)
+        board_pose = transform(rotation, centre - rotation @ middle)
         try:
             joints = solve_inverse_kinematics(
                 inverse(base) @ board_pose @ inverse(flange_from_board), ready
@@ -341,23 +347,23 @@ def simulate_poses(
         except ValueError:
             continue  # out of reach: draw another pose
         true_joints = np.clip(
-            joints + random.normal(0.0, TWIN_JOINT_RAD, 6), RANGE_RAD[:, 0], RANGE_RAD[:, 1]
+            joints + random.normal(0.0, SIMULATED_JOINT_RAD, 6), RANGE_RAD[:, 0], RANGE_RAD[:, 1]
         )
         left_from_board = (
             inverse(world_from_left) @ base @ twin_forward(true_joints) @ flange_from_board
         )
-        if not _is_in_both_views(shown, left_from_board):
+        if not _is_in_both_views(simulated, left_from_board):
             continue
         done += 1
         names = [f"{one}{done:02}.png" for one in ("left", "right")]
-        for name, picture in zip(names, shown.pair(left_from_board), strict=True):
-            write_file(folder / name, encode_png(picture))
+        for name, image in zip(names, simulated.pair(left_from_board), strict=True):
+            write_file(folder / name, encode_png(image))
         add_row(folder, names, joints)
         yield done
 
 
-def _is_in_both_views(shown: TwinBoard, left_from_board: Floats) -> bool:
-    """Return whether all corners are well inside both images."""
-    size = np.array([shown.camera.width_px, shown.camera.height_px])
-    views = shown.corners(left_from_board)
+def _is_in_both_views(simulated: TwinBoard, left_from_board: Floats) -> bool:
+    """Return whether all corners are at least 40 px inside both images."""
+    size = np.array([simulated.camera.width_px, simulated.camera.height_px])
+    views = simulated.corners(left_from_board)
     return all(((view > 40.0) & (view < size - 40.0)).all() for view in views)

@@ -1,9 +1,9 @@
 """Fit a stereo rig to all corners of all board poses by least squares, with its covariance.
 
-Unknown are the rig (22 numbers, `PARAMETERS`) and the board's pose in each pair (6 numbers).  A
-pair's corners depend on the rig and on that pose only.  The poses are therefore eliminated one by
-one, and a system of 22 equations remains (Schur complement; Triggs et al., Bundle Adjustment: A
-Modern Synthesis, 1999, section 6).  Lens model: pinhole with k1, k2, p1, p2.
+The unknowns are the rig (22 parameters, `PARAMETERS`) and the board's pose in each pair (6). A
+pair's corners depend only on the rig and on that pose, so the poses are eliminated. A system of 22
+equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern Synthesis, 1999,
+section 6). Lens model: pinhole with k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ PARAMETERS = (
     *(f"right.{name}" for name in LENS),
     *(f"right_from_left.{name}" for name in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")),
 )
-"""The rig's numbers in order; rx, ry, rz: rotation vector."""
+"""Names of the rig's parameters in order; rx, ry, rz: rotation vector."""
 
 LEFT, RIGHT, STAND = slice(0, 8), slice(8, 16), slice(16, 22)
 
-STEPS = 50
+MAX_STEPS = 50
 CONVERGED_COST_CHANGE = 1e-9
 """Relative change of the cost that ends the iteration."""
 
 
 class NotDeterminedError(FlexsheetError, ValueError):
-    """Raised when the pairs do not determine all of the rig's numbers."""
+    """Raised when the pairs do not determine all parameters of the rig."""
 
     code = "not-determined"
     remedy = "Add image pairs that differ in tilt and distance."
@@ -45,13 +45,11 @@ class NotDeterminedError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RigFit:
-    """Hold a fitted rig and its residuals.
+    """Fitted rig and its residuals.
 
-    rig: (22,).
-    poses: of the board, (pairs, 6), rotation vector and position in the left camera's frame.
-
-    The other fields are each pair's residuals left and right (n, 2) px, detected minus projected,
-    the standard deviation of one coordinate px, and the rig's covariance (22, 22).
+    rig: (22,). poses: of the board, (pairs, 6), rotation vector and position in the left camera's
+    frame. residuals: per pair, left and right (n, 2), detected minus projected, px. sigma_px:
+    standard deviation of one corner coordinate. covariance: of the rig, (22, 22).
     """
 
     rig: Floats
@@ -61,17 +59,18 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Root mean square distance (pairs, 2) px between detected and projected corners, left and
-        right."""
+        """Return the rms distance (pairs, 2) between detected and projected corners, left and
+        right, px.
+        """
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
-        """Root mean square distance over all corners of both views."""
+        """Return the rms distance between detected and projected corners of both views, px."""
         return rms_distance(np.concatenate([view for views in self.residuals for view in views]))
 
 
-def floats(array: object) -> Floats:
-    """Convert OpenCV's result to an array in double precision."""
+def to_floats(array: object) -> Floats:
+    """Convert an OpenCV result to an array in double precision."""
     return np.asarray(array, dtype=np.float64)
 
 
@@ -81,29 +80,28 @@ def rms_distance(shifts: Floats) -> float:
 
 
 def lens_arrays(lens: Floats) -> tuple[Floats, Floats]:
-    """Return the camera matrix (3, 3) and OpenCV's distortion (5,) of a lens's eight numbers."""
+    """Return the camera matrix (3, 3) and OpenCV's distortion (5,) of a lens (8,)."""
     fx, fy, cx, cy, k1, k2, p1, p2 = lens
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return matrix, np.array([k1, k2, p1, p2, 0.0])
 
 
 def pose_transform(pose: Floats) -> Floats:
-    """Return the transform (4, 4) of a rotation vector and a position (6,)."""
+    """Return the transform (4, 4) of a pose (6,): rotation vector and position."""
     return rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:])
 
 
 def pose_vector(transform: Floats) -> Floats:
-    """Return rotation vector and position (6,) of a transform (4, 4)."""
+    """Return the pose (6,), rotation vector and position, of a transform (4, 4)."""
     return np.concatenate([rigid.vector_from_rotation(transform[:3, :3]), transform[:3, 3]])
 
 
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return pixels (n, 2) of points, and their Jacobians (2n, 6) by the pose and (2n, 8) by the
-    lens."""
+    """Project points to pixels (n, 2), with Jacobians (2n, 6) by pose and (2n, 8) by lens."""
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
-    slopes = floats(slope)
-    return floats(pixels)[:, 0], slopes[:, :6], slopes[:, 6:14]
+    slopes = to_floats(slope)
+    return to_floats(pixels)[:, 0], slopes[:, :6], slopes[:, 6:14]
 
 
 def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
@@ -117,8 +115,7 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """Hold a pair at the present estimate: shifts (m,) px, Jacobians (m, 22) by rig, (m, 6) by
-    pose."""
+    """Linearized residuals of a pair: shifts (m,) px, Jacobians (m, 22) by rig, (m, 6) by pose."""
 
     shifts: Floats
     by_rig: Floats
@@ -126,7 +123,10 @@ class Linearized:
 
 
 def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Linearized:
-    """Linearize a pair's corners at a rig (22,) and a pose (6,); board: its corners (n, 3) m."""
+    """Linearize a pair's residuals at a rig (22,) and pose (6,).
+
+    board: its corners (n, 3), m.
+    """
     left_points, right_points = board[pair.left.ids], board[pair.right.ids]
     left, left_by_pose, left_by_lens = _project(left_points, pose, rig[LEFT])
     in_right, by_pose, by_stand = _compose(pose, rig[STAND])
@@ -147,13 +147,10 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """Hold the normal equations with the poses eliminated.
+    """Normal equations with the poses eliminated.
 
-    matrix: (22, 22).
-    side: (22,).
-
-    For each pose it also holds the inverse of its block (6, 6), its gradient (6,) and its coupling
-    (22, 6).
+    matrix: (22, 22). side: (22,). poses: for each, the inverse of its block (6, 6), its gradient
+    (6,) and its coupling (22, 6).
     """
 
     matrix: Floats
@@ -162,12 +159,14 @@ class _Reduced:
 
 
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
-    """Make the Levenberg-Marquardt equations: the diagonal is raised by the fraction `damping`."""
+    """Make the Levenberg-Marquardt equations, with the diagonal increased by the fraction
+    `damping`.
+    """
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
     for pair in pairs:
         own = pair.by_pose.T @ pair.by_pose
-        inverse = floats(np.linalg.inv(own + damping * np.diag(np.diag(own))))
+        inverse = to_floats(np.linalg.inv(own + damping * np.diag(np.diag(own))))
         coupling = pair.by_rig.T @ pair.by_pose
         slope = pair.by_pose.T @ pair.shifts
         whole = pair.by_rig.T @ pair.by_rig
@@ -178,66 +177,66 @@ def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
 
 
 def _scaled_inverse(matrix: Floats) -> Floats:
-    """Invert a symmetric positive matrix whose rows have very different units.
+    """Invert a symmetric positive definite matrix whose rows have very different units.
 
-    Raises NotDeterminedError for one that is not positive, or is nearly singular.
+    Raises NotDeterminedError for a matrix that is not positive definite or is nearly singular.
     """
     scale = np.sqrt(np.diag(matrix))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise NotDeterminedError("a number of the rig changes no corner")
+        raise NotDeterminedError("a parameter of the rig has no effect on the corners")
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     if values[0] < 1e-12:
         weakest = PARAMETERS[int(np.argmax(np.abs(vectors[:, 0] / scale) * scale))]
-        raise NotDeterminedError(f"{weakest} cannot be told from the others")
+        raise NotDeterminedError(f"{weakest} cannot be separated from the other parameters")
     inverse = (vectors / values) @ vectors.T
     return np.asarray(inverse / np.outer(scale, scale), dtype=np.float64)
 
 
 def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Floats) -> RigFit:
-    """Fit the rig and the poses to all corners, from a start; board: its corners (n, 3) m.
+    """Fit the rig and the poses to all corners from initial values (Levenberg-Marquardt).
 
-    Levenberg-Marquardt.  Raises NotDeterminedError where the pairs do not determine the rig.
+    board: its corners (n, 3), m. Raises NotDeterminedError.
     """
     rig, poses = rig.copy(), poses.copy()
 
-    def at(rig: Floats, poses: Floats) -> list[Linearized]:
+    def linearize_all(rig: Floats, poses: Floats) -> list[Linearized]:
         return [linearize(one, board, rig, pose) for one, pose in zip(pairs, poses, strict=True)]
 
-    present = at(rig, poses)
-    cost = sum(float(pair.shifts @ pair.shifts) for pair in present)
+    current = linearize_all(rig, poses)
+    cost = sum(float(pair.shifts @ pair.shifts) for pair in current)
     damping = 1e-4
-    for _ in range(STEPS):
-        reduced = _eliminate_poses(present, damping)
+    for _ in range(MAX_STEPS):
+        reduced = _eliminate_poses(current, damping)
         step = _scaled_inverse(reduced.matrix) @ reduced.side
         moves = np.array([i @ (slope - c.T @ step) for i, slope, c in reduced.poses])
-        tried = at(rig + step, poses + moves)
-        tried_cost = sum(float(pair.shifts @ pair.shifts) for pair in tried)
-        if not tried_cost < cost:
-            if damping > 1e6 or tried_cost - cost < CONVERGED_COST_CHANGE * cost:
+        trial = linearize_all(rig + step, poses + moves)
+        trial_cost = sum(float(pair.shifts @ pair.shifts) for pair in trial)
+        if not trial_cost < cost:
+            if damping > 1e6 or trial_cost - cost < CONVERGED_COST_CHANGE * cost:
                 break
             damping *= 10.0
             continue
-        gained = cost - tried_cost
-        rig, poses, present, cost = rig + step, poses + moves, tried, tried_cost
+        gained = cost - trial_cost
+        rig, poses, current, cost = rig + step, poses + moves, trial, trial_cost
         damping = max(0.1 * damping, 1e-12)
         if gained < CONVERGED_COST_CHANGE * cost:
             break
-    numbers = sum(len(pair.shifts) for pair in present)
+    numbers = sum(len(pair.shifts) for pair in current)
     freedom = numbers - len(PARAMETERS) - poses.size
     if freedom < 1:
-        raise NotDeterminedError(f"{numbers} coordinates for {numbers - freedom} unknowns")
+        raise NotDeterminedError(f"{numbers} corner coordinates, {numbers - freedom} unknowns")
     variance = cost / freedom
     return RigFit(
         rig=rig,
         poses=poses,
-        residuals=tuple(_by_view(one, pair) for one, pair in zip(present, pairs, strict=True)),
+        residuals=tuple(_split_views(one, pair) for one, pair in zip(current, pairs, strict=True)),
         sigma_px=float(np.sqrt(variance)),
-        covariance=variance * _scaled_inverse(_eliminate_poses(present, 0.0).matrix),
+        covariance=variance * _scaled_inverse(_eliminate_poses(current, 0.0).matrix),
     )
 
 
-def _by_view(present: Linearized, pair: BoardPair) -> tuple[Floats, Floats]:
-    shifts = present.shifts.reshape(-1, 2)
+def _split_views(linearized: Linearized, pair: BoardPair) -> tuple[Floats, Floats]:
+    shifts = linearized.shifts.reshape(-1, 2)
     split = len(pair.left.ids)
     return shifts[:split], shifts[split:]
 

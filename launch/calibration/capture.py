@@ -1,7 +1,7 @@
-"""Select board pairs during live capture: track the coverage and decide when to take a pair.
+"""Select board pairs during live capture, by coverage.
 
-A pair is taken when the board is still at a new pose and adds coverage: of the cells of each image,
-of tilts, of distances, or of the number of pairs.
+A pair is accepted if the board is at rest in a new pose and adds coverage: image cells, tilts,
+distances, or the number of pairs.
 """
 
 from __future__ import annotations
@@ -21,66 +21,66 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLUMNS, ROWS = 4, 3
-"""Number of cells of an image."""
+"""Columns and rows of the coverage cells of an image."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""The board is still when its corners move by less than this from image to image."""
+"""Maximum corner motion between images of a board at rest, px."""
 
 NEW_POSE_PX = 12.0
-"""A board pose is new when its corners are farther than this from those of any taken pair."""
+"""Minimum corner distance between a new board pose and every accepted one, px."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""Fractions of the image's diagonal that the upright board's diagonal covers."""
+"""Limits of the near and far distances: board diagonal over image diagonal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Hold a quantity to be covered: group ("left cell", "right cell", "tilt", "distance", "pairs")
-    and name.
+    """Quantity to be covered by pairs.
 
-    A cell's name is its column and row.
+    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: of a cell, column and
+    row.
     """
 
     group: str
     name: str
 
 
-def needed(pairs: int) -> dict[Bin, int]:
-    """Return how often each bin must be covered for `pairs` pairs.
+def compute_required_counts(pairs: int) -> dict[Bin, int]:
+    """Return the required number of pairs per bin, for `pairs` pairs.
 
-    Cells that only one camera sees at most distances (the left image's left edge, the right image's
-    right edge) are not required.
+    Excludes the left image's left edge and the right image's right edge, which at most distances
+    only one camera sees.
     """
-    often = max(1, round(0.1 * pairs))
-    wanted = {Bin("pairs", ""): pairs}
+    count = max(1, round(0.1 * pairs))
+    required = {Bin("pairs", ""): pairs}
     for row in range(ROWS):
         for column in range(COLUMNS):
             if column > 0:
-                wanted[Bin("left cell", f"{column},{row}")] = often
+                required[Bin("left cell", f"{column},{row}")] = count
             if column < COLUMNS - 1:
-                wanted[Bin("right cell", f"{column},{row}")] = often
-    wanted.update({Bin("tilt", name): often for name in TILTS})
-    wanted.update({Bin("distance", name): often for name in DISTANCES})
-    return wanted
+                required[Bin("right cell", f"{column},{row}")] = count
+    required.update({Bin("tilt", name): count for name in TILTS})
+    required.update({Bin("distance", name): count for name in DISTANCES})
+    return required
 
 
 @dataclass(frozen=True, slots=True)
 class PairAssessment:
-    """Hold the assessment of one image pair.
+    """Assessment of one image pair.
 
-    hint: what the person should do with the board.
+    hint: instruction to the user about the next board pose.
     """
 
-    taken: bool
+    accepted: bool
     hint: str
 
 
 class Capture:
-    """Assess image pairs and select those to take."""
+    """Selector of image pairs for a calibration, which counts the coverage."""
 
     def __init__(
         self,
@@ -89,59 +89,62 @@ class Capture:
         lens: Lens,
         size: tuple[int, int],
         pairs: int = 20,
-        still_pictures: int = 4,
+        still_images: int = 4,
     ) -> None:
-        """lens: of the left camera, approximately.  still_pictures: consecutive still images before
-        a pair is taken."""
+        """Create a selector without pairs.
+
+        lens: of the left camera, approximate. still_images: number of consecutive images of a board
+        at rest that a pair requires.
+        """
         self.board = board
-        self.needed = needed(pairs)
+        self.needed = compute_required_counts(pairs)
         self.counts: Counter[Bin] = Counter()
         self._lens = np.array(
             [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion[:4]]
         )
-        self._size, self._still_pictures = size, still_pictures
+        self._size, self._still_images = size, still_images
         self._finder = CornerFinder(board, quick=True)
         self._points = board_points(board)
         self._middle = self._points.mean(axis=0)
         self._before: BoardPair | None = None
         self._still = 0
-        self._taken: list[BoardPair] = []
+        self._accepted: list[BoardPair] = []
 
     @property
     def complete(self) -> bool:
         return not self.missing()
 
     def missing(self) -> list[Bin]:
-        """Return the bins that lack coverage, in the order in which they are requested."""
-        return [one for one, often in self.needed.items() if self.counts[one] < often]
+        """Return the bins with missing coverage, in the order of the requests to the user."""
+        return [one for one, count in self.needed.items() if self.counts[one] < count]
 
-    def see(self, left: Image, right: Image) -> PairAssessment:
-        """Assess a pair of grey images (h, w); a taken one is counted."""
+    def add_pair(self, left: Image, right: Image) -> PairAssessment:
+        """Assess a pair of grey images (h, w), and add it to the coverage if it is accepted."""
         views = self._finder.find(left), self._finder.find(right)
-        pair = match_views(*views, self.board, ("the left picture", "the right picture"))
+        pair = match_views(*views, self.board, ("the left image", "the right image"))
         if isinstance(pair, str):
             self._before, self._still = None, 0
             return PairAssessment(False, pair)
-        moved_px = np.inf if self._before is None else _shift(pair, self._before)
+        moved_px = np.inf if self._before is None else _measure_shift(pair, self._before)
         self._before = pair
         self._still = self._still + 1 if moved_px < STILL_PX else 1
-        if any(_shift(pair, one) < NEW_POSE_PX for one in self._taken):
-            return PairAssessment(False, self.advice("taken from here; "))
-        bins = self.bins_of(pair)
+        if any(_measure_shift(pair, one) < NEW_POSE_PX for one in self._accepted):
+            return PairAssessment(False, self._make_hint("pose already captured; "))
+        bins = self._find_bins(pair)
         adds = [one for one in bins if self.counts[one] < self.needed.get(one, 0)]
         if not adds:
-            return PairAssessment(False, self.advice("nothing new here; "))
-        if self._still < self._still_pictures:
-            return PairAssessment(False, "hold still")
+            return PairAssessment(False, self._make_hint("no new coverage; "))
+        if self._still < self._still_images:
+            return PairAssessment(False, "keep the board still")
         self.counts.update(bins)
-        self._taken.append(pair)
-        return PairAssessment(True, self.advice("taken; "))
+        self._accepted.append(pair)
+        return PairAssessment(True, self._make_hint("accepted; "))
 
-    def bins_of(self, pair: BoardPair) -> list[Bin]:
+    def _find_bins(self, pair: BoardPair) -> list[Bin]:
         """Return the bins that a pair covers."""
         pose = board_pose(pair.left, self._points, self._lens)
         bins = [Bin("pairs", ""), Bin("tilt", classify_tilt(pose, self._middle))]
-        bins.append(Bin("distance", self._distance(pose)))
+        bins.append(Bin("distance", self._classify_distance(pose)))
         for group, view in (("left cell", pair.left), ("right cell", pair.right)):
             cell = np.floor(view.pixels / self._size * [COLUMNS, ROWS]).astype(int)
             cell = np.clip(cell, 0, [COLUMNS - 1, ROWS - 1])
@@ -153,36 +156,37 @@ class Capture:
             ]
         return bins
 
-    def _distance(self, pose: Floats) -> str:
+    def _classify_distance(self, pose: Floats) -> str:
         middle = pose_transform(pose) @ [*self._middle, 1.0]
         diagonal_m = self.board.square_m * np.hypot(self.board.columns + 1, self.board.rows + 1)
         fraction = self._lens[0] * diagonal_m / middle[2] / np.hypot(*self._size)
         return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
-    def advice(self, before: str) -> str:
-        """Return what to do with the board next, after the words `before`."""
+    def _make_hint(self, prefix: str) -> str:
+        """Return the next instruction to the user, after the text `prefix`."""
         missing = self.missing()
         if not missing:
-            return before + "all is covered"
+            return prefix + "coverage complete"
         groups = {one.group: one for one in reversed(missing)}
         for group in ("tilt", "distance"):
             if group in groups:
-                return f"{before}show the board {_as_order(groups[group])}"
+                return f"{prefix}show the board {_describe_pose(groups[group])}"
         for side in ("left", "right"):
             if f"{side} cell" in groups:
-                return f"{before}show the board {place(groups[f'{side} cell'])} the {side} picture"
-        return before + "show the board somewhere else"
+                cell = _describe_cell(groups[f"{side} cell"])
+                return f"{prefix}show the board {cell} the {side} image"
+        return prefix + "show the board in another pose"
 
 
-def _as_order(one: Bin) -> str:
-    orders = {"upright": "straight on", "near": "nearer", "far": "further away"}
+def _describe_pose(one: Bin) -> str:
+    phrases = {"upright": "facing the camera", "near": "nearer", "far": "further away"}
     if one.name == "middle":
         return "at middle distance"
-    return orders.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
+    return phrases.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
 
 
-def place(cell: Bin) -> str:
-    """Describe the position of a cell: "at the top left of"."""
+def _describe_cell(cell: Bin) -> str:
+    """Describe the position of a cell, such as "at the top left of"."""
     column, row = (int(part) for part in cell.name.split(","))
     height = ("top", "middle", "bottom")[row]
     across = ("left", "centre left", "centre right", "right")[column]
@@ -192,10 +196,8 @@ def place(cell: Bin) -> str:
 def classify_tilt(pose: Floats, middle: Floats) -> str:
     """Classify the tilt of a board pose (6,) in the left camera's frame as one of TILTS.
 
-    It uses the board's normal, pointing towards the camera, so that the rotation of the board
-    within its plane has no effect.
-
-    middle: centre of the board (3,), in its own frame.
+    Uses the board's normal towards the camera, so rotation within the board's plane has no effect.
+    middle: centre of the board (3,) in its own frame, m.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]
@@ -211,8 +213,8 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
     return "top back" if aside[1] < 0 else "bottom back"
 
 
-def _shift(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median distance px by which common corners have moved; infinite without any."""
+def _measure_shift(pair: BoardPair, other: BoardPair) -> float:
+    """Return the median displacement of common corners, px; infinite without common corners."""
     _, here, there = np.intersect1d(
         pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
     )

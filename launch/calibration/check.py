@@ -1,7 +1,7 @@
-"""Evaluate a calibration by measuring a board of known size.
+"""Evaluate a stereo calibration by measuring a board of known size.
 
-Pairs that made the calibration give too small errors.  `check_stereo` is therefore for other pairs,
-and `cross_check` leaves each pair out in turn and measures it with the calibration of the rest.
+Errors on pairs used to calibrate are too small. So `check_stereo` is for other pairs, and
+`cross_check` measures each pair with a calibration from the remaining pairs.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from flexsheet.launch.calibration.bundle import (
     LEFT,
     RIGHT,
     STAND,
-    floats,
     lens_arrays,
     pose_transform,
+    to_floats,
 )
 from flexsheet.launch.calibration.corners import (
     BoardPair,
     BoardView,
     CalibrationError,
     Progress,
+    align_numbering,
     board_points,
     compute_digest,
     find_pairs,
     ignore_progress,
     read_gray,
-    same_order,
 )
 from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
@@ -42,21 +42,21 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """Hold a rig in OpenCV's form: matrices (3, 3), distortions (5,), a transform (4, 4)."""
+    """Rig in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
     right_from_left: Floats
 
     @staticmethod
-    def of(numbers: Floats) -> StereoRig:
-        """Make it from the 22 numbers of a fit."""
+    def from_fit(numbers: Floats) -> StereoRig:
+        """Make the rig from the 22 parameters of a fit."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
         return StereoRig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
     @staticmethod
-    def calibrated(calibration: StereoCalibration) -> StereoRig:
-        """Make it from a calibration file."""
+    def from_calibration(calibration: StereoCalibration) -> StereoRig:
+        """Make the rig from a calibration file."""
         left, right = (
             np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
             for lens in (calibration.left, calibration.right)
@@ -67,7 +67,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """Hold a board as measured by a rig: errors in m and px, each array of any length."""
+    """Errors of a board measured by a rig, m and px; the arrays have different lengths."""
 
     squares_m: Floats
     diagonals_m: Floats
@@ -77,8 +77,7 @@ class BoardMeasurement:
 
 
 def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
-    """Triangulate pixels (n, 2) into points (n, 3) in the left camera's frame, m: undistorted,
-    linear."""
+    """Triangulate pixels (n, 2) linearly into points (n, 3) in the left camera's frame, m."""
     normalized = [
         cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0].T
         for pixels, matrix, distortion in zip(
@@ -89,9 +88,8 @@ def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
     return np.asarray((points[:3] / points[3]).T, dtype=np.float64)
 
 
-def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
-    """Return distances (n,) left after the best rigid motion of `model` (n, 3) onto `points` (n,
-    3).
+def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
+    """Return distances (n,) after the best rigid fit of `model` (n, 3) to `points` (n, 3).
 
     Source: Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
     """
@@ -102,48 +100,49 @@ def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
 
 
 def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasurement:
-    """Measure the corners that both views of a pair show."""
+    """Measure the corners that are visible in both views of a pair."""
     ids, left, right = pair.common()
     points = triangulate_corners(rig, left, right)
-    place = {int(corner): number for number, corner in enumerate(ids)}
+    row = {int(corner): number for number, corner in enumerate(ids)}
     squares, diagonals = [], []
-    for corner, here in place.items():
+    for corner, here in row.items():
         column = corner % board.columns
         for step, within in ((1, column + 1 < board.columns), (board.columns, True)):
-            there = place.get(corner + step)
+            there = row.get(corner + step)
             if within and there is not None:
                 squares.append(np.linalg.norm(points[there] - points[here]) - board.square_m)
     last = board.columns * board.rows - 1
     length_m = board.square_m * float(np.hypot(board.columns - 1, board.rows - 1))
     for ends in ((0, last), (board.columns - 1, last - board.columns + 1)):
-        if ends[0] in place and ends[1] in place:
-            span = points[place[ends[1]]] - points[place[ends[0]]]
+        if ends[0] in row and ends[1] in row:
+            span = points[row[ends[1]]] - points[row[ends[0]]]
             diagonals.append(np.linalg.norm(span) - length_m)
     return BoardMeasurement(
         squares_m=np.array(squares),
         diagonals_m=np.array(diagonals),
-        rigid_fit_m=rigid_fit_residuals(points, board_points(board)[ids]),
-        reprojection_px=_reprojection(rig, left, right, points),
+        rigid_fit_m=compute_rigid_residuals(points, board_points(board)[ids]),
+        reprojection_px=_measure_reprojection(rig, left, right, points),
         distance_m=float(np.median(points[:, 2])),
     )
 
 
-def _reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Return distances (2n,) px between detected corners and projected points, left and right."""
+def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
+    """Return distances (2n,) between detected corners and projected points, left and right, px."""
     distances = []
     stands = (np.eye(4), rig.right_from_left)
-    for seen, matrix, distortion, stand in zip(
+    for pixels, matrix, distortion, stand in zip(
         (left, right), rig.matrices, rig.distortions, stands, strict=True
     ):
         rotation, _ = cv2.Rodrigues(stand[:3, :3])
-        drawn = cv2.projectPoints(points, rotation, stand[:3, 3], matrix, distortion)[0][:, 0]
-        distances.append(np.linalg.norm(drawn - seen, axis=1))
+        projected = cv2.projectPoints(points, rotation, stand[:3, 3], matrix, distortion)[0][:, 0]
+        distances.append(np.linalg.norm(projected - pixels, axis=1))
     return np.concatenate(distances)
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square; None for no values: a partly visible ChArUco board has no
-    diagonals."""
+    """Return the root mean square, or None without values (a partly visible board has no
+    diagonals).
+    """
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -152,13 +151,12 @@ def _in_mm(values: Floats) -> float | None:
     return None if rms is None else 1e3 * rms
 
 
-def summary(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
+def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
     """Return root mean squares over all boards.
 
-    square_rms_mm: error of the distances of neighbouring corners.
-    diagonal_rms_mm: error of both diagonals of the board.
-    rigid_fit_rms_mm: error of the corners after a rigid fit of the board.
-    reprojection_rms_px: error of the triangulate_corners corners.
+    square_rms_mm: of the distance errors between neighbouring corners. diagonal_rms_mm: of the
+    length errors of the board's diagonals. rigid_fit_rms_mm: of the corner errors after a rigid fit
+    of the board. reprojection_rms_px: of the triangulated corners.
     """
     return {
         "pairs": len(boards),
@@ -178,41 +176,40 @@ def check_stereo(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> dict[str, float | int | list[str] | None]:
-    """Measure a board of known size with a calibration, on images that did not make it.
+    """Measure a board of known size with a calibration, in images not used to calibrate.
 
-    The result holds the `summary` of the pairs, and used_to_calibrate: names of left images that
-    made the calibration and thus give too small errors.
-
-    Raises CalibrationError for images of another size, or without a board in any pair.
+    Returns the values of `summarize`, and used_to_calibrate: the left images that the calibration
+    was made from, whose errors are too small. Raises CalibrationError for images of another size,
+    and if no pair shows the board.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):
         raise CalibrationError(
-            f"pictures of {size[0]}x{size[1]} px, calibration of {calibration.device} for "
+            f"images of {size[0]}x{size[1]} px, but the calibration of {calibration.device} is for "
             f"{calibration.width_px}x{calibration.height_px} px"
         )
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     if not pairs:
-        raise CalibrationError(f"no usable pair of {len(found)}: {found[0]}")
+        raise CalibrationError(f"none of the {len(found)} pairs is usable; the first: {found[0]}")
     used = {pair.digest for pair in calibration.pairs if pair.used}
-    again = [
+    reused = [
         left.name
         for left, right in zip(left_paths, right_paths, strict=True)
         if compute_digest(left, right) in used
     ]
-    rig = StereoRig.calibrated(calibration)
+    rig = StereoRig.from_calibration(calibration)
     return {
-        **summary([measure_board(rig, pair, board) for pair in pairs]),
-        "used_to_calibrate": again,
+        **summarize([measure_board(rig, pair, board) for pair in pairs]),
+        "used_to_calibrate": reused,
     }
 
 
 def calibrate_plain_opencv(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """Calibrate with OpenCV as in its tutorials, for comparison: intrinsics first, then fixed.
+    """Calibrate as in OpenCV's tutorials, for comparison: intrinsics first, then with them fixed.
 
-    points: the board's corners (n, 3) m.
+    points: the board's corners (n, 3), m.
     """
     model = [points[pair.left.ids].astype(np.float32) for pair in pairs]
     left = [pair.left.pixels.astype(np.float32) for pair in pairs]
@@ -231,8 +228,8 @@ def calibrate_plain_opencv(
         flags=cv2.CALIB_FIX_INTRINSIC,
     )
     return StereoRig(
-        (floats(left_matrix), floats(right_matrix)),
-        (floats(left_distortion).ravel()[:5], floats(right_distortion).ravel()[:5]),
+        (to_floats(left_matrix), to_floats(right_matrix)),
+        (to_floats(left_distortion).ravel()[:5], to_floats(right_distortion).ravel()[:5]),
         np.block([[rotation, position], [np.zeros((1, 3)), np.ones((1, 1))]]),
     )
 
@@ -241,8 +238,7 @@ PLAIN_HALF_WINDOW_PX = 5
 
 
 def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """Find a chessboard's corners as in OpenCV's tutorials: refined in a window of 11 px
-    everywhere."""
+    """Find chessboard corners as in OpenCV's tutorials: refined in a fixed window of 11 px."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
     window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
     views = []
@@ -255,7 +251,7 @@ def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | Non
         views.append(refined.reshape(-1, 2).astype(np.float64))
     ids = np.arange(board.columns * board.rows)
     return BoardPair(
-        BoardView(ids, views[0]), BoardView(ids, same_order(views[0], views[1], board))
+        BoardView(ids, views[0]), BoardView(ids, align_numbering(views[0], views[1], board))
     )
 
 
@@ -267,20 +263,18 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Leave pairs out in turn, `leave_out` at a time, and measure them with the calibration of the
-    rest.
+    """Cross-validate: calibrate without `leave_out` pairs at a time, and measure those pairs.
 
-    The i-th, i+G-th, ... pair are left out together, so that similar neighbouring images are not.
-    The same is done with plain OpenCV, except for ChArUco boards.
-
-    Raises CalibrationError when the images cannot be used or too few pairs remain.
+    Excludes the pairs i, i+G, i+2G, ... together, so that similar consecutive images are not
+    excluded together. For chessboards, repeats this with plain OpenCV. Raises CalibrationError for
+    unusable images, and if too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
     if len(whole) - leave_out < MIN_PAIRS or leave_out < 1:
         raise CalibrationError(
-            f"{len(whole)} usable pairs of {len(found)}, {leave_out} of them left out at a time: "
-            f"at least {MIN_PAIRS} must remain to calibrate with; take more pictures"
+            f"{len(whole)} of {len(found)} pairs are usable, {leave_out} are excluded at a time; "
+            f"at least {MIN_PAIRS} must remain to calibrate; capture more images"
         )
     points = board_points(board)
     plain: dict[int, BoardPair] = {}
@@ -291,27 +285,33 @@ def cross_check(
                 plain[i] = pair
     numbers = list(whole)
     groups = -(-len(numbers) // leave_out)
-    ours: dict[int, BoardMeasurement] = {}
-    theirs: dict[int, BoardMeasurement] = {}
+    measured: dict[int, BoardMeasurement] = {}
+    plain_measured: dict[int, BoardMeasurement] = {}
     for group in range(groups):
         out = numbers[group::groups]
-        kept = [i for i in numbers if i not in out]
-        selection = PairSelection([whole[i] for i in kept], [left_paths[i].name for i in kept])
-        rig = StereoRig.of(fit_selection(selection, points, size).rig)
-        ours.update({i: measure_board(rig, whole[i], board) for i in out})
+        rest = [i for i in numbers if i not in out]
+        selection = PairSelection([whole[i] for i in rest], [left_paths[i].name for i in rest])
+        rig = StereoRig.from_fit(fit_selection(selection, points, size).rig)
+        measured.update({i: measure_board(rig, whole[i], board) for i in out})
         if plain:
-            yardstick = calibrate_plain_opencv([plain[i] for i in kept if i in plain], points, size)
-            theirs.update({i: measure_board(yardstick, plain[i], board) for i in out if i in plain})
-        progress(group + 1, groups, "leaving pairs out")
+            plain_rig = calibrate_plain_opencv([plain[i] for i in rest if i in plain], points, size)
+            plain_measured |= {
+                i: measure_board(plain_rig, plain[i], board) for i in out if i in plain
+            }
+        progress(group + 1, groups, "cross-validating")
     return {
-        **summary(list(ours.values())),
-        "calibrate_plain_opencv": summary(list(theirs.values())) if theirs else None,
+        **summarize(list(measured.values())),
+        "calibrate_plain_opencv": (
+            summarize(list(plain_measured.values())) if plain_measured else None
+        ),
         "rows": [
             {
                 "left": left_paths[i].name,
-                "distance_m": ours[i].distance_m,
-                "rigid_fit_rms_mm": _in_mm(ours[i].rigid_fit_m),
-                "plain_rigid_fit_rms_mm": _in_mm(theirs[i].rigid_fit_m) if i in theirs else None,
+                "distance_m": measured[i].distance_m,
+                "rigid_fit_rms_mm": _in_mm(measured[i].rigid_fit_m),
+                "plain_rigid_fit_rms_mm": (
+                    _in_mm(plain_measured[i].rigid_fit_m) if i in plain_measured else None
+                ),
             }
             for i in numbers
         ],

@@ -1,7 +1,7 @@
-"""Detect corners of calibration boards: whole chessboards, and ChArUco boards seen in part.
+"""Detect the corners of calibration boards: complete chessboards and partly visible ChArUco boards.
 
-A corner's id counts along the board's columns first, so that it is the row of `board_points`.  The
-same id is the same corner in every image.
+A corner's id is its row in `board_points`, counted along the board's columns first. It denotes the
+same corner in every image.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
-"""Called with (steps done, number of steps, description of the last step)."""
+"""Progress callback of (steps done, number of steps, description of the last step)."""
 
 SCALE = 2
-"""Corners are refined in an image enlarged by this factor.  OpenCV's refinement interpolates
-linearly between pixels, which shifts corners by 0.015 px and the board's size by 3e-5.  Markers are
-also found earlier in a larger image."""
+"""Enlargement of the image for corner refinement.
+
+OpenCV's refinement interpolates linearly between pixels, which shifts corners by 0.015 px and
+changes the board's size by 3e-5. Enlarged images also have more detectable markers.
+"""
 
 MIN_CORNERS = 8
-"""Minimum number of a ChArUco board's corners in a view; fewer do not determine its pose well."""
+"""Minimum number of ChArUco corners in a view; fewer do not determine its pose well."""
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
-"""Bounds of the refinement window, in pixels of the enlarged image."""
+"""Bounds of the refinement window's half side, in pixels of the enlarged image."""
 
 MAX_REFINEMENT_PX = 1.0
-"""A ChArUco corner that refinement moves farther was drawn to another edge, and is dropped."""
+"""Maximum shift of a ChArUco corner by refinement, px; larger shifts follow another edge."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""Standard deviations of the smoothing; markers are nearer to the corners than neighbouring
-corners."""
+"""Standard deviations of the smoothing, px; ChArUco markers are closer than the next corners."""
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
 class CalibrationError(FlexsheetError, ValueError):
-    """Raised for images that cannot be used for calibration; the message says which and what to
-    do."""
+    """Raised for images that cannot be used for calibration."""
 
     code = "calibration"
     remedy = (
-        "Take sharp images of the whole board in many tilts. Check `--board` (inner corners) and "
-        "`--square-mm`."
+        "Capture sharp images of the whole board at different tilts. Check `--board` (inner "
+        "corners) and `--square-mm`."
     )
 
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """Hold the board's corners in one image: ids (n,), ascending, and pixels (n, 2)."""
+    """Corners of the board in one image: ids (n,), ascending, and pixels (n, 2)."""
 
     ids: Ids
     pixels: Floats
@@ -67,13 +67,13 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class BoardPair:
-    """Hold one pose of the board in both images; of a ChArUco board each may show other corners."""
+    """One pose of the board in both images, whose corner ids may differ for a ChArUco board."""
 
     left: BoardView
     right: BoardView
 
     def common(self) -> tuple[Ids, Floats, Floats]:
-        """Return the corners that both views show: ids (n,), left and right pixels (n, 2)."""
+        """Return the corners visible in both views: ids (n,), left and right pixels (n, 2)."""
         ids, in_left, in_right = np.intersect1d(
             self.left.ids, self.right.ids, assume_unique=True, return_indices=True
         )
@@ -85,7 +85,7 @@ def ignore_progress(done: int, total: int, what: str) -> None:
 
 
 def board_points(board: Board) -> Floats:
-    """Return corners (rows*columns, 3) in the board's frame, m: along the columns first."""
+    """Return corners (rows*columns, 3) in the board's frame, m, along the columns first."""
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
     points[:, :2] = grid * board.square_m
@@ -93,49 +93,51 @@ def board_points(board: Board) -> Floats:
 
 
 def describe(board: Board) -> str:
-    """Describe the board: "chessboard of 9x6 inner corners"."""
+    """Describe the board, such as "chessboard of 9x6 inner corners"."""
     name = {"chessboard": "chessboard", "charuco": "ChArUco board"}[board.kind]
     return f"{name} of {board.columns}x{board.rows} inner corners"
 
 
-def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's board; raises CalibrationError for an unknown or too small dictionary."""
+def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
+    """Make OpenCV's board; CalibrationError for an unknown or too small dictionary."""
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
         raise CalibrationError(
-            f"ChArUco board with markers of {board.marker_m} m from dictionary "
-            f"{board.dictionary!r}: give the markers' side and a name of OpenCV's, as DICT_4X4_50"
+            f"ChArUco board with markers of {board.marker_m} m, dictionary {board.dictionary!r}: "
+            "give the marker size and an OpenCV dictionary, such as DICT_4X4_50"
         )
     if board.marker_m >= board.square_m:
         raise CalibrationError(
             f"markers of {1e3 * board.marker_m:g} mm do not fit into squares of "
-            f"{1e3 * board.square_m:g} mm: measure both again"
+            f"{1e3 * board.square_m:g} mm: check both sizes"
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     squares = (board.columns + 1, board.rows + 1)
-    needed, held = squares[0] * squares[1] // 2, len(dictionary.bytesList)
-    if needed > held:
+    needed, available = squares[0] * squares[1] // 2, len(dictionary.bytesList)
+    if needed > available:
         raise CalibrationError(
-            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, {name} holds "
-            f"{held}: take a larger dictionary"
+            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, {name} contains "
+            f"{available}; choose a larger dictionary"
         )
     return cv2.aruco.CharucoBoard(squares, board.square_m, board.marker_m, dictionary)
 
 
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Make a detector that finds a corner from one marker beside it; errors are refined or dropped.
+    """Make a detector that needs one marker per corner; wrong corners are refined or dropped later.
 
-    With OpenCV's default of two markers, a quarter fewer corners are found, most at the image's
-    edge.
+    OpenCV's default of two markers finds a quarter fewer corners, mostly at the image's edge.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
-    return cv2.aruco.CharucoDetector(charuco_board(board), parameters)
+    return cv2.aruco.CharucoDetector(make_charuco_board(board), parameters)
 
 
 class CornerFinder:
-    """Find one kind of board in images; `quick` gives up early on images without one."""
+    """Detector of the corners of one kind of board.
+
+    quick: use OpenCV's fast check, which rejects images without a board early.
+    """
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
         self.board = board
@@ -145,12 +147,12 @@ class CornerFinder:
             self._flags |= cv2.CALIB_CB_FAST_CHECK
 
     def find(self, image: Image) -> BoardView | None:
-        """Return subpixel corners of a grey image (h, w), or None where too few are visible."""
+        """Return the subpixel corners of a grey image (h, w), or None if too few are visible."""
         if self._detector is not None:
-            return self._charuco(image)
-        return self._chessboard(image)
+            return self._find_charuco(image)
+        return self._find_chessboard(image)
 
-    def _chessboard(self, image: Image) -> BoardView | None:
+    def _find_chessboard(self, image: Image) -> BoardView | None:
         board = self.board
         found, corners = cv2.findChessboardCorners(
             image, (board.columns, board.rows), flags=self._flags
@@ -158,16 +160,16 @@ class CornerFinder:
         if not found:
             return None
         start = np.asarray(corners.reshape(-1, 2), dtype=np.float64)
-        half_px = 0.4 * _nearest(start)
+        half_px = 0.4 * _measure_spacing(start)
         pixels = _refine_corners(
-            _larger(image), start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX
+            _enlarge(image), start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX
         )
         return BoardView(np.arange(board.rows * board.columns), pixels)
 
-    def _charuco(self, image: Image) -> BoardView | None:
+    def _find_charuco(self, image: Image) -> BoardView | None:
         assert self._detector is not None
         assert self.board.marker_m is not None
-        larger = _larger(image)
+        larger = _enlarge(image)
         corners, found, _, _ = self._detector.detectBoard(larger)
         if found is None or len(found) < MIN_CORNERS:
             return None
@@ -176,7 +178,7 @@ class CornerFinder:
         in_larger = np.asarray(corners.reshape(-1, 2)[order], dtype=np.float64)
         start = (in_larger + 0.5) / SCALE - 0.5
         rim = 0.5 * (1.0 - self.board.marker_m / self.board.square_m)
-        half_px = min(0.4, 0.7 * rim) * _nearest(start)
+        half_px = min(0.4, 0.7 * rim) * _measure_spacing(start)
         pixels = _refine_corners(larger, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
         last = np.array([image.shape[1], image.shape[0]]) - 1.0
         clear = np.minimum(start, last - start).min(axis=1) > half_px + 2.0
@@ -188,14 +190,14 @@ class CornerFinder:
         return BoardView(ids, pixels)
 
 
-def _nearest(pixels: Floats) -> Floats:
-    """Return the distance (n,) of each corner to the nearest other one."""
+def _measure_spacing(pixels: Floats) -> Floats:
+    """Return the distance (n,) of each corner to its nearest neighbour, px."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))
 
 
-def _larger(image: Image) -> Image:
+def _enlarge(image: Image) -> Image:
     """Enlarge the image by SCALE; pixel x moves to SCALE * (x + 1/2) - 1/2."""
     larger = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_CUBIC)
     return np.asarray(larger, dtype=np.uint8)
@@ -204,14 +206,13 @@ def _larger(image: Image) -> Image:
 def _refine_corners(
     larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float
 ) -> Floats:
-    """Refine corners (n, 2) px to the saddle points of their neighbourhoods, half_px (n,) to each
-    side.
+    """Refine corners (n, 2) px to the saddle points of their neighbourhoods.
 
-    larger: the result of `_larger`; all other lengths are in pixels of the original image.
+    larger: result of `_enlarge`. half_px: half sides of the windows (n,), in pixels of the original
+    image, as all other lengths.
 
-    A window must not contain the next edges (those of a neighbouring corner, or of a marker), which
-    shift corners by pixels.  Smoothing removes noise (and JPEG blocks) from the gradients that
-    determine the saddle point.
+    A window must not contain the edges of a neighbouring corner or marker, which shift corners by
+    several pixels. Smoothing reduces noise and JPEG artefacts in the gradients.
     """
     smooth = cv2.GaussianBlur(larger, (0, 0), SCALE * smoothing_px)
     halves = np.clip(SCALE * half_px, MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX).astype(int)
@@ -225,12 +226,12 @@ def _refine_corners(
     return refined
 
 
-def same_order(left: Floats, right: Floats, board: Board) -> Floats:
-    """Renumber the right image's corners to start at the same board corner as the left's.
+def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
+    """Renumber the right image's corners to match the left image's numbering.
 
-    A detector may begin at either end of the board (at any corner of a square one).  The two
-    cameras of a rig are nearly parallel, so that the right numbering is the one whose axes have the
-    left's directions.
+    A detector may start at either end of the board, or at any corner of a square board. The cameras
+    of a rig are nearly parallel, so the matching numbering has the same axis directions in both
+    images.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -241,36 +242,39 @@ def same_order(left: Floats, right: Floats, board: Board) -> Floats:
         directions = np.stack([square[0, -1] - square[0, 0], square[-1, 0] - square[0, 0]])
         return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
-    wanted = axes(left)
-    return max(numberings, key=lambda corners: float(np.sum(axes(corners) * wanted)))
+    target = axes(left)
+    return max(numberings, key=lambda corners: float(np.sum(axes(corners) * target)))
 
 
 def match_views(
     left: BoardView | None, right: BoardView | None, board: Board, names: tuple[str, str]
 ) -> BoardPair | str:
-    """Match the board in a pair of views, or return why it cannot be used; names: of the images."""
+    """Match the board in a pair of views, or return the reason why that is impossible.
+
+    names: of the images.
+    """
     if left is None or right is None:
         missing = [name for name, seen in zip(names, (left, right), strict=True) if seen is None]
-        return f"no {describe(board)} in {' and '.join(missing)}"
+        return f"no {describe(board)} found in {' and '.join(missing)}"
     if board.kind == "charuco":
         pair = BoardPair(left, right)
         shared = len(pair.common()[0])
         if shared < MIN_CORNERS:
-            return f"{shared} corners are in both views, at least {MIN_CORNERS} are needed"
+            return f"{shared} common corners in both views, at least {MIN_CORNERS} are required"
         return pair
-    return BoardPair(left, BoardView(right.ids, same_order(left.pixels, right.pixels, board)))
+    return BoardPair(left, BoardView(right.ids, align_numbering(left.pixels, right.pixels, board)))
 
 
 def read_gray(path: Path) -> Image:
-    """Read an image in grey; raises CalibrationError for an unreadable image."""
+    """Read an image in grey; CalibrationError for an unreadable file."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
-        raise CalibrationError(f"{path}: not a picture that can be read")
+        raise CalibrationError(f"{path}: missing or unreadable image")
     return np.asarray(image, dtype=np.uint8)
 
 
 def compute_digest(left: Path, right: Path) -> str:
-    """Return a digest that distinguishes a pair of files from others of the same names."""
+    """Return a digest that distinguishes a pair of files from others with the same names."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 
@@ -280,17 +284,18 @@ def find_pairs(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> tuple[list[BoardPair | str], tuple[int, int]]:
-    """Return the board in each pair, or the reason why not, and the images' (width, height).
+    """Return the board in each pair, or the reason for its absence, and the images' (width,
+    height).
 
-    Raises CalibrationError for unequal counts, no images, unreadable ones, or mixed sizes.
+    Raises CalibrationError for unequal counts, no images, unreadable images or different sizes.
     """
     if len(left_paths) != len(right_paths):
         raise CalibrationError(
-            f"{len(left_paths)} left and {len(right_paths)} right pictures; give equally many, in "
+            f"{len(left_paths)} left and {len(right_paths)} right images; give the same number, in "
             "the same order"
         )
     if not left_paths:
-        raise CalibrationError("no pictures: the patterns match no file")
+        raise CalibrationError("no images: the patterns match no file")
     finder = CornerFinder(board)
     results: list[BoardPair | str] = []
     size: tuple[int, int] | None = None
@@ -301,7 +306,8 @@ def find_pairs(
             image_size = (image.shape[1], image.shape[0])
             if size is not None and image_size != size:
                 raise CalibrationError(
-                    f"{path}: {image_size[0]}x{image_size[1]} px, the others {size[0]}x{size[1]}"
+                    f"{path}: {image_size[0]}x{image_size[1]} px, expected "
+                    f"{size[0]}x{size[1]} as the other images"
                 )
             size = image_size
             views.append(finder.find(image))

@@ -1,9 +1,9 @@
-"""Generate and decode structured light: Gray code patterns, and camera images of them.
+"""Generate and decode structured light: Gray-code patterns, and camera images of them.
 
-A camera's pixel is wider than a projector's, so that the finest stripes are not resolved: each
+A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each
 image is decoded to cells of a few projector pixels. A smooth map fitted to the cells around a
-projector pixel gives its position in the image to a fraction of a camera pixel (after Moreno and
-Taubin 2012, who fit local homographies).
+projector pixel gives its image position with subpixel accuracy. Moreno and Taubin (2012) fit local
+homographies instead.
 """
 
 from __future__ import annotations
@@ -22,43 +22,43 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 MIN_CONTRAST = 24
-"""Minimum difference between white and black, in levels, of a camera pixel that the projector
-lights."""
+"""Minimum difference between white and black image, in grey levels, of a lit camera pixel."""
 
 MIN_STRIPE_PX = 4
-"""Width of the finest stripes that are used, projector pixels."""
+"""Width of the finest decoded stripes, projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side of the window for the fit at a projector pixel, projector pixels."""
+"""Half the side length of the fit window around a projector pixel, projector pixels."""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
-"""A fit that leaves more than this (rms, camera pixels) spans an edge or a fold of the sheet."""
+"""Maximum rms residual of a fit, camera pixels; larger ones span an edge or fold of the sheet."""
 
 
 class DecodeError(FlexsheetError, ValueError):
-    """Raised for images that do not show the patterns; the text gives the reason."""
+    """Raised for images from which the patterns cannot be decoded."""
 
     code = "gray-code"
-    remedy = "Take all images in order, exposed neither too dark nor too bright."
+    remedy = "Capture all patterns in order, without over- or underexposure."
 
 
-def patterns(width_px: int, height_px: int) -> list[Image]:
-    """Return the projector's images in their order: each stripe and its inverse, then white, then
-    black."""
+def make_patterns(width_px: int, height_px: int) -> list[Image]:
+    """Return the projector's images in order: each pattern with its inverse, then white, then
+    black.
+    """
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
-        raise DecodeError(f"no Gray code of {width_px}x{height_px}")
+        raise DecodeError(f"OpenCV cannot generate a Gray code of {width_px}x{height_px} pixels")
     white = np.full((height_px, width_px), 255, np.uint8)
     return [*(np.asarray(image, np.uint8) for image in images), white, np.zeros_like(white)]
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Hold the lit pixels (n, 2) of one camera and the projector pixels (n, 2) that light them.
+    """Lit pixels (n, 2) of a camera and the projector pixels (n, 2) that light them.
 
-    The latter are the middles of their cells.
+    The projector pixels are the centres of their cells.
     """
 
     pixels: Floats
@@ -66,35 +66,34 @@ class Decoded:
 
 
 def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """Decode one camera's images (height, width) of `patterns(width_px, height_px)`, in their
-    order.
+    """Decode one camera's images (height, width) of `make_patterns`, in their order.
 
-    Raises DecodeError for another number of images, sizes that differ, or nothing lit.
+    Raises DecodeError for a wrong number of images, different sizes, or too few lit pixels.
     """
     bits = [_bits(width_px), _bits(height_px)]
-    wanted = 2 * sum(bits) + 2
-    if len(images) != wanted:
-        raise DecodeError(f"{len(images)} images; the patterns are {wanted}")
+    expected = 2 * sum(bits) + 2
+    if len(images) != expected:
+        raise DecodeError(f"expected {expected} images, one per pattern, found {len(images)}")
     if len({image.shape for image in images}) != 1:
         raise DecodeError("the images have different sizes")
     white, black = (image.astype(np.int16) for image in images[-2:])
     row, column = np.nonzero(white - black >= MIN_CONTRAST)
     if len(row) < MIN_CELLS:
         raise DecodeError(
-            f"{len(row)} of the camera's pixels are lit by the projector: make the room darker, "
-            "the exposure longer, or aim both at the sheet"
+            f"the projector lights only {len(row)} camera pixels: darken the room, increase the "
+            "exposure time, or aim both devices at the sheet"
         )
-    axes, begin = [], 0
+    axes, first = [], 0
     for count in bits:
         value = np.zeros(len(row), np.int64)
         before = np.zeros(len(row), np.int64)
         unused = min(int(np.log2(MIN_STRIPE_PX)), count - 1)
         for number in range(count - unused):
-            shown, inverse = images[begin + 2 * number], images[begin + 2 * number + 1]
+            shown, inverse = images[first + 2 * number], images[first + 2 * number + 1]
             before ^= shown[row, column] > inverse[row, column]
             value = 2 * value + before
         axes.append(value * 2.0**unused + 0.5 * (2.0**unused - 1.0))
-        begin += 2 * count
+        first += 2 * count
     return Decoded(np.column_stack([column, row]).astype(np.float64), np.column_stack(axes))
 
 
@@ -102,12 +101,12 @@ def _bits(size_px: int) -> int:
     return int(np.ceil(np.log2(size_px)))
 
 
-def find_pixels(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
-    """Return the camera's pixels (n, 2) of the projector's pixels (n, 2), and which are found."""
-    found, seen = np.zeros((len(wanted), 2)), np.zeros(len(wanted), np.bool_)
+def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
+    """Return the camera pixels (n, 2) of projector pixels (n, 2), and a mask (n,) of valid ones."""
+    found, valid = np.zeros((len(projector_px), 2)), np.zeros(len(projector_px), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
     lit_by, pixels = view.lit_by[order], view.pixels[order]
-    for index, pixel in enumerate(wanted):
+    for index, pixel in enumerate(projector_px):
         first, last = np.searchsorted(
             lit_by[:, 0], [pixel[0] - WINDOW_HALF_PX, pixel[0] + WINDOW_HALF_PX]
         )
@@ -116,26 +115,28 @@ def find_pixels(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
             (lit_by[first:last][near] - pixel) / WINDOW_HALF_PX, pixels[first:last][near]
         )
         if pixel_found is not None:
-            found[index], seen[index] = pixel_found, True
-    return found, seen
+            found[index], valid[index] = pixel_found, True
+    return found, valid
 
 
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
-    """Return the camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in
-    -1..1."""
+    """Return the camera pixel (2,) at offset 0 of a quadratic map, or None if the fit is poor.
+
+    offsets: (n, 2) of cells, in window half sides (-1..1).
+    """
     for _ in range(2):
-        # Cells on all sides are required: beyond the sheet's edge the fit would extrapolate.
+        # Require cells on all sides; beyond the sheet's edge the fit would extrapolate.
         quadrants = (offsets > 0.0) @ np.array([1, 2])
         if len(pixels) < MIN_CELLS or len(np.unique(quadrants)) < 4:
             return None
         x, y = offsets.T
         terms = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
         solution, *_ = np.linalg.lstsq(terms, pixels, rcond=None)
-        off = np.linalg.norm(pixels - terms @ solution, axis=1)
-        keep = off <= 3.0 * np.median(off)
+        error = np.linalg.norm(pixels - terms @ solution, axis=1)
+        keep = error <= 3.0 * np.median(error)
         if keep.all():
             break
         offsets, pixels = offsets[keep], pixels[keep]
-    if float(np.sqrt(np.mean(off[keep] ** 2))) > MAX_FIT_RMS_PX * MIN_STRIPE_PX:
+    if float(np.sqrt(np.mean(error[keep] ** 2))) > MAX_FIT_RMS_PX * MIN_STRIPE_PX:
         return None
     return np.asarray(solution[0], dtype=np.float64)

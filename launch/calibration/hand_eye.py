@@ -1,17 +1,17 @@
 """Estimate the pose of an arm's base in the world from images of a board on its flange.
 
-Robot-world and hand-eye calibration: at each of several poses of the arm
+Robot-world/hand-eye calibration: for each of several poses of the arm
 
-    world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
+world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
 
-where the first and the third transform are unknown.  A closed form (Shah, Solving the
-robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms Robotics 5(3),
-2013) gives the start; then all corners of all images are fitted together.  The flange differs from
-the forward kinematics by some tenths of a millimetre, an error common to all corners of a pair.  So
-each pose has a small random motion of the flange.  In this mixed model, restricted maximum
-likelihood estimates the standard deviations (Patterson and Thompson, Biometrika 58(3), 1971).
-Without it, each corner would count as independent, and the stated uncertainty would be several
-times too small.
+where the first and third transform are unknown. A closed form gives the initial values (Shah,
+Solving the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms
+Robotics 5(3), 2013). Then all corners of all images are fitted together.
+
+The flange deviates from the forward kinematics by some tenths of a millimetre, an error common to
+all corners of a pair. So each pose has a small random flange motion. In this mixed model,
+restricted maximum likelihood estimates the standard deviations (Patterson and Thompson, Biometrika
+58(3), 1971). Treating all corners as independent would underestimate the uncertainty several times.
 
 Motions (6,) are a rotation vector (rad), then a translation (m).
 """
@@ -44,34 +44,37 @@ MIN_POSES = 6
 """Minimum number of poses; 15 to 20 are recommended."""
 
 MIN_ROTATION_RAD = float(np.radians(5.0))
-"""Minimum RMS rotation of the flange about each of two axes; less leaves unknowns undetermined."""
+"""Minimum rms rotation of the flange about each of two axes; less does not determine all unknowns.
+"""
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""Random subsets are tried as starts too, so that one wrong pose cannot spoil the start."""
+"""Size of the random subsets used as further initial values, in case of a wrong pose."""
 
 LENGTH_M = 0.3
-"""Translation that weighs as much as a rotation of one radian."""
+"""Translation that has the same weight as a rotation of one radian."""
 
 MAX_MEDIAN_RATIO = 6.0
-"""A pose with a larger error, over the median error, is excluded from the first fit."""
+"""Maximum error over the median error of a pose in the first fit."""
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""A pose with a larger squared deviation is an outlier.  Deviations are chi-square with six degrees
-of freedom, scaled by the median.  The maximum in 75 simulated sets of 15 poses without an outlier
-was 43, since an arm's error varies over its workspace."""
+"""Squared deviation of an outlier pose, and the median for six degrees of freedom (chi-square).
+
+Deviations are scaled by the median. The limit is above the maximum (43) of 75 simulated sets of 15
+poses without outliers; an arm's error varies over its workspace.
+"""
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""Lower bound of the scale: poses that agree to rounding have no spread."""
+"""Lower bound of the scale, for poses that agree to rounding."""
 
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""Larger standard deviations mean that the joints do not belong to the images."""
+"""Maximum plausible standard deviations; larger ones mean wrongly assigned joints."""
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
-"""Maximum fraction of outliers; more point to another mistake."""
+"""Maximum fraction of outliers; more indicate another mistake."""
 
 MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
 """Lower bounds of the arm's standard deviations."""
@@ -79,8 +82,8 @@ MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
 ADVICE = (
-    "check that the joints are those at the exposure, that the board is fixed to the flange, and "
-    "that stereo calibration and board are the right ones"
+    "check that the joints are measured at the exposure, that the board is fixed to the flange, "
+    "and that stereo calibration and board are correct"
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
@@ -88,14 +91,14 @@ INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
 
 MAX_ITERATIONS = 30
 CONVERGED_STEP = 1e-10
-"""A smaller step of all unknowns (rad, m) ends the iteration."""
+"""Maximum step of any unknown (rad, m) at convergence."""
 
-START_STEP = 1e-6
-"""The same for a start value."""
+INITIAL_STEP = 1e-6
+"""Maximum step at convergence of an initial value."""
 
 
 class HandEyeError(FlexsheetError, ValueError):
-    """Raised for poses that do not determine the base; the text gives the reason and a remedy."""
+    """Raised for poses that do not determine the base."""
 
     code = "hand-eye"
     remedy = "Measure more poses, with the board rotated about at least two axes."
@@ -103,7 +106,7 @@ class HandEyeError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraLens:
-    """Hold a camera matrix (3, 3) px and Brown's distortion (5,)."""
+    """Camera matrix (3, 3), px, and Brown's distortion (5,)."""
 
     matrix: Floats
     distortion: Floats
@@ -111,7 +114,7 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """Hold the optics and the pose of the stereo camera; transforms (4, 4)."""
+    """Optics and pose of the stereo camera; transforms (4, 4)."""
 
     left: CameraLens
     right: CameraLens
@@ -121,7 +124,7 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """Hold the corners in one image: positions on the board (k, 3) m, and pixels (k, 2)."""
+    """Corners in one image: points on the board (k, 3), m, and pixels (k, 2)."""
 
     points_board: Floats
     pixels: Floats
@@ -129,7 +132,7 @@ class CornerView:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """Hold one pose of the arm: its joints (6,) rad, and the board's corners in both images."""
+    """One pose of the arm: joints (6,), rad, and the board's corners in both images."""
 
     name: str
     joints_rad: Floats
@@ -138,12 +141,12 @@ class BoardDetection:
 
 
 @dataclass(frozen=True, slots=True)
-class Residual:
-    """Hold the residual of one pose.
+class PoseResidual:
+    """Residual of one pose.
 
     shift_m, turn_rad: difference between the flange poses from the images and from the joints.
-    rms_px: of the corners, projected with the pose from the joints.  reason: why the pose is an
-        outlier; "" for an inlier.
+    rms_px: of the corners, projected with the pose from the joints. reason: for excluding the pose;
+    empty for an inlier.
     """
 
     name: str
@@ -155,15 +158,15 @@ class Residual:
 
 @dataclass(frozen=True, slots=True)
 class BaseFit:
-    """Hold the pose of the base, its uncertainty and the residuals.
+    """Pose of the base with its uncertainty and residuals.
 
-    covariance: (6, 6) of the motion from the estimated world_from_base to the true one: a rotation
-        about the base's origin in the world's axes, then a translation.  Multiplied by the square
-        of `jackknife_ratio` if that is above 1.
-    corner_sigma_px: standard deviation of one coordinate of a corner.  arm_sigma_rad, arm_sigma_m:
-        of one component of the flange's pose error.
-    jackknife_ratio: standard deviations by the jackknife over those of the fit (RMS over the six).
-    leave_one_out: (n, 6) motions of the base when one inlier is left out.
+    covariance: (6, 6) of the motion from the estimated to the true world_from_base: rotation about
+    the base's origin in world axes, then translation. Scaled by the square of `jackknife_ratio` if
+    that is above 1.
+
+    corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m: of one
+    component of the flange's pose error. jackknife_ratio: jackknife over fit standard deviations
+    (rms over six). leave_one_out: (n, 6) motions of the base when one inlier is excluded.
     """
 
     world_from_base: Floats
@@ -174,12 +177,12 @@ class BaseFit:
     arm_sigma_m: float
     jackknife_ratio: float
     leave_one_out: Floats
-    residuals: tuple[Residual, ...]
+    residuals: tuple[PoseResidual, ...]
 
-    def std_at(self, world_m: Floats) -> tuple[float, float]:
-        """Return the standard deviations of a commanded pose at a point in the world (3,) m.
+    def compute_std(self, world_m: Floats) -> tuple[float, float]:
+        """Return the standard deviations of a commanded pose at a world point (3,), over all axes.
 
-        The first is that of the distance (m), the second that of the rotation (rad), over all axes.
+        The first is that of the position (m), the second that of the rotation (rad).
         """
         lever = np.hstack([-skew(world_m - self.world_from_base[:3, 3]), np.eye(3)])
         shift = float(np.sqrt(np.trace(lever @ self.covariance @ lever.T)))
@@ -188,7 +191,7 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """Hold the unknown transforms, both (4, 4)."""
+    """Estimates of the unknown transforms, both (4, 4)."""
 
     world_from_base: Floats
     flange_from_board: Floats
@@ -203,16 +206,15 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """Hold one pose, linearized about the present unknowns.
+    """One pose, linearized at the current estimates.
 
-    seen: (6,) motion of the flange, in its own frame, that fits the corners best.
-    spread: (6, 6), its covariance per px^2 of the corners.  by_unknowns: (6, 12), the derivative of
-        the flange's motion by those of base and board.
-    inner_px2: sum of squared pixel residuals after the motion `seen`.
-    count: number of coordinates.  rms_px: of the corners, without that motion.
+    measured: (6,) motion of the flange, in its own frame, that fits the corners best. spread: (6,
+    6) its covariance per px^2 of corner noise. by_unknowns: (6, 12) derivative of the flange's
+    motion by those of base and board. inner_px2: sum of squared pixel residuals after the motion
+    `measured`. count: number of coordinates. rms_px: of the corners, without that motion.
     """
 
-    seen: Floats
+    measured: Floats
     spread: Floats
     by_unknowns: Floats
     inner_px2: float
@@ -221,121 +223,123 @@ class _LinearizedPose:
 
 
 def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig, *, seed: int = 0) -> BaseFit:
-    """Estimate the pose of the arm's base; raise HandEyeError if the poses do not determine it.
+    """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
 
-    seed: of the random starts.  The stereo rig's pose and optics are taken as exact: their errors
-    enter the result, and equally the fingertip, which the same rig measures.
+    seed: of the random initial values. The stereo rig is assumed exact: its errors affect the
+    result and the fingertip equally, since the same rig measures both.
     """
     _check_count(detections)
     flanges = [forward(one.joints_rad) for one in detections]
     _check_rotations(flanges)
-    boards = [_board_pose(one, rig) for one in detections]
-    unknowns = _find_start(flanges, boards, rig, seed=seed)
+    boards = [_fit_board_pose(one, rig) for one in detections]
+    unknowns = _find_initial(flanges, boards, rig, seed=seed)
     used = _find_rough_inliers(_compute_discrepancies(unknowns, flanges, boards, rig))
     for attempt in range(2 * MAX_READMISSIONS):
         _check_outliers(detections, used)
         kept = np.flatnonzero(used).tolist()
         _check_rotations([flanges[i] for i in kept])
-        unknowns, model = _fit(
+        unknowns, model = _fit_unknowns(
             unknowns, [detections[i] for i in kept], [flanges[i] for i in kept], rig
         )
         _check_plausible(model)
-        again = _find_inliers(_linearize(unknowns, detections, flanges, rig), model)
-        if (again == used).all():
+        inliers = _find_inliers(_linearize(unknowns, detections, flanges, rig), model)
+        if (inliers == used).all():
             break
-        # A pose may be readmitted a few times only, so that the iteration ends.
-        used = again if attempt < MAX_READMISSIONS else again & used
+        # Readmit a pose only a few times, so that the iteration ends.
+        used = inliers if attempt < MAX_READMISSIONS else inliers & used
     return _make_result(detections, flanges, rig, unknowns=unknowns, model=model, used=used)
 
 
 def _check_count(detections: Sequence[BoardDetection]) -> None:
     if len(detections) < MIN_POSES:
         raise HandEyeError(
-            f"{len(detections)} poses of the arm, at least {MIN_POSES} are needed; measure 15 to 20"
+            f"{len(detections)} arm poses, at least {MIN_POSES} are required; record 15 to 20"
         )
     for one in detections:
         if not np.isfinite(one.joints_rad).all() or one.joints_rad.shape != (6,):
-            raise HandEyeError(f"{one.name}: needs six finite joints; correct or remove it")
+            raise HandEyeError(
+                f"{one.name}: expected six finite joint angles; correct or remove the pose"
+            )
 
 
 def _check_outliers(detections: Sequence[BoardDetection], used: NDArray[np.bool_]) -> None:
-    strays = int((~used).sum())
-    if strays > MAX_OUTLIER_RATIO * len(used):
+    outliers = int((~used).sum())
+    if outliers > MAX_OUTLIER_RATIO * len(used):
         names = ", ".join(one.name for one, good in zip(detections, used, strict=True) if not good)
         raise HandEyeError(
-            f"{strays} of {len(used)} poses do not agree with the others ({names}): {ADVICE}"
+            f"{outliers} of {len(used)} poses contradict the others ({names}): {ADVICE}"
         )
 
 
 def _check_plausible(model: _NoiseModel) -> None:
     if model.arm_m > MAX_PLAUSIBLE_ARM_M or model.arm_rad > MAX_PLAUSIBLE_ARM_RAD:
         raise HandEyeError(
-            f"the poses contradict one another (the arm would differ from its joints by "
-            f"{1e3 * model.arm_m:.1f} mm and {np.degrees(model.arm_rad):.1f} degrees): {ADVICE}"
+            f"the poses contradict one another (estimated arm error "
+            f"{1e3 * model.arm_m:.1f} mm, {np.degrees(model.arm_rad):.1f} degrees): {ADVICE}"
         )
 
 
 def _check_rotations(flanges: Sequence[Floats]) -> None:
-    """Check for rotations about two axes: one alone leaves the translation along it unknown."""
+    """Check for rotations about two axes; one alone does not determine the translation along it."""
     mean = _mean_rotation([flange[:3, :3] for flange in flanges])
-    turns = np.array([vector_from_rotation(mean.T @ flange[:3, :3]) for flange in flanges])
-    values, axes = np.linalg.eigh(turns.T @ turns / len(turns))
+    rotations = np.array([vector_from_rotation(mean.T @ flange[:3, :3]) for flange in flanges])
+    values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
     spread = np.sqrt(np.maximum(values, 0.0))
     if spread[2] < MIN_ROTATION_RAD:
         raise HandEyeError(
-            f"the flange hardly rotates between the poses ({np.degrees(spread[2]):.1f} degrees "
-            f"rms, at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes): rotate it by 20 to "
-            "40 degrees in both directions"
+            f"the flange rotates by only {np.degrees(spread[2]):.1f} degrees rms between the "
+            f"poses, at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes are required; "
+            "rotate it by 20 to 40 degrees in both directions"
         )
     if spread[1] < MIN_ROTATION_RAD:
         x, y, z = axes[:, 2]
         raise HandEyeError(
-            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) of its own frame "
+            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own frame "
             f"(about others {np.degrees(spread[1]):.1f} degrees rms, at least "
-            f"{np.degrees(MIN_ROTATION_RAD):.0f}): rotate it about another axis too"
+            f"{np.degrees(MIN_ROTATION_RAD):.0f} required); rotate it about another axis, too"
         )
 
 
 def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
-    """Return the rotation nearest to all (least squares of the matrices)."""
+    """Return the mean of rotations (least squares of the matrices)."""
     u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt)
 
 
-def _board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
+def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
     """Fit left_from_board (4, 4) to the corners of both images.
 
-    A flat board has two similar poses in one image; the other image decides.
+    One image of a flat board has two similar solutions; the other image decides between them.
     """
     left = detection.left
-    count, turns, shifts, _ = cv2.solvePnPGeneric(
+    count, rotations, shifts, _ = cv2.solvePnPGeneric(
         left.points_board, left.pixels, rig.left.matrix, rig.left.distortion,
         flags=cv2.SOLVEPNP_IPPE,
     )  # fmt: skip
-    best, least = None, np.inf
+    best, min_cost = None, np.inf
     for index in range(count):
         pose = transform(
-            rotation_from_vector(np.asarray(turns[index], np.float64).ravel()),
+            rotation_from_vector(np.asarray(rotations[index], np.float64).ravel()),
             np.asarray(shifts[index], np.float64).ravel(),
         )
         for _ in range(MAX_ITERATIONS):
             residuals, slopes = _linearize_pixels(detection, rig, pose, np.eye(4))
             step = np.linalg.lstsq(slopes, residuals, rcond=None)[0]
             pose = pose @ transform(rotation_from_vector(step[:3]), step[3:])
-            if np.abs(step).max() < START_STEP:
+            if np.abs(step).max() < INITIAL_STEP:
                 break
         cost = float(residuals @ residuals)
-        if np.isfinite(cost) and cost < least:
-            best, least = pose, cost
+        if np.isfinite(cost) and cost < min_cost:
+            best, min_cost = pose, cost
     if best is None:
-        raise HandEyeError(f"{detection.name}: no pose of the board fits its corners; remove it")
+        raise HandEyeError(f"{detection.name}: no board pose fits the corners; remove this pose")
     return np.asarray(best)
 
 
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Return residuals (m,) px, and derivatives (m, 6) of the projections by a flange motion."""
+    """Return residuals (m,), px, and derivatives (m, 6) of the projections by a flange motion."""
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
         (detection.left, rig.left, np.eye(4)),
@@ -345,84 +349,87 @@ def _linearize_pixels(
         eye_from_flange = eye_from_left @ left_from_flange
         in_eye = apply(eye_from_flange, on_flange)
         residuals.append((view.pixels - project(in_eye, lens.matrix, lens.distortion)).ravel())
-        turn = eye_from_flange[:3, :3]
-        by_place = np.empty((len(in_eye), 2, 3))
+        rotation = eye_from_flange[:3, :3]
+        by_point = np.empty((len(in_eye), 2, 3))
         for axis in range(3):
-            # Half a micrometre: pixels are smooth enough for ten digits.
+            # Half a micrometre: the projection is smooth enough for ten digits.
             nudge = np.zeros(3)
             nudge[axis] = 5e-7
             ahead, behind = (
-                project(in_eye + way * nudge, lens.matrix, lens.distortion) for way in (1.0, -1.0)
+                project(in_eye + sign * nudge, lens.matrix, lens.distortion) for sign in (1.0, -1.0)
             )
-            by_place[:, :, axis] = (ahead - behind) / 1e-6
+            by_point[:, :, axis] = (ahead - behind) / 1e-6
         x, y, z = on_flange.T
         motion = np.zeros((len(on_flange), 3, 6))
         motion[:, 0, 1], motion[:, 0, 2], motion[:, 1, 2] = z, -y, x
         motion[:, 1, 0], motion[:, 2, 0], motion[:, 2, 1] = -z, y, -x
         motion[:, :, 3:] = np.eye(3)
-        slopes.append((by_place @ turn @ motion).reshape(-1, 6))
+        slopes.append((by_point @ rotation @ motion).reshape(-1, 6))
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def _find_start(
+def _find_initial(
     flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig, *, seed: int
 ) -> _Unknowns:
-    """Return the closed form from all poses, or from the subset that agrees with most others."""
+    """Return the closed-form solution of all poses, or of the subset that fits most poses best."""
     random = np.random.default_rng(seed)
     every = np.arange(len(flanges))
     subsets = [
         every,
         *(random.choice(every, SUBSET_POSES, replace=False) for _ in range(RANDOM_STARTS)),
     ]
-    best, least = None, np.inf
+    best, min_score = None, np.inf
     for chosen in subsets:
-        found = _closed_form([flanges[i] for i in chosen], [boards[i] for i in chosen], rig)
+        found = _solve_closed_form([flanges[i] for i in chosen], [boards[i] for i in chosen], rig)
         if found is None:
             continue
-        off = _compute_discrepancies(found, flanges, boards, rig)
+        error = _compute_discrepancies(found, flanges, boards, rig)
         score = float(
             np.median(
-                np.linalg.norm(off[:, 3:], axis=1) + LENGTH_M * np.linalg.norm(off[:, :3], axis=1)
+                np.linalg.norm(error[:, 3:], axis=1)
+                + LENGTH_M * np.linalg.norm(error[:, :3], axis=1)
             )
         )
-        if score < least:
-            best, least = found, score
+        if score < min_score:
+            best, min_score = found, score
     if best is None:
         raise HandEyeError(
-            "no start was found from these poses: rotate the flange more, about two axes"
+            "no initial solution for these poses; rotate the flange more, about two axes"
         )
     return best
 
 
-def _closed_form(
+def _solve_closed_form(
     flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> _Unknowns | None:
     """Return Shah's solution of B F X = C, or None if these poses have none.
 
-    With Y the transpose of X's rotation, C Y = B F for all rotations; hence the matrix
-    sum(kron(F, C)) takes the stacked columns of Y to those of B, n times as long, and both are its
-    first singular vectors.  The shifts follow by linear least squares.
+    With Y the transpose of X's rotation, C Y = B F for all rotations. So the matrix sum(kron(F, C))
+    maps the stacked columns of Y to n times those of B, and both are its first singular vectors.
+    The translations follow by linear least squares.
     """
-    seen = [rig.world_from_left @ board for board in boards]
+    worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
-        [np.kron(f[:3, :3], c[:3, :3]) for f, c in zip(flanges, seen, strict=True)], axis=0
+        [np.kron(f[:3, :3], c[:3, :3]) for f, c in zip(flanges, worlds, strict=True)], axis=0
     )
     u, values, vt = np.linalg.svd(stacked)
     if values[0] - values[1] < 1e-9 * values[0]:
         return None
-    base = _rotation_from_stacked(u[:, 0])
-    board = _rotation_from_stacked(vt[0]).T
+    base = _unstack_rotation(u[:, 0])
+    board = _unstack_rotation(vt[0]).T
     # R_B (R_F t_X + t_F) + t_B = t_C
     rows = np.vstack([np.hstack([base @ f[:3, :3], np.eye(3)]) for f in flanges])
-    sides = np.concatenate([c[:3, 3] - base @ f[:3, 3] for f, c in zip(flanges, seen, strict=True)])
+    sides = np.concatenate(
+        [c[:3, 3] - base @ f[:3, 3] for f, c in zip(flanges, worlds, strict=True)]
+    )
     shifts, _, rank, _ = np.linalg.lstsq(rows, sides, rcond=1e-9)
     if rank < 6:
         return None
     return _Unknowns(transform(base, shifts[3:]), transform(board, shifts[:3]))
 
 
-def _rotation_from_stacked(stacked: Floats) -> Floats:
-    """Return the rotation whose stacked columns (9,) are these up to a factor."""
+def _unstack_rotation(stacked: Floats) -> Floats:
+    """Return the rotation nearest to these stacked columns (9,), up to a factor."""
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
@@ -430,56 +437,56 @@ def _rotation_from_stacked(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return motions (n, 6) in the flange's frame from its pose by joints to that by images."""
+    """Return flange motions (n, 6), in its frame, from the pose by joints to that by images."""
     found = []
     for flange, board in zip(flanges, boards, strict=True):
-        seen = rig.world_from_left @ board @ inverse(unknowns.flange_from_board)
-        motion = inverse(unknowns.world_from_base @ flange) @ seen
+        measured = rig.world_from_left @ board @ inverse(unknowns.flange_from_board)
+        motion = inverse(unknowns.world_from_base @ flange) @ measured
         found.append(np.concatenate([vector_from_rotation(motion[:3, :3]), motion[:3, 3]]))
     return np.array(found)
 
 
 def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
-    """Return which poses (n,) have errors below a multiple of the median, for the first fit."""
+    """Return a mask (n,) of poses with errors below a multiple of the median, for the first fit."""
     good = np.ones(len(discrepancies), dtype=bool)
-    for part, smallest in ((slice(0, 3), MIN_ARM_RAD), (slice(3, 6), MIN_ARM_M)):
-        off = np.linalg.norm(discrepancies[:, part], axis=1)
-        good &= off <= MAX_MEDIAN_RATIO * max(float(np.median(off)), smallest)
+    for part, min_error in ((slice(0, 3), MIN_ARM_RAD), (slice(3, 6), MIN_ARM_M)):
+        error = np.linalg.norm(discrepancies[:, part], axis=1)
+        good &= error <= MAX_MEDIAN_RATIO * max(float(np.median(error)), min_error)
     return good
 
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """Hold the standard deviations of a corner's coordinate (px) and of the flange (rad, m)."""
+    """Standard deviations of a corner coordinate (px) and of the flange (rad, m)."""
 
     corner_px: float
     arm_rad: float
     arm_m: float
 
-    def weights(self, places: Sequence[_LinearizedPose]) -> Floats:
-        """Return the information (n, 6, 6) of each measured flange motion, arm error included."""
-        own = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
-        spreads = np.array([one.spread for one in places])
-        return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + own))
+    def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
+        """Return the information (n, 6, 6) of each measured flange motion, with the arm error."""
+        arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
+        spreads = np.array([one.spread for one in poses])
+        return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + arm))
 
 
-def _find_inliers(places: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
-    """Return which poses (n,) are inliers by the chi-square test, scaled by the median.
+def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
+    """Return a mask (n,) of inliers by the chi-square test, scaled by the median.
 
-    Deviations within rounding are inliers, however exact the others are.
+    Deviations within rounding are inliers even if the others are exact.
     """
-    seen = np.array([one.seen for one in places])
-    at_least = _NoiseModel(
+    measured = np.array([one.measured for one in poses])
+    bounded = _NoiseModel(
         max(model.corner_px, ROUNDING_PX),
         max(model.arm_rad, ROUNDING_RAD),
         max(model.arm_m, ROUNDING_M),
     )
-    squares = np.einsum("nk,nkl,nl->n", seen, at_least.weights(places), seen)
+    squares = np.einsum("nk,nkl,nl->n", measured, bounded.compute_weights(poses), measured)
     scale = max(float(np.median(squares)) / MEDIAN_CHI_SQUARE, MIN_SCALE)
     return np.asarray(squares <= MAX_CHI_SQUARE * scale)
 
 
-def _fit(
+def _fit_unknowns(
     unknowns: _Unknowns,
     detections: Sequence[BoardDetection],
     flanges: Sequence[Floats],
@@ -488,14 +495,14 @@ def _fit(
     """Fit the unknowns and the standard deviations by Gauss-Newton steps."""
     model: _NoiseModel | None = None
     for _ in range(MAX_ITERATIONS):
-        places = _linearize(unknowns, detections, flanges, rig)
-        model = _estimate_deviations(places, model)
-        matrix, side = _normal_equations(places, model)
+        poses = _linearize(unknowns, detections, flanges, rig)
+        model = _estimate_deviations(poses, model)
+        matrix, side = _normal_equations(poses, model)
         try:
             step = np.asarray(np.linalg.solve(matrix, side), np.float64)
         except np.linalg.LinAlgError as error:
             raise HandEyeError(
-                "the poses do not determine the base: rotate the flange more, about two axes"
+                "the poses do not determine the base; rotate the flange more, about two axes"
             ) from error
         unknowns = unknowns.apply_step(step)
         if np.abs(step).max() < CONVERGED_STEP:
@@ -520,16 +527,16 @@ def _linearize(
             detection, rig, left_from_world @ world_from_flange, board
         )
         information = slopes.T @ slopes
-        seen = np.asarray(np.linalg.solve(information, slopes.T @ residuals), np.float64)
+        measured = np.asarray(np.linalg.solve(information, slopes.T @ residuals), np.float64)
         back = world_from_flange[:3, :3].T
         lever = world_from_flange[:3, 3] - unknowns.world_from_base[:3, 3]
         by_base = np.block([[back, np.zeros((3, 3))], [-back @ skew(lever), back]])
         found.append(
             _LinearizedPose(
-                seen=seen,
+                measured=measured,
                 spread=np.asarray(np.linalg.inv(information), np.float64),
                 by_unknowns=np.hstack([by_base, by_board]),
-                inner_px2=float(residuals @ residuals - seen @ information @ seen),
+                inner_px2=float(residuals @ residuals - measured @ information @ measured),
                 count=len(residuals),
                 rms_px=float(np.sqrt(2.0 * np.mean(residuals * residuals))),
             )
@@ -538,26 +545,26 @@ def _linearize(
 
 
 def _normal_equations(
-    places: Sequence[_LinearizedPose], model: _NoiseModel
+    poses: Sequence[_LinearizedPose], model: _NoiseModel
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations (12, 12) and (12,) of a step of the unknowns."""
-    weights = model.weights(places)
-    slopes = np.array([one.by_unknowns for one in places])
-    seen = np.array([one.seen for one in places])
+    """Return the normal equations (12, 12) and (12,) for a step of the unknowns."""
+    weights = model.compute_weights(poses)
+    slopes = np.array([one.by_unknowns for one in poses])
+    measured = np.array([one.measured for one in poses])
     matrix = np.einsum("nki,nkl,nlj->ij", slopes, weights, slopes)
-    side = np.einsum("nki,nkl,nl->i", slopes, weights, seen)
+    side = np.einsum("nki,nkl,nl->i", slopes, weights, measured)
     return matrix, side
 
 
 def _estimate_deviations(
-    places: Sequence[_LinearizedPose], before: _NoiseModel | None
+    poses: Sequence[_LinearizedPose], before: _NoiseModel | None
 ) -> _NoiseModel:
-    """Estimate corner noise from the residuals within poses, the arm's error by REML."""
-    freedom = sum(one.count - 6 for one in places)
-    corner = float(np.sqrt(max(sum(one.inner_px2 for one in places), 0.0) / max(freedom, 1)))
+    """Estimate corner noise from residuals within poses, and the arm's error by REML."""
+    freedom = sum(one.count - 6 for one in poses)
+    corner = float(np.sqrt(max(sum(one.inner_px2 for one in poses), 0.0) / max(freedom, 1)))
     corner = max(corner, 1e-6)
-    seen = np.array([one.seen for one in places])
-    slopes = np.array([one.by_unknowns for one in places])
+    measured = np.array([one.measured for one in poses])
+    slopes = np.array([one.by_unknowns for one in poses])
 
     def neg_log_likelihood(logs: Floats) -> float:
         """Return -2 log of the restricted likelihood without its constant."""
@@ -566,11 +573,11 @@ def _estimate_deviations(
             [np.log(MIN_ARM_RAD), np.log(MIN_ARM_M)],
             [np.log(MAX_ARM_RAD), np.log(MAX_ARM_M)],
         )
-        weights = _NoiseModel(corner, *np.exp(logs).tolist()).weights(places)
+        weights = _NoiseModel(corner, *np.exp(logs).tolist()).compute_weights(poses)
         matrix = np.einsum("nki,nkl,nlj->ij", slopes, weights, slopes)
-        side = np.einsum("nki,nkl,nl->i", slopes, weights, seen)
-        left = seen - slopes @ np.linalg.lstsq(matrix, side, rcond=None)[0]
-        squares = float(np.einsum("nk,nkl,nl->", left, weights, left))
+        side = np.einsum("nki,nkl,nl->i", slopes, weights, measured)
+        residual = measured - slopes @ np.linalg.lstsq(matrix, side, rcond=None)[0]
+        squares = float(np.einsum("nk,nkl,nl->", residual, weights, residual))
         spread = float(np.linalg.slogdet(matrix)[1] - np.linalg.slogdet(weights)[1].sum())
         return squares + spread
 
@@ -587,8 +594,8 @@ def _estimate_deviations(
 
 def _apply_motion(pose: Floats, motion: Floats) -> Floats:
     """Rotate a pose about its own origin and translate it; the motion is in the parent's axes."""
-    turn = rotation_from_vector(motion[:3])
-    return transform(turn @ pose[:3, :3], pose[:3, 3] + motion[3:])
+    rotation = rotation_from_vector(motion[:3])
+    return transform(rotation @ pose[:3, :3], pose[:3, 3] + motion[3:])
 
 
 def _make_result(
@@ -601,13 +608,13 @@ def _make_result(
     used: NDArray[np.bool_],
 ) -> BaseFit:
     every = _linearize(unknowns, detections, flanges, rig)
-    places = [one for one, good in zip(every, used, strict=True) if good]
-    matrix, _ = _normal_equations(places, model)
+    poses = [one for one, good in zip(every, used, strict=True) if good]
+    matrix, _ = _normal_equations(poses, model)
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     left_out = []
-    for index in range(len(places)):
-        # At the optimum, leaving out one pose is one step of the remaining normal equations.
-        without, side = _normal_equations(places[:index] + places[index + 1 :], model)
+    for index in range(len(poses)):
+        # At the optimum, excluding one pose is one step of the remaining normal equations.
+        without, side = _normal_equations(poses[:index] + poses[index + 1 :], model)
         left_out.append(np.linalg.solve(without, side)[:6])
     motions = np.array(left_out)
     count = len(motions)
@@ -625,12 +632,12 @@ def _make_result(
         jackknife_ratio=ratio,
         leave_one_out=motions,
         residuals=tuple(
-            Residual(
+            PoseResidual(
                 name=detection.name,
-                shift_m=float(np.linalg.norm(one.seen[3:])),
-                turn_rad=float(np.linalg.norm(one.seen[:3])),
+                shift_m=float(np.linalg.norm(one.measured[3:])),
+                turn_rad=float(np.linalg.norm(one.measured[:3])),
                 rms_px=one.rms_px,
-                reason="" if good else "does not agree with the others",
+                reason="" if good else "inconsistent with the other poses",
             )
             for detection, one, good in zip(detections, every, used, strict=True)
         ),

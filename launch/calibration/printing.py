@@ -1,7 +1,7 @@
-"""Write boards to print at true size: the black parts as rectangles, as SVG or PNG.
+"""Write calibration boards to print at true size, as SVG or PNG.
 
-The first square is black.  The markers of a ChArUco board are in the white squares, numbered by
-row, as OpenCV's detector expects.
+The first square is black. The white squares of a ChArUco board contain the markers, numbered by row
+as OpenCV's detector expects.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.corners import CalibrationError, charuco_board, describe
+from flexsheet.launch.calibration.corners import CalibrationError, describe, make_charuco_board
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.files import write_file
 
@@ -27,8 +27,7 @@ PNG_DOTS_PER_INCH = 300
 
 
 def find_black_rectangles(board: Board) -> Floats:
-    """Return black parts (n, 4): x, y, width, height in m from the outer corner of the first
-    square.
+    """Return the black rectangles (n, 4): x, y, width, height, m, from the first square's corner.
 
     Raises CalibrationError for markers that do not fit the board.
     """
@@ -41,7 +40,7 @@ def find_black_rectangles(board: Board) -> Floats:
     ]
     if board.kind == "chessboard":
         return np.array(squares)
-    dictionary = charuco_board(board).getDictionary()
+    dictionary = make_charuco_board(board).getDictionary()
     assert board.marker_m is not None
     cells = dictionary.markerSize + 2
     cell_m = board.marker_m / cells
@@ -50,15 +49,15 @@ def find_black_rectangles(board: Board) -> Floats:
         (row, column) for row in range(rows) for column in range(columns) if (row + column) % 2
     ]
     for marker, (row, column) in enumerate(white):
-        picture = cv2.aruco.generateImageMarker(dictionary, marker, cells)
-        for y, x, width in _runs(np.asarray(picture) == 0):
+        image = cv2.aruco.generateImageMarker(dictionary, marker, cells)
+        for y, x, width in _find_runs(np.asarray(image) == 0):
             left, top = column * side + rim_m + x * cell_m, row * side + rim_m + y * cell_m
             squares.append((left, top, width * cell_m, cell_m))
     return np.array(squares)
 
 
-def _runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
-    """Return (row, first column, length) of the black runs of a marker's rows."""
+def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
+    """Return (row, first column, length) of the black runs in a marker image."""
     runs = []
     for y, row in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
@@ -66,16 +65,16 @@ def _runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
     return runs
 
 
-def caption(board: Board) -> str:
-    """Describe the board; printed below it so that a print tells how to use it."""
+def make_caption(board: Board) -> str:
+    """Describe the board and the print scale, for the text below the board."""
     text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
     if board.marker_m is not None:
         text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"
-    return f"{text}. Print at 100 %: the line is {RULER_MM:g} mm long."
+    return f"{text}. Print at 100 %; the line is {RULER_MM:g} mm long."
 
 
-def svg(board: Board) -> str:
-    """Return the board as SVG in millimetres, with a caption and a line to measure the print by."""
+def make_svg(board: Board) -> str:
+    """Return the board as SVG in millimetres, with a caption and a ruler line."""
     border = 1e3 * BORDER_SQUARES * board.square_m
     width = 1e3 * (board.columns + 1) * board.square_m + 2 * border
     height = 1e3 * (board.rows + 1) * board.square_m + 2 * border
@@ -93,7 +92,7 @@ def svg(board: Board) -> str:
             f'<rect width="{width:g}" height="{whole:g}" fill="white"/>',
             *parts,
             f'<text x="{border:g}" y="{height + 0.8 * CAPTION_MM:g}" font-size="4" '
-            f'font-family="sans-serif">{caption(board)}</text>',
+            f'font-family="sans-serif">{make_caption(board)}</text>',
             f'<path d="M {border:g} {ruler_y:g} h {RULER_MM:g}" stroke="black" '
             'stroke-width="0.3"/>',
             "</svg>\n",
@@ -101,28 +100,30 @@ def svg(board: Board) -> str:
     )
 
 
-def raster(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as an image (h, w), white 255; a dot is black where its centre is."""
+def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
+    """Return the board as an image (h, w); pixels whose centre is in a black part are 0, others
+    255.
+    """
     border = BORDER_SQUARES * board.square_m
     across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
     width, height = np.ceil(across * dots_per_m).astype(int)
-    picture = np.full((height, width), 255, np.uint8)
+    image = np.full((height, width), 255, np.uint8)
     for x, y, w, h in find_black_rectangles(board):
         low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
         high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
-        picture[low[1] : high[1], low[0] : high[0]] = 0
-    return picture
+        image[low[1] : high[1], low[0] : high[0]] = 0
+    return image
 
 
 def write_board(board: Board, path: Path) -> None:
-    """Write the board by the path's suffix; raises CalibrationError for another suffix."""
+    """Write the board in the format of the path's suffix.  Raises CalibrationError."""
     suffix = path.suffix.lower()
     if suffix == ".svg":
-        write_file(path, svg(board))
+        write_file(path, make_svg(board))
     elif suffix == ".png":
-        import matplotlib.image  # imported here, since it is slow
+        import matplotlib.image  # slow import
 
-        picture = raster(board, PNG_DOTS_PER_INCH / 0.0254)
-        matplotlib.image.imsave(path, picture, cmap="gray", vmin=0, vmax=255, dpi=PNG_DOTS_PER_INCH)
+        image = rasterize(board, PNG_DOTS_PER_INCH / 0.0254)
+        matplotlib.image.imsave(path, image, cmap="gray", vmin=0, vmax=255, dpi=PNG_DOTS_PER_INCH)
     else:
-        raise CalibrationError(f"{path}: write the board as .svg or .png")
+        raise CalibrationError(f"{path}: unknown image format; use .svg or .png")

@@ -1,7 +1,7 @@
 """Calibrate the projector's optics and pose from the points that its pixels light.
 
-A projector is an inverse camera: each of its pixels lights a point, and two cameras measure that
-point. So points are measured, not assumed, and the sheet may be held anywhere.
+A projector is an inverse camera: each of its pixels lights a point, whose position two cameras
+measure. So the poses of the sheet need not be known.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""Distance between the projector pixels that are searched."""
+"""Distance between the sampled projector pixels, px."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -41,22 +41,25 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""Typical errors of a scene's projector from a tape measure: rotation (rad), position (m), focal
-length (relative), principal point (px). Only the ratios count."""
+"""Typical errors of a scene's projector measured by tape, of which only the ratios matter.
+
+Rotation (rad), position (m), focal length (relative), principal point (px).
+"""
 
 
 class ProjectorError(FlexsheetError, ValueError):
-    """Images or points that give no calibration; the message gives the remedy."""
+    """Raised for images or points that do not determine the projector."""
 
     code = "projector-calibration"
-    remedy = "Take images in more poses, with the whole pattern on the sheet."
+    remedy = "Capture images in more poses, with the whole pattern on the sheet."
 
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
-    """World points (n, 3), the projector's pixels (n, 2) that light them, the pose (n,) of each.
+    """Points lit by projector pixels.
 
-    skew_m: (n,) the distance between the two cameras' rays.
+    world: (n, 3) m. pixels: (n, 2) of the projector. pose: (n,) number of the sheet's pose. skew_m:
+    (n,) distance between the two cameras' rays.
     """
 
     world: Floats
@@ -67,9 +70,9 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """Hold a calibrated projector and its residuals, in projector pixels and metres on the sheet.
+    """Calibrated projector and its residuals, in projector pixels and metres on the sheet.
 
-    held_out_rms_px: of poses that it was fitted without. before_rms_px: of the initial projector.
+    held_out_rms_px: of poses excluded from the fit. before_rms_px: of the initial projector.
     coverage_ratio: fraction of the image's cells with points.
     """
 
@@ -90,10 +93,10 @@ def measure_points(
     camera: StereoCamera,
     projector: Projector,
 ) -> ProjectorPoints:
-    """Triangulate what the projector's pixels light, from left and right images of each pose.
+    """Triangulate the points lit by projector pixels, from left and right images of each pose.
 
-    camera: its optics as calibrated, `world_from_left` from the scene. Raises ProjectorError, which
-    names the pose whose images do not show the patterns.
+    camera: with calibrated optics, and `world_from_left` from the scene. Raises ProjectorError if
+    the patterns cannot be decoded.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
@@ -114,8 +117,9 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """Return world points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance
-    (n,)."""
+    """Return the midpoints (n, 3) between the rays of pixels (n, 2), m, and the rays' distances
+    (n,).
+    """
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(
@@ -139,7 +143,7 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
-    """Return the projector's pixels (n, 2) that light world points (n, 3)."""
+    """Return the projector pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
@@ -147,28 +151,27 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 
 
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
-    """Fit the projector that lights the points, from an initial one.
+    """Fit a projector to points, from an initial projector.
 
-    Raises ProjectorError where the points are too few, too similar in depth, cover too little of
-    the image, or are not of one projector.
+    Raises ProjectorError for too few points, a small depth range or coverage, and large residuals.
     """
     inliers = np.ones(len(points.world), np.bool_)
-    poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
-    coverage = _coverage(points.pixels, guess)
+    poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
+    coverage = _measure_coverage(points.pixels, guess)
     if poses < MIN_POSES or len(points.world) < MIN_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses: hold the sheet in {MIN_POSES} or "
-            f"more, lit and seen by both cameras, for {MIN_POINTS} points at least"
+            f"{len(points.world)} points in {poses} poses; capture at least {MIN_POSES} poses "
+            f"and {MIN_POINTS} points that both cameras see"
         )
     if depth_m < MIN_DEPTH_RANGE_M:
         raise ProjectorError(
-            f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and "
-            f"hold it nearer and farther, over {1e3 * MIN_DEPTH_RANGE_M:.0f} mm at least"
+            f"the depth range of the points is {1e3 * depth_m:.0f} mm; tilt and move the sheet "
+            f"over at least {1e3 * MIN_DEPTH_RANGE_M:.0f} mm along the projection"
         )
     if coverage < MIN_COVERAGE:
         raise ProjectorError(
-            f"the points cover {100 * coverage:.0f} % of the projector's image, "
-            f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not determined elsewhere"
+            f"the points cover {100 * coverage:.0f} % of the projector's image, at least "
+            f"{100 * MIN_COVERAGE:.0f} % are required; move the sheet over the image"
         )
     for _ in range(3):
         projector = _fit_projector(points, inliers, guess)
@@ -182,9 +185,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     rms = _rms(residual_px[inliers])
     if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points: not "
-            "one projector, or the sheet moved between its images; hold it still, check "
-            "the cameras (flexsheet calibrate check)"
+            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points; keep "
+            "the sheet still during each pose, and check the cameras (flexsheet calibrate check)"
         )
     held_out = [
         np.linalg.norm(
@@ -218,14 +220,14 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """Return the range (m) of the central 90 % of the points along the projector's axis."""
+def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
+    """Return the depth range of the central 90 % of the points along the projector's axis, m."""
     pose = guess.world_from_projector
     along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
 
 
-def _coverage(pixels: Floats, projector: Projector) -> float:
+def _measure_coverage(pixels: Floats, projector: Projector) -> float:
     size = np.array([projector.width_px, projector.height_px])
     cells = np.floor(pixels / size * COVERAGE_CELLS).astype(int)
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
@@ -234,9 +236,10 @@ def _coverage(pixels: Floats, projector: Projector) -> float:
 def _fit_projector(
     points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector
 ) -> Projector:
-    """Fit a projector by least squares: square pixels, k1, k2, p1, p2; k3 as in the guess.
+    """Fit a projector by least squares: one focal length, principal point, k1, k2, p1, p2.
 
-    OpenCV's own fit rejects a principal point outside the image, where lens shift puts it.
+    Aspect ratio and k3 are those of the guess. OpenCV's fit rejects a principal point outside the
+    image, which lens shift causes.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -253,8 +256,8 @@ def _fit_projector(
         return camera_matrix(x[6], aspect * x[6], x[7], x[8]), np.array([*x[9:13], k3])
 
     def residuals(x: Floats) -> Floats:
-        seen, _ = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
-        return np.asarray((seen.reshape(-1, 2) - pixels).ravel())
+        projected, _ = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
+        return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
         """Return derivatives by rotation, translation, focal length, principal point, k1 to p2."""
@@ -264,15 +267,15 @@ def _fit_projector(
 
     solved = least_squares(residuals, start, jac=derivatives, x_scale="jac", method="lm")
     matrix, distortion = split(solved.x)
-    found = transform(rotation_from_vector(solved.x[:3]), solved.x[3:6])
-    return _projector(guess, matrix, distortion, inverse(found))
+    fitted = transform(rotation_from_vector(solved.x[:3]), solved.x[3:6])
+    return _make_projector(guess, matrix, distortion, inverse(fitted))
 
 
-def _projector(
-    like: Projector, matrix: Floats, distortion: Floats, world_from_projector: Floats
+def _make_projector(
+    template: Projector, matrix: Floats, distortion: Floats, world_from_projector: Floats
 ) -> Projector:
     k = [float(value) for value in distortion]
-    return like.model_copy(
+    return template.model_copy(
         update={
             "lens": Lens(
                 fx_px=float(matrix[0, 0]),
@@ -289,16 +292,15 @@ def _projector(
     )
 
 
-def keystone(
+def fit_keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
 ) -> ProjectorFit:
-    """Fit the projector whose pixels (4, 2) light the corners of a rectangle on the imaginary
-    screen.
+    """Fit a projector whose pixels (4, 2) light the corners of a rectangle on the virtual screen.
 
-    corners_px: left bottom, right bottom, right top, left top, as the user sees them. The image on
-    the screen, a homography, is matched exactly. Eight numbers (pose, focal length, one of the
-    principal point's) realize it, nearest to the guess's, whose distortion stays. Raises
-    ProjectorError where the corners are no convex quadrangle.
+    corners_px: bottom left, bottom right, top right, top left, from the user's view. The fit
+    matches this homography exactly. Of the projectors that do, it returns the one nearest to the
+    guess, with the guess's distortion. Raises ProjectorError if the corners are not a convex
+    quadrangle.
     """
     x, y = half_width_m, half_height_m
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
@@ -307,42 +309,42 @@ def keystone(
     cross_products = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
-            f"corners {corners_px.tolist()} are no convex quadrangle: give them as left bottom, "
-            "right bottom, right top, left top, as the user sees them"
+            f"corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
+            "bottom right, top right, top left, from the user's view"
         )
     lens, pose = guess.lens, guess.world_from_projector
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)
 
-    def projector(numbers: Floats) -> Projector:
+    def build_projector(numbers: Floats) -> Projector:
         x = numbers * TYPICAL_ERRORS
         correction = transform(rotation_from_vector(x[:3]), x[3:6])
         focal = np.exp(x[6])
         matrix = camera_matrix(
             lens.fx_px * focal, lens.fy_px * focal, lens.cx_px + x[7], lens.cy_px + x[8]
         )
-        return _projector(guess, matrix, np.array(lens.distortion), start @ correction)
+        return _make_projector(guess, matrix, np.array(lens.distortion), start @ correction)
 
     def residuals(numbers: Floats) -> Floats:
-        residual_px = project_points(projector(numbers), world) - corners_px
+        residual_px = project_points(build_projector(numbers), world) - corners_px
         return np.concatenate([residual_px.ravel(), 1e-2 * numbers])
 
     solved = least_squares(residuals, np.zeros(9), x_scale="jac", max_nfev=60)
-    found = projector(solved.x)
-    residual_px = np.linalg.norm(project_points(found, world) - corners_px, axis=1)
+    fitted = build_projector(solved.x)
+    residual_px = np.linalg.norm(project_points(fitted, world) - corners_px, axis=1)
     before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
     if _rms(residual_px) > MAX_RMS_PX:
         raise ProjectorError(
-            f"no projector near the scene's lights these corners "
-            f"({_rms(residual_px):.1f} px left): check their order, and the pose in the scene"
+            f"no projector pose near the scene's fits these corners (residual "
+            f"{_rms(residual_px):.1f} px rms); check their order and the pose in the scene"
         )
-    distance_m = float(np.linalg.norm(found.world_from_projector.position_m))
+    distance_m = float(np.linalg.norm(fitted.world_from_projector.position_m))
     return ProjectorFit(
-        projector=found,
+        projector=fitted,
         rms_px=_rms(residual_px),
         held_out_rms_px=float("nan"),
         before_rms_px=_rms(before),
-        rms_m=_rms(residual_px) * distance_m / found.lens.fx_px,
-        coverage_ratio=_coverage(corners_px, guess),
+        rms_m=_rms(residual_px) * distance_m / fitted.lens.fx_px,
+        coverage_ratio=_measure_coverage(corners_px, guess),
         depth_range_m=0.0,
         poses=1,
         points=4,

@@ -1,6 +1,6 @@
-"""Write a calibration's report: residuals of corners, quality of pairs, coverage, uncertainty.
+"""Write a calibration report: corner residuals, pair quality, coverage and uncertainty.
 
-The report is one page that needs no other file, with its images beside it as PNG.
+The report is one self-contained HTML page; its images are also written as PNG.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""Length in the image of the 95 % longest residual."""
+"""Arrow length of the 95th percentile of the residuals, image px."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -40,15 +40,16 @@ img { max-width: 100%; } figcaption { color: #444; }
 """
 
 
-def epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
-    """Right pixels (n, 2) of all common corners, and their signed distances (n,) px from the
+def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
+    """Return right pixels (n, 2) of all common corners and their epipolar distances (n,), px.
 
-    epipolar lines of the left ones, both undistorted and in the right camera's pixels.
+    The distances are signed, from the undistorted left corner's epipolar line, in the right
+    camera's pixels.
     """
-    rig = StereoRig.of(calibrated.fit.rig)
+    rig = StereoRig.from_fit(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]
     essential = rigid.skew(position) @ rotation
-    places, distances = [], []
+    points, distances = [], []
     for pair in calibrated.pairs.values():
         _, left, right = pair.common()
         rays = []
@@ -58,13 +59,13 @@ def epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
             slopes = cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0]
             rays.append(np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1))
         lines = rays[0] @ essential.T
-        off = (rays[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)
-        distances.append(rig.matrices[1][1, 1] * off)
-        places.append(right)
-    return np.concatenate(places), np.concatenate(distances)
+        error = (rays[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)
+        distances.append(rig.matrices[1][1, 1] * error)
+        points.append(right)
+    return np.concatenate(points), np.concatenate(distances)
 
 
-def _residuals(calibrated: CalibrationResult) -> Figure:
+def _draw_residuals(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 5.0))
     lengths = np.concatenate(
         [np.linalg.norm(view, axis=1) for views in calibrated.fit.residuals for view in views]
@@ -72,11 +73,11 @@ def _residuals(calibrated: CalibrationResult) -> Figure:
     longest = float(np.percentile(lengths, 95.0))
     for side, (axis, name) in enumerate(zip(axes, ("left", "right"), strict=True)):
         views = [(pair.left, pair.right)[side] for pair in calibrated.pairs.values()]
-        places = np.concatenate([view.pixels for view in views])
+        points = np.concatenate([view.pixels for view in views])
         shifts = np.concatenate([residual[side] for residual in calibrated.fit.residuals])
         numbers = np.concatenate([[i] * len(view.ids) for i, view in enumerate(views)])
         arrows = axis.quiver(
-            *places.T,
+            *points.T,
             *shifts.T,
             numbers,
             cmap="turbo",
@@ -86,11 +87,11 @@ def _residuals(calibrated: CalibrationResult) -> Figure:
             width=0.0015,
         )
         axis.quiverkey(arrows, 0.85, 1.03, longest, f"{longest:.2g} px", labelpos="E")
-        _as_picture(axis, calibrated.size, f"{name}: seen minus drawn, a colour a pair")
+        _format_image_axis(axis, calibrated.size, f"{name}: detected - projected, by pair")
     return figure
 
 
-def _pairs(calibrated: CalibrationResult) -> Figure:
+def _draw_pairs(calibrated: CalibrationResult) -> Figure:
     figure, (axis,) = _figure(1, 1, (13.0, 3.6))
     pairs = calibrated.calibration.pairs
     x = np.arange(len(pairs))
@@ -107,12 +108,12 @@ def _pairs(calibrated: CalibrationResult) -> Figure:
     return figure
 
 
-def _coverage(calibrated: CalibrationResult) -> Figure:
+def _draw_coverage(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 3, (15.0, 4.2))
     for axis, side in zip(axes[:2], ("left", "right"), strict=True):
         for pair in calibrated.pairs.values():
             axis.plot(*getattr(pair, side).pixels.T, ".", ms=2.5)
-        _as_picture(axis, calibrated.size, f"corners in the {side} picture")
+        _format_image_axis(axis, calibrated.size, f"corners in the {side} image")
     middle = board_points(calibrated.calibration.board).mean(axis=0)
     tilts, depths = [], []
     for pose in calibrated.fit.poses:
@@ -128,36 +129,36 @@ def _coverage(calibrated: CalibrationResult) -> Figure:
     return figure
 
 
-def _epipolar(calibrated: CalibrationResult) -> Figure:
+def _draw_epipolar(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 4.6))
-    places, off = epipolar_distances(calibrated)
-    largest = float(np.percentile(np.abs(off), 98.0))
+    pixels, error = compute_epipolar_distances(calibrated)
+    largest = float(np.percentile(np.abs(error), 98.0))
     points = axes[0].scatter(
-        places[:, 0], places[:, 1], c=off, s=7, cmap="coolwarm", vmin=-largest, vmax=largest
+        pixels[:, 0], pixels[:, 1], c=error, s=7, cmap="coolwarm", vmin=-largest, vmax=largest
     )
     figure.colorbar(points, ax=axes[0], label="px")
-    _as_picture(axes[0], calibrated.size, "right: distance from the epipolar line")
-    axes[1].hist(off, bins=60, range=(-2 * largest, 2 * largest))
-    rms = float(np.sqrt(np.mean(off**2)))
+    _format_image_axis(axes[0], calibrated.size, "right: distance from the epipolar line")
+    axes[1].hist(error, bins=60, range=(-2 * largest, 2 * largest))
+    rms = float(np.sqrt(np.mean(error**2)))
     axes[1].set(xlabel="distance, px", ylabel="corners", title=f"rms {rms:.3f} px")
     return figure
 
 
 def _figure(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure  # imported here, since it is slow
+    from matplotlib.figure import Figure  # slow import
 
     figure = Figure(figsize=size_in, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.ravel())
 
 
-def _as_picture(axis: Axes, size: tuple[int, int], title: str) -> None:
+def _format_image_axis(axis: Axes, size: tuple[int, int], title: str) -> None:
     axis.set(xlim=(0, size[0]), ylim=(size[1], 0), title=title)
     axis.set_aspect("equal")
 
 
-def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
-    """Return (name, value, standard deviation) of the rig's 22 numbers."""
+def list_parameters(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
+    """Return (name, value, standard deviation) of the rig's 22 parameters."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -168,24 +169,24 @@ def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, floa
 
 
 def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
-    """Write `index.html` and the images into a folder, which is made; returns the page."""
+    """Write `index.html` and its images to a folder, created if missing; return the page's path."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = calibrated.calibration
     board, uncertainty = calibration.board, calibration.uncertainty
     assert uncertainty is not None
-    drawn = {
-        "residuals": (_residuals, "Residuals. Arrows that flow together tell of a lens that the "
-                      "model does not know, or of a board that is not flat."),
-        "pairs": (_pairs, "Root mean square per pair; red: left out."),
-        "coverage": (_coverage, "Where the board was. Blank parts of a picture are guessed."),
-        "epipolar": (_epipolar, "Epipolar residuals: noise of the corners that no depth explains."),
+    drawings = {
+        "residuals": (_draw_residuals, "Residuals. Neighbouring arrows in one direction indicate a "
+                      "wrong lens model or a board that is not flat."),
+        "pairs": (_draw_pairs, "Rms residual per pair; red: excluded."),
+        "coverage": (_draw_coverage, "Board positions. The lens is extrapolated in blank areas."),
+        "epipolar": (_draw_epipolar, "Epipolar residuals: corner noise, independent of depth."),
     }  # fmt: skip
     figures = []
-    for name, (draw, text) in drawn.items():
-        picture = BytesIO()
-        draw(calibrated).savefig(picture, format="png", dpi=DOTS_PER_INCH)
-        write_file(folder / f"{name}.png", picture.getvalue())
-        coded = base64.b64encode(picture.getvalue()).decode()
+    for name, (draw, text) in drawings.items():
+        image = BytesIO()
+        draw(calibrated).savefig(image, format="png", dpi=DOTS_PER_INCH)
+        write_file(folder / f"{name}.png", image.getvalue())
+        coded = base64.b64encode(image.getvalue()).decode()
         figures.append(
             f'<figure><img alt="{name}" src="data:image/png;base64,{coded}">'
             f"<figcaption>{text}</figcaption></figure>"
@@ -195,20 +196,20 @@ def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
         ("device", calibration.device),
         ("date", calibration.date),
         ("board", f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"),
-        ("pictures", f"{calibration.width_px}x{calibration.height_px} px"),
+        ("images", f"{calibration.width_px}x{calibration.height_px} px"),
         ("pairs", f"{used} of {len(calibration.pairs)} used"),
         ("reprojection", f"{calibration.reprojection_rms_px:.3f} px rms"),
-        ("corner noise", f"{uncertainty.corner_sigma_px:.3f} px a coordinate"),
+        ("corner noise", f"{uncertainty.corner_sigma_px:.3f} px per coordinate"),
         (
             "uncertainty of a fingertip",
-            f"{1e3 * uncertainty.depth_std_m:.3f} mm in depth, "
-            f"{1e3 * uncertainty.lateral_std_m:.3f} mm across (one standard deviation) at "
+            f"{1e3 * uncertainty.depth_std_m:.3f} mm depth, "
+            f"{1e3 * uncertainty.lateral_std_m:.3f} mm lateral (one standard deviation) at "
             f"{1e3 * uncertainty.working_distance_m:.0f} mm",
         ),
         (
-            "refits without some pairs",
-            f"scatter {uncertainty.jackknife_ratio:.2f} times as much as the fit alone states"
-            + ("; the uncertainty was raised to that" if uncertainty.jackknife_ratio > 1 else ""),
+            "jackknife scatter over fit uncertainty",
+            f"{uncertainty.jackknife_ratio:.2f}"
+            + ("; the uncertainty is scaled by it" if uncertainty.jackknife_ratio > 1 else ""),
         ),
         ("software", f"flexsheet {calibration.code_version}, OpenCV {calibration.opencv_version}"),
     ]
@@ -225,13 +226,13 @@ def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
             f"<h1>Calibration of {html.escape(calibration.device)}</h1><table>",
             *(f"<tr><td>{name}</td><td>{html.escape(str(text))}</td></tr>" for name, text in facts),
             "</table>",
-            *(["<h2>Left out</h2><ul>", *left_out, "</ul>"] if left_out else []),
+            *(["<h2>Excluded pairs</h2><ul>", *left_out, "</ul>"] if left_out else []),
             *figures,
-            "<h2>The rig's numbers</h2><table><tr><th>number</th><th>value</th><th>standard "
+            "<h2>Parameters of the rig</h2><table><tr><th>name</th><th>value</th><th>standard "
             "deviation</th></tr>",
             *(
                 f"<tr><td>{name}</td><td>{value:.6g}</td><td>{deviation:.2g}</td></tr>"
-                for name, value, deviation in parameter_rows(calibrated)
+                for name, value, deviation in list_parameters(calibrated)
             ),
             "</table></body></html>\n",
         ]

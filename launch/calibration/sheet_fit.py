@@ -20,18 +20,17 @@ Bools = NDArray[np.bool_]
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
-"""Error of the model itself; residuals are weighted by this fraction of the force and by the
-noise."""
+"""Error of the model as a fraction of the force; residuals are weighted by it and the noise."""
 
 OUTLIER_SIGMAS = 5.0
-"""A row with a larger residual is an outlier; the fit is repeated without it."""
+"""Residual of an outlier row, in standard deviations; the fit is repeated without outliers."""
 
 MAX_RELATIVE_DEVIATION = 0.5
-"""A parameter with a larger relative standard deviation is undetermined."""
+"""Maximum relative standard deviation of a determined parameter."""
 
 
 class SheetModelFitError(FlexsheetError, ValueError):
-    """Raised for rows that do not determine the model; the message names what is missing."""
+    """Raised for rows that do not determine the model."""
 
     code = "sheet-model-fit"
     remedy = "Add pushes at other stretches and depths."
@@ -39,10 +38,9 @@ class SheetModelFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPush:
-    """Hold one measured push.
+    """One measured push.
 
-    position_m: on the stretched sheet.
-    edge_force_n: None if not measured.
+    position_m: on the stretched sheet, from its centre. edge_force_n: None if not measured.
     """
 
     edge_distance_m: float
@@ -55,13 +53,12 @@ class MeasuredPush:
 
 @dataclass(frozen=True, slots=True)
 class SheetModelFit:
-    """Hold the fitted model and its uncertainty.
+    """Fitted sheet model and its uncertainty.
 
-    law: takes stretch ratios over the nominal width.
-    names, values, standard_deviations: the fitted parameters, in the same order.
-    used: (n,), which rows.
-    residual_ratio: (n,) measured over fitted force, minus one.
-    rms_ratio: of the used rows above the noise.
+    law: model as a function of the stretch ratio over the nominal width. names, values,
+    standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows without
+    outliers. residual_ratio: (n,) measured over fitted force, minus one. rms_ratio, worst_ratio: of
+    the used rows with forces above the noise.
     """
 
     law: ScaledSheetModel
@@ -80,22 +77,22 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_sh
 def fit_sheet_model(
     pushes: Sequence[MeasuredPush], nominal: Rubber, *, with_mooney: bool = False
 ) -> SheetModelFit:
-    """Fit modulus x thickness, slack width, cubic ratio and optionally the Mooney fraction.
+    """Fit modulus times thickness, slack width, cubic ratio and optionally the Mooney weight.
 
-    Robust least squares: soft L1, then without outliers.  Raises SheetModelFitError for too few
-        rows, or rows that leave a parameter undetermined.
+    Robust least squares: soft L1, then without outliers. Raises SheetModelFitError for too few
+    rows, and for rows that do not determine a parameter.
     """
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
         raise SheetModelFitError(
-            f"{len(pushes)} rows; {2 * len(names)} or more are needed for {names}"
+            f"{len(pushes)} rows; fitting {', '.join(names)} requires at least {2 * len(names)}"
         )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
     high = np.array([start[0] + 7.0, 0.1, 2.0, 0.95])
     size = len(names)
 
-    def model_at(numbers: Floats) -> ScaledSheetModel:
+    def build_model(numbers: Floats) -> ScaledSheetModel:
         return make_model(
             nominal,
             modulus_thickness_n_per_m=float(np.exp(numbers[0])),
@@ -105,7 +102,7 @@ def fit_sheet_model(
         )
 
     def residuals(numbers: Floats, used: Bools) -> Floats:
-        return _residuals(model_at(numbers), pushes, nominal.width_m, used)
+        return _residuals(build_model(numbers), pushes, nominal.width_m, used)
 
     used = np.ones(len(pushes), dtype=bool)
     for loss in ("soft_l1", "linear"):
@@ -119,22 +116,24 @@ def fit_sheet_model(
         )
         start[:size] = solved.x
         if loss == "soft_l1":
-            off = np.abs(_residuals(model_at(solved.x), pushes, nominal.width_m, used, fold=True))
-            used = off <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(off)))
+            error = np.abs(
+                _residuals(build_model(solved.x), pushes, nominal.width_m, used, fold=True)
+            )
+            used = error <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(error)))
             if used.sum() < 2 * size:
                 raise SheetModelFitError(
-                    f"{int((~used).sum())} of {len(pushes)} rows contradict the others: no model "
-                    "fits them; check units and signs"
+                    f"{int((~used).sum())} of {len(pushes)} rows contradict the others; check "
+                    "units and signs"
                 )
     freedom = max(len(solved.fun) - size, 1)
     spread = max(1.0, float(solved.fun @ solved.fun) / freedom)
     information = solved.jac.T @ solved.jac
     if np.linalg.cond(information) > 1e14:
         raise SheetModelFitError(
-            "the rows do not determine all parameters: push at several stretches and depths"
+            "the rows do not determine all parameters; add other stretches and depths"
         )
     deviations = np.sqrt(np.diag(np.linalg.inv(information)) * spread)
-    law = model_at(solved.x)
+    law = build_model(solved.x)
     values = (
         law.rubber.young_modulus_pa * law.rubber.thickness_m,
         law.rubber.width_m,
@@ -142,12 +141,12 @@ def fit_sheet_model(
         law.rubber.mooney_share,
     )[:size]
     scale = (values[0], nominal.width_m, values[2], 1.0)[:size]
-    stated = tuple(float(d) * one for d, one in zip(deviations, scale, strict=True))
+    scaled = tuple(float(d) * one for d, one in zip(deviations, scale, strict=True))
     if deviations[0] > MAX_RELATIVE_DEVIATION or deviations[2] > 2.0 * MAX_RELATIVE_DEVIATION:
-        at = 0 if deviations[0] > MAX_RELATIVE_DEVIATION else 2
+        index = 0 if deviations[0] > MAX_RELATIVE_DEVIATION else 2
         raise SheetModelFitError(
-            f"{names[at]} is known to {100 * deviations[at]:.0f} % only: push at more stretches, "
-            "and to greater depths"
+            f"{names[index]} has an uncertainty of {100 * deviations[index]:.0f} %; add more "
+            "stretches and greater depths"
         )
     ratio = _force_ratios(law, pushes, nominal.width_m)
     force = np.array([push.force_n for push in pushes])
@@ -157,7 +156,7 @@ def fit_sheet_model(
         law=law,
         names=names,
         values=values,
-        standard_deviations=stated,
+        standard_deviations=scaled,
         used=used,
         residual_ratio=ratio,
         rms_ratio=float(np.sqrt(np.mean(ratio[counted] ** 2))),
@@ -168,8 +167,7 @@ def fit_sheet_model(
 def _predict(
     law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
 ) -> tuple[Floats, Floats]:
-    """Return the model's forces and edge forces (n,), N, with one call for pushes that differ in
-    depth only."""
+    """Compute forces and edge forces (n,), N, with one call for pushes that differ in depth."""
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -192,19 +190,23 @@ def _residuals(
     *,
     fold: bool = False,
 ) -> Floats:
-    """Return weighted residuals: the used rows' forces, then their edge forces; or, folded, the
-    larger of the two for every row (n,)."""
+    """Return weighted residuals of the used rows: forces, then edge forces.
+
+    fold: return the larger of both magnitudes for every row (n,) instead.
+    """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
-    pulled = np.array(
+    measured_edges = np.array(
         [np.nan if push.edge_force_n is None else push.edge_force_n for push in pushes]
     )
-    pressing = (forces - measured) / np.hypot(FORCE_NOISE_N, MODEL_ERROR_RATIO * measured)
-    pulling = (edges - pulled) / np.hypot(EDGE_NOISE_N, MODEL_ERROR_RATIO * pulled)
+    force_error = (forces - measured) / np.hypot(FORCE_NOISE_N, MODEL_ERROR_RATIO * measured)
+    edge_error = (edges - measured_edges) / np.hypot(
+        EDGE_NOISE_N, MODEL_ERROR_RATIO * measured_edges
+    )
     if fold:
-        larger: Floats = np.fmax(np.abs(pressing), np.abs(pulling))
+        larger: Floats = np.fmax(np.abs(force_error), np.abs(edge_error))
         return larger
-    return np.concatenate([pressing[used], pulling[used & np.isfinite(pulled)]])
+    return np.concatenate([force_error[used], edge_error[used & np.isfinite(measured_edges)]])
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
@@ -218,10 +220,11 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
 def tabulate_pushes(
     law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
 ) -> TabulatedSheetModel:
-    """Tabulate the used rows over the model; SheetModelFitError unless they form a full grid.
+    """Tabulate the used rows relative to the model.
 
-    Stretches, x and y must occur in all combinations (positions by their distance from the centre).
-    Depths may differ between them; they are interpolated to common depths that all rows cover.
+    Every combination of stretch, x and y must occur, with points given by their distance from the
+    centre. Depths may differ; they are interpolated to the range common to all combinations. Raises
+    SheetModelFitError for an incomplete grid.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0
@@ -238,22 +241,24 @@ def tabulate_pushes(
         (s, x, y) for s in axes[0] for x in axes[1] for y in axes[2] if (s, x, y) not in cells
     ]
     if not cells or missing:
-        what = f"no rows at stretch, x, y {missing[0]}" if missing else "no row is left"
-        raise SheetModelFitError(f"{what}: a table needs every combination of stretch and position")
+        what = f"no rows at stretch, x, y {missing[0]}" if missing else "no usable rows"
+        raise SheetModelFitError(
+            f"{what}; a table requires all combinations of stretch and position"
+        )
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
     if not shallowest < deepest:
         raise SheetModelFitError(
-            "a table needs depths that all stretches and positions have in common"
+            "the stretches and positions have no common depth range, which a table requires"
         )
-    least = min(len({depth for depth, _ in rows}) for rows in cells.values())
-    depths = np.geomspace(shallowest, deepest, max(2, min(least, 12)))
+    count = min(len({depth for depth, _ in rows}) for rows in cells.values())
+    depths = np.geomspace(shallowest, deepest, max(2, min(count, 12)))
     entries = np.empty((len(axes[0]), len(depths), len(axes[1]), len(axes[2])))
     for (s, x, y), rows in cells.items():
         known = np.unique([depth for depth, _ in rows])
         means = [np.mean([r for depth, r in rows if depth == one]) for one in known]
-        at = (axes[0].index(s), slice(None), axes[1].index(x), axes[2].index(y))
-        entries[at] = np.interp(np.log(depths), np.log(known), means)
+        index = (axes[0].index(s), slice(None), axes[1].index(x), axes[2].index(y))
+        entries[index] = np.interp(np.log(depths), np.log(known), means)
     return TabulatedSheetModel(
         law, np.array(axes[0]), depths, np.array(axes[1]), np.array(axes[2]), entries
     )

@@ -1,4 +1,4 @@
-"""Simulate pushes of the sheet by the simulator's membrane, for calibration and reference."""
+"""Simulate pushes of the sheet with the simulator's membrane, for calibration and reference."""
 
 from __future__ import annotations
 
@@ -17,58 +17,60 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
-"""Residual tension of slack rubber, in shear moduli: a hundredth of that in the graph, where the
-sheet may hang.  With the larger one, a small push into a sheet that is just not taut would have
-three times its force."""
+"""Residual tension of slack rubber, in shear moduli, for a sheet that is taut.
+
+The graph uses a hundred times as much, since there the sheet may hang. For a sheet that is barely
+slack, that would triple the force of a small push.
+"""
 
 
-def twin_push(
+def simulate_push(
     sheet: SheetSpec,
     stretch_ratio: float,
     depth_m: float,
-    place_m: tuple[float, float],
+    point_m: tuple[float, float],
     finger_radius_m: float,
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Return the force along the sheet's normal and the mean force on a clamp, N.
+    """Return the normal force of a push and the mean force on a clamp, N.
 
-    place_m: pushed position on the sheet (x, y from its centre).
+    point_m: pushed point on the sheet (x, y from its centre).
     """
     half = 0.5 * sheet.width_m * stretch_ratio
     pushed = solve(
         Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
         transform(np.eye(3), [-half, 0.0, 0.0]),
         transform(np.eye(3), [half, 0.0, 0.0]),
-        finger_tip=np.array([*place_m, -depth_m]),
+        finger_tip=np.array([*point_m, -depth_m]),
         finger_radius_m=finger_radius_m,
         cells=cells,
         slack_tension=JUST_TAUT_TENSION if stretch_ratio >= 1.0 else SLACK_TENSION,
     )
-    pull = 0.5 * (pushed.left_force_n[0] - pushed.right_force_n[0])
-    return float(pushed.finger_force_n[2]), float(pull)
+    clamp_force_n = 0.5 * (pushed.left_force_n[0] - pushed.right_force_n[0])
+    return float(pushed.finger_force_n[2]), float(clamp_force_n)
 
 
-def twin_force(
+def simulate_force(
     sheet: SheetSpec,
     stretch_ratio: float,
     depth_m: float,
-    place_m: tuple[float, float],
+    point_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """Return the normal force of `twin_push`, N."""
-    return twin_push(sheet, stretch_ratio, depth_m, place_m, finger_radius_m)[0]
+    """Return the normal force of `simulate_push`, N."""
+    return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
 
-def twin_points(
+def simulate_points(
     scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
 ) -> Floats:
-    """Return points (n, 3) m of the simulated sheet, clamped at two edges under a fingertip."""
-    pushed = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
+    """Return points (n, 3) of the simulated sheet between two edges under a fingertip, m."""
+    pushed = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     return pushed.positions.reshape(-1, 3)
 
 
-def true_sheet(
+def solve_sheet(
     scene: Scene,
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
@@ -85,23 +87,22 @@ def true_sheet(
     )
 
 
-def twin_errors(
+def make_error_function(
     scene: Scene,
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> Callable[[Image, Image], Floats]:
-    """Return a function that evaluates projector images of both coordinate ramps.
+    """Make a function that computes image errors from projector images of both coordinate ramps.
 
-    It returns the errors (n,), m, at all points of the simulated sheet that the scene's eye sees.
+    It returns the errors (n,), m, at all points of the simulated sheet that are visible to the eye.
     """
-    sheet = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
+    sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m
 
     def errors(coordinate_ramp_x: Image, coordinate_ramp_y: Image) -> Floats:
         x, y = (
-            seen(picture, sheet, scene, eye=eye)
-            for picture in (coordinate_ramp_x, coordinate_ramp_y)
+            seen(image, sheet, scene, eye=eye) for image in (coordinate_ramp_x, coordinate_ramp_y)
         )
         return error_map(x, y, METRES_PER_PX).sizes_m
 

@@ -1,7 +1,7 @@
 """Calibrate a stereo rig from images of a board.
 
-Lens model: pinhole with k1, k2, p1, p2.  k3 stays 0, since boards that fill less than the image
-    cannot separate it from k2.
+The lens model is a pinhole with k1, k2, p1, p2. k3 is fixed to 0, since boards that do not fill the
+image cannot separate it from k2.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ from flexsheet.launch.calibration.corners import (
     find_pairs,
     ignore_progress,
 )
-from flexsheet.launch.calibration.selection import PairSelection, fit_selection, not_determined
+from flexsheet.launch.calibration.selection import (
+    PairSelection,
+    fit_selection,
+    make_undetermined_error,
+)
 from flexsheet.launch.calibration.uncertainty import (
+    compute_jackknife_covariance,
+    compute_position_jacobian,
+    compute_position_std,
     compute_right_from_left,
-    jackknife_covariance,
-    position_slopes,
-    position_spread,
-    view_of_work,
+    sample_working_plane,
 )
 from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
 from flexsheet.messages.scene import Lens
@@ -46,12 +50,15 @@ from flexsheet.messages.scene import Lens
 Floats = NDArray[np.float64]
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
-"""Maximum depth error as a fraction of the working distance; above, the rig is undetermined."""
+"""Maximum depth error as a fraction of the working distance; above it, the rig is undetermined."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """Hold a calibration and its input for a report; pairs are numbered among all pairs."""
+    """Calibration with its fit and board pairs, for a report.
+
+    pairs: the used ones, by their number among all pairs.
+    """
 
     calibration: StereoCalibration
     fit: RigFit
@@ -70,22 +77,22 @@ def calibrate_stereo(
 ) -> CalibrationResult:
     """Calibrate a rig from pairs of images of a board.
 
-    Some pairs and corners are left out, with the reason kept in the result: pairs without the
-    board, pairs that repeat an earlier one, and pairs that contradict the others grossly
-    (`misfits`). Also left out are single corners six standard deviations off, and pairs whose
-    residual then exceeds three times the median and half a pixel.
+    Excludes pairs without the board, repeated pairs, and pairs that contradict the others
+    (`compute_misfits`). Then excludes corners with residuals above six standard deviations, and
+    pairs with residuals above three times the median and half a pixel.  The result contains the
+    reasons.
 
-    working_distance_m: where the uncertainty is stated; None: at the median distance of the boards.
+    working_distance_m: distance for the uncertainty; None: median distance of the boards.
 
-    Raises CalibrationError when the images cannot be used, fewer than MIN_PAIRS pairs remain, or
-    they do not determine the rig.
+    Raises CalibrationError for unusable images, fewer than MIN_PAIRS remaining pairs, or an
+    undetermined rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     selection = PairSelection(found, [path.name for path in left_paths])
     points = board_points(board)
     fit = fit_selection(selection, points, size)
     try:
-        uncertainty = state_uncertainty(
+        uncertainty = compute_uncertainty(
             fit,
             selection.pairs(),
             points,
@@ -94,13 +101,13 @@ def calibrate_stereo(
             progress=progress,
         )
     except NotDeterminedError as error:
-        raise not_determined(len(selection.good), str(error)) from error
+        raise make_undetermined_error(len(selection.good), str(error)) from error
     if uncertainty.depth_std_m > MAX_DEPTH_ERROR_FRACTION * uncertainty.working_distance_m:
-        said = (
+        reason = (
             f"depth at {1e3 * uncertainty.working_distance_m:.0f} mm is uncertain by "
             f"{1e3 * uncertainty.depth_std_m:.0f} mm"
         )
-        raise not_determined(len(selection.good), said)
+        raise make_undetermined_error(len(selection.good), reason)
     residuals = selection.residuals
     calibration = StereoCalibration(
         device=device,
@@ -132,7 +139,7 @@ def calibrate_stereo(
     return CalibrationResult(calibration, fit, selection.good, size)
 
 
-def state_uncertainty(
+def compute_uncertainty(
     fit: RigFit,
     pairs: Sequence[BoardPair],
     points: Floats,
@@ -141,19 +148,19 @@ def state_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """Return the rig's covariance, and the uncertainty of a fingertip at `distance_m` that follows.
+    """Return the rig's covariance and the resulting uncertainty of a fingertip at `distance_m`.
 
-    Where refits without some of the pairs scatter more than the covariance, it is raised to theirs.
+    If jackknife refits scatter more than the covariance predicts, it is scaled up to their scatter.
     """
     if distance_m is None:
         middles = [pose_transform(pose) @ [*points.mean(axis=0), 1.0] for pose in fit.poses]
         distance_m = float(np.median([middle[2] for middle in middles]))
-    slopes = position_slopes(fit.rig, view_of_work(fit.rig, size, distance_m))
-    refits = jackknife_covariance(fit, pairs, points, progress)
-    stated = float(np.hypot(*position_spread(slopes, fit.covariance)))
-    ratio = float(np.hypot(*position_spread(slopes, refits))) / stated
+    slopes = compute_position_jacobian(fit.rig, sample_working_plane(fit.rig, size, distance_m))
+    refits = compute_jackknife_covariance(fit, pairs, points, progress)
+    stated = float(np.hypot(*compute_position_std(slopes, fit.covariance)))
+    ratio = float(np.hypot(*compute_position_std(slopes, refits))) / stated
     covariance = fit.covariance * max(1.0, ratio) ** 2
-    depth_m, lateral_m = position_spread(slopes, covariance)
+    depth_m, lateral_m = compute_position_std(slopes, covariance)
     return Uncertainty(
         corner_sigma_px=fit.sigma_px,
         jackknife_ratio=ratio,
@@ -166,6 +173,6 @@ def state_uncertainty(
 
 
 def make_lens(numbers: Floats) -> Lens:
-    """Make a scene's lens from its eight numbers."""
+    """Make a lens from eight numbers: fx, fy, cx, cy (px) and the distortion k1, k2, p1, p2."""
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

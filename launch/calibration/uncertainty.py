@@ -1,8 +1,7 @@
-"""Compute the error of a measured fingertip that follows from the uncertainty of the rig.
+"""Compute the error of a measured fingertip caused by the uncertainty of the rig.
 
-It follows to first order from the covariance of the rig's numbers.  A jackknife, which leaves pairs
-out, also covers common errors of corners, a board that is not flat, and a lens that differs from
-the model.
+The error follows to first order from the covariance of the rig's parameters. A delete-a-group
+jackknife also covers common corner errors, a warped board and deviations from the lens model.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from flexsheet.launch.calibration.bundle import (
     STAND,
     RigFit,
     fit_rig,
-    floats,
     lens_arrays,
     pose_transform,
+    to_floats,
 )
 from flexsheet.launch.calibration.corners import BoardPair, Progress, ignore_progress
 from flexsheet.nodes.models import rigid
@@ -30,17 +29,16 @@ from flexsheet.nodes.models import rigid
 Floats = NDArray[np.float64]
 
 GROUPS = 20
-"""Maximum number of refits of the jackknife; with more pairs, several are left out at a time."""
+"""Maximum number of jackknife refits; with more pairs, several are left out at a time."""
 
 
-def view_of_work(
+def sample_working_plane(
     rig: Floats, size: tuple[int, int], distance_m: float, *, across: int = 5
 ) -> Floats:
-    """Return points (n, 3) in the left camera's frame, `distance_m` deep, where a fingertip is
-    measured.
+    """Sample points (n, 3), m, at depth `distance_m` in the left camera's frame.
 
-    They are a grid over the middle half, in both directions, of the left image, as far as the right
-    image shows it.
+    They are a grid over the middle half of the left image's width and height, without points
+    outside the right image.
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
@@ -48,17 +46,18 @@ def view_of_work(
     pixels = np.stack(np.meshgrid(fractions * (width - 1), fractions * (height - 1)), axis=-1)
     slopes = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion)[:, 0]
     points = distance_m * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
-    seen, _ = cv2.projectPoints(points, rig[STAND][:3], rig[STAND][3:], *lens_arrays(rig[RIGHT]))
-    inside = ((seen[:, 0] >= 0) & (seen[:, 0] <= np.array([width, height]) - 1)).all(axis=1)
+    right_px, _ = cv2.projectPoints(
+        points, rig[STAND][:3], rig[STAND][3:], *lens_arrays(rig[RIGHT])
+    )
+    inside = ((right_px[:, 0] >= 0) & (right_px[:, 0] <= np.array([width, height]) - 1)).all(axis=1)
     return points[inside] if inside.any() else points
 
 
-def position_slopes(rig: Floats, points: Floats) -> Floats:
-    """Return the Jacobian (n, 3, 22) of triangulate_corners positions (n, 3) by the rig's numbers.
+def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
+    """Return the Jacobian (n, 3, 22) of triangulated positions (n, 3) by the rig's parameters.
 
-    A fingertip's pixels p = f(x, rig) are given.  The point of least squared image error then obeys
-    A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig, hence dx/drig =
-    -(A'A)^-1 A'B.
+    For fixed pixels p = f(x, rig), the point of least squared image error obeys A dx + B drig = 0
+    in the least-squares sense, with A = df/dx and B = df/drig. So dx/drig = -(A'A)^-1 A'B.
     """
     count = len(points)
     by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
@@ -74,38 +73,36 @@ def position_slopes(rig: Floats, points: Floats) -> Floats:
     by_rig[:, 2:, RIGHT] = slope[..., 6:14]
     by_rig[:, 2:, STAND] = slope[..., :6]
     across = by_point.transpose(0, 2, 1)
-    return floats(-np.linalg.solve(across @ by_point, across @ by_rig))
+    return to_floats(-np.linalg.solve(across @ by_point, across @ by_rig))
 
 
-def position_spread(slopes: Floats, covariance: Floats) -> tuple[float, float]:
-    """Return standard deviations (depth, lateral) m, root mean square over the points of `slopes`.
+def compute_position_std(slopes: Floats, covariance: Floats) -> tuple[float, float]:
+    """Return standard deviations (depth, lateral), m, root mean square over the points.
 
-    covariance: of the rig (22, 22).
-
-    Lateral means x and y together.
+    slopes: (n, 3, 22). covariance: of the rig (22, 22). Lateral combines x and y.
     """
     variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)
     return float(np.sqrt(variances[2])), float(np.sqrt(variances[0] + variances[1]))
 
 
-def jackknife_covariance(
+def compute_jackknife_covariance(
     fit: RigFit,
     pairs: Sequence[BoardPair],
     board: Floats,
     progress: Progress = ignore_progress,
 ) -> Floats:
-    """Return the covariance (22, 22) of the rig from refits without some of the pairs each.
+    """Return the covariance (22, 22) of the rig from refits that each leave out some pairs.
 
-    The delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5): (G -
+    Delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5): (G -
     1)/G times the scatter of the G refits about their mean.
     """
     groups = min(GROUPS, len(pairs))
     rigs = []
     for group in range(groups):
-        kept = [i for i in range(len(pairs)) if i % groups != group]
-        refit = fit_rig([pairs[i] for i in kept], board, rig=fit.rig, poses=fit.poses[kept])
+        used = [i for i in range(len(pairs)) if i % groups != group]
+        refit = fit_rig([pairs[i] for i in used], board, rig=fit.rig, poses=fit.poses[used])
         rigs.append(refit.rig)
-        progress(group + 1, groups, "leaving pairs out")
+        progress(group + 1, groups, "jackknife refits")
     scatter = np.array(rigs) - np.mean(rigs, axis=0)
     return np.asarray((groups - 1) / groups * scatter.T @ scatter)
 

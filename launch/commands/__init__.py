@@ -1,4 +1,4 @@
-"""Define the subcommands of `flexsheet`, one module per command.
+"""Subcommands of `flexsheet`, one module per command.
 
-Libraries are imported when a command runs, so that help and `topic list` start fast.
+Commands import libraries when they run, so that help and `topic list` start quickly.
 """

@@ -42,21 +42,21 @@ TOPICS = ("arm_left", "arm_right")
 CONFIRMATION_TIMEOUT_S = 3.0
 MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
-ReasonOption = Annotated[str, typer.Option("--reason", help="Reason to show and to log.")]
+ReasonOption = Annotated[str, typer.Option("--reason", help="Reason that is shown and logged.")]
 
 
 @app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Show the state of both arms; exit code 1 if one does not report."""
+    """Print the state of both arms; exit code 1 if an arm does not report."""
     raise typer.Exit(run_interruptible(_command(run, None, lambda arms: len(arms) == 2, as_json)))
 
 
 @app.command("ready", hidden=True, epilog=examples("flexsheet arms ready"))
 @app.command(epilog=examples("flexsheet arms enable"))
 def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Let the arms move.  Make sure first that nobody is near them.
+    """Allow the arms to move; make sure first that nobody is near them.
 
-    Exit code 1 if an arm refuses; its reason is shown.
+    Exit code 1 if an arm refuses; prints its reason.
     """
     from flexsheet.messages.types import Arming
 
@@ -71,7 +71,7 @@ def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
 @app.command("stand-down", hidden=True, epilog=examples("flexsheet arms stand-down"))
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
 def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Bring both arms to rest and slacken the sheet, until `flexsheet arms enable`."""
+    """Stop both arms and slacken the sheet, until `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
     message = Arming(ready=False, reason=reason)
@@ -86,9 +86,9 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop, which latches; it never replaces the hard-wired stop.
+    """Engage the software e-stop, which latches; it does not replace the hard-wired e-stop.
 
-    Without --run, all graphs of this user on this computer stop.
+    Without --run, stops all graphs of this user on this computer.
 
     Exit code 0 if a launcher or a bridge has confirmed the stop, or both arms report it.
     """
@@ -128,7 +128,7 @@ async def _confirm_stop(
         silent += [side for side in SIDES if side not in arms.states]
         words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}")
     if any(one.outcome is StopOutcome.REFUSED for one in attempts):
-        words.print("another tool holds the endpoint of the topic estop")
+        words.print("another tool is using the endpoint of the topic estop")
     return 0 if confirmed else FAILED
 
 
@@ -140,8 +140,8 @@ def reset(
 ) -> None:
     """Clear an e-stop and latched faults of arms at rest.
 
-    Arms with `arming: manual` stay where they are until `flexsheet arms enable`.  Simulated arms
-    with `arming: auto` move as soon as there is a target.
+    Arms with `arming: manual` do not move until `flexsheet arms enable`. Simulated arms with
+    `arming: auto` move as soon as they receive a target.
     """
     from flexsheet.messages.types import EStop
 
@@ -157,7 +157,7 @@ def reset(
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Return what the arms of a plan do after a reset, by their bridges' `arming`."""
+    """Return a text about what the arms do after a reset, from their bridges' `arming`."""
     arming = {
         str(node.arm_side): node.parameters.get("arming")
         for node in plan.nodes.values()
@@ -167,14 +167,16 @@ def _describe_reset(plan: ResolvedGraph) -> str:
     free = [side for side in arming if side not in waiting]
     sentences = ["reset"]
     if waiting:
-        sentences.append(f"{' and '.join(waiting)}: moves again only after flexsheet arms enable")
+        sentences.append(f"{' and '.join(waiting)}: moves only after flexsheet arms enable")
     if free:
-        sentences.append(f"{' and '.join(free)}: moves as soon as there is a target (arming: auto)")
+        sentences.append(
+            f"{' and '.join(free)}: moves as soon as it receives a target (arming: auto)"
+        )
     return "; ".join(sentences)
 
 
 class _Arms:
-    """Read the arms' states of a running graph, and publish to them; an async context."""
+    """Connection to the arms of a running graph, an async context: states and commands."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -207,7 +209,7 @@ class _Arms:
         self.states[state.side], self._received_s[state.side] = state, self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
-        """Send a message once, after its readers have connected."""
+        """Publish a message once, after its readers have connected."""
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
         self._writer = GraphWriter(self._plan, self._run, [topic])
@@ -215,7 +217,7 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Send a stop at once; it is latched, so later readers receive it too."""
+        """Publish a stop immediately; it is latched, so later readers receive it too."""
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
         from flexsheet.messages.bus import BusError
@@ -224,14 +226,14 @@ class _Arms:
         try:
             self._writer = GraphWriter(self._plan, self._run, ["estop"])
             self._writer.publish("estop", estop)
-            # The last reader may be a launcher, which stores it.
+            # Wait for a launcher, which stores the stop, to reconnect.
             await asyncio.sleep(READER_RECONNECT_S)
         except BusError:
             outcome = StopOutcome.REFUSED
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Return whether fresh states satisfy `done` within CONFIRMATION_TIMEOUT_S."""
+        """Return whether states younger than MAX_STATE_AGE_S satisfy `done` before the timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             if done(
@@ -252,7 +254,7 @@ async def _command(
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
-    """Publish a command to both arms, wait until it has acted, and show their state."""
+    """Publish a command to both arms, wait for its effect, and print their states."""
     from flexsheet.launch.running.tools import tools_host
 
     plan, run = running_graph(run_directory)
@@ -277,7 +279,7 @@ def _check_may_reset(plan: ResolvedGraph, host: str, command: tuple[str, Message
         return
     if tools_on(host) not in plan.may_reset_estop():
         raise CommandError(
-            f'host "{host}" may not reset an e-stop; reset it on '
+            f'host "{host}" is not allowed to reset an e-stop; reset it on '
             f"{', '.join(plan.estop_resetters)}, "
             f"or set hosts.{host}.may_reset_estop in {plan.launch_file}",
             BAD_INPUT,
@@ -290,7 +292,7 @@ def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
             "side": side,
             "mode": arms[side].mode if side in arms else "silent",
             "ready": side in arms and arms[side].ready,
-            "reason": arms[side].reason if side in arms else "no message from its bridge",
+            "reason": arms[side].reason if side in arms else "no message from the bridge",
             "faults": list(arms[side].faults) if side in arms else [],
         }
         for side in SIDES

@@ -1,4 +1,4 @@
-"""`flexsheet bag`: record, play, look into, save, verify and report on bags."""
+"""`flexsheet bag`: record, play, recover, export, verify and report on bags."""
 
 from __future__ import annotations
 
@@ -30,11 +30,13 @@ if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
-SHOWN_EVERY_S = 0.2
+PROGRESS_PERIOD_S = 0.2
 MAX_TOPICS_LISTED = 10
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
+    add_completion=False,
+    no_args_is_help=True,
+    help="Record, play and analyse bags, which are MCAP files of recorded topics.",
 )
 
 BagArgument = Annotated[
@@ -43,7 +45,9 @@ BagArgument = Annotated[
 TopicsOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--topic", help="Only this topic; may be given again.", autocompletion=complete.topics
+        "--topic",
+        help="Topic to use; repeat for several; default: all.",
+        autocompletion=complete.topics,
     ),
 ]
 
@@ -64,23 +68,28 @@ def record(
         typer.Option(
             "--include",
             metavar="TOPIC",
-            help="Record this topic too, for example stereo; may be given again.",
+            help="Further topic to record, such as stereo; repeat for several.",
             autocompletion=complete.topics,
         ),
     ] = None,
     also: Annotated[
-        list[str] | None, typer.Option("--also", hidden=True, help="Old name of --include.")
+        list[str] | None, typer.Option("--also", hidden=True, help="Former name of --include.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Stop after this time.")
+        float | None,
+        typer.Option(
+            metavar="SECONDS", help="Duration of the recording, s; default: until Ctrl-C."
+        ),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Record the running graph until Ctrl-C; without --topic all topics logged by default."""
+    """Record the topics of the running graph until Ctrl-C; default: all topics that are logged."""
     running = running_graph(run)
     if bag.exists():
-        raise CommandError(f"{bag}: exists already; a bag is never written over", BAD_INPUT)
+        raise CommandError(
+            f"{bag}: the file exists and is not overwritten; name a new file", BAD_INPUT
+        )
     logs_on_stderr()
     included = [*(include or ()), *(also or ())]
     run_interruptible(
@@ -101,35 +110,37 @@ def record(
 def play(
     *,
     bag: BagArgument,
-    rate: Annotated[float, typer.Option(help="Speed factor.", min=0.01)] = 1.0,
+    rate: Annotated[
+        float, typer.Option(help="Playback speed as a factor of real time.", min=0.01)
+    ] = 1.0,
     start: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Start at this position in the bag.", min=0.0)
+        float, typer.Option(metavar="SECONDS", help="Start position in the bag, s.", min=0.0)
     ] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat playback until Ctrl-C.")] = False,
     topics: TopicsOption = None,
     launch: Annotated[
         Path | None,
         typer.Option(
             "--launch",
             metavar="FILE",
-            help="Start this launch file first, and end it after playing.",
+            help="Launch file to start before playback and stop after it.",
             autocompletion=complete.yaml_files,
         ),
     ] = None,
     into: Annotated[
-        Path | None, typer.Option("--into", hidden=True, help="Old name of --launch.")
+        Path | None, typer.Option("--into", hidden=True, help="Former name of --launch.")
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a bag into a graph: the topics of `external_topics` in its launch file."""
-    how = Playing(bag, tuple(topics or ()), rate, start, loop, as_json)
-    raise typer.Exit(run_interruptible(_play(how, launch or into, run)))
+    """Play the topics of a bag that are `external_topics` of the graph's launch file."""
+    request = PlayRequest(bag, tuple(topics or ()), rate, start, loop, as_json)
+    raise typer.Exit(run_interruptible(_play(request, launch or into, run)))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
 def info(bag: BagArgument, as_json: JsonOption = False) -> None:
-    """What a bag holds; a bag that was cut off by a crash is read as far as it goes."""
+    """Print the contents of a bag; a truncated bag is read up to its end."""
     from flexsheet.messages.bag import info as bag_info
 
     summary = bag_info(bag)
@@ -160,10 +171,10 @@ def info(bag: BagArgument, as_json: JsonOption = False) -> None:
 @app.command(epilog=examples("flexsheet bag recover cut.mcap whole.mcap"))
 def recover(
     bag: BagArgument,
-    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Bag to write.")],
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Recovered bag to write.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Write a whole bag from what can be read of a cut or damaged one; the original stays."""
+    """Write the readable messages of a truncated or damaged bag to a new bag."""
     from flexsheet.messages.bag import recover as recover_bag
 
     with progress_bar(f"recovering {bag.name}") as progress:
@@ -175,7 +186,7 @@ def recover(
         [
             ("bag", output),
             ("from", f"{bag}, {'complete' if report.was_complete else report.problem}"),
-            ("saved", f"{report.messages} messages, {report.attachments} attachments"),
+            ("recovered", f"{report.messages} messages, {report.attachments} attachments"),
             (
                 "lost",
                 f"{report.damaged_chunks} damaged chunks, "
@@ -197,7 +208,7 @@ def export(
     topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write what a bag holds for other tools: Foxglove and rerun open the file."""
+    """Convert a bag to an MCAP file for Foxglove and Rerun."""
     from flexsheet.launch.bags.export import export as export_bag
 
     with progress_bar(f"exporting {bag.name}") as progress:
@@ -206,7 +217,9 @@ def export(
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
         also = f" and {more} more" if more > 0 else ""
-        words.print(f"not exported: {listed}{also} (their types have changed)", markup=False)
+        words.print(
+            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
+        )
     if as_json:
         print_json({**asdict(result), "output": str(output)})
         return
@@ -223,32 +236,35 @@ def verify(
     node: Annotated[
         str,
         typer.Argument(
-            help="Name of the node in the bag's launch file.",
+            help="Node name in the bag's launch file.",
             autocompletion=complete.node_types,
         ),
     ],
     bag: BagArgument,
     tolerance: Annotated[
-        float, typer.Option(help="Between replayed and recorded numbers.", min=0.0)
+        float,
+        typer.Option(
+            help="Maximum difference between replayed and recorded values, in their units.", min=0.0
+        ),
     ] = 1e-6,
     as_json: JsonOption = False,
 ) -> None:
-    """Step one node through what it took of its recorded inputs, twice, and compare.
+    """Replay a node twice with its recorded inputs, and compare its outputs.
 
-    Exit code 1: the two passes gave different bytes, or the node failed, or it cannot be replayed.
-    Exit code 3: they gave the same, but other numbers than the node published live: as from a node
-    that reads the clock by itself, or from a bag of code that did not say what its nodes took.
+    Exit code 1: the two runs differ, the node failed, or it cannot be replayed. Exit code 3: the
+    runs are equal but differ from the outputs published live, for example because the node reads
+    the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
     logs_on_stderr()
-    with progress_bar(f"stepping {node} through {bag.name}, twice") as progress:
+    with progress_bar(f"replaying {node} twice with {bag.name}") as progress:
         result = verify_node(bag, node, tolerance=tolerance, progress=progress)
     if as_json:
         print_json({**asdict(result), "ok": result.ok})
     else:
         _print_verification(result)
-        words.print(_verdict(result), markup=False)
+        words.print(_describe_result(result), markup=False)
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:
@@ -266,14 +282,19 @@ def report(
     bag: BagArgument,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE.html", help="Page; else beside the bag."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FILE.html",
+            help="HTML file to write; default: next to the bag.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one page about a session: what was wrong first, then charts, tables and pictures.
+    """Write an HTML report on a recording: faults, charts, tables and images.
 
-    The page needs no network.  With --json the numbers are printed, and a page is written only
-    where one is named.  A bag that was cut off is read as far as it goes.
+    The page needs no network connection. With --json, prints the values, and writes a page only if
+    --output is given. A truncated bag is read up to its end.
     """
     from flexsheet.launch.bags.report.write import default_output
     from flexsheet.launch.bags.report.write import report as report_on
@@ -293,20 +314,27 @@ def _print_verification(result: Verification) -> None:
     print_fields(
         [
             ("node", result.node),
-            ("order", "as it took them" if result.as_taken else "as the recorder got them"),
-            ("messages in", f"{result.messages_in}, missing {result.missing}"),
-            ("messages out", result.messages_out),
-            ("same bytes twice", "yes" if result.same_bytes else "NO"),
-            ("sha256 of them", result.digest),
+            ("input order", "as the node read it" if result.as_taken else "as recorded"),
+            ("input messages", f"{result.messages_in}, missing {result.missing}"),
+            ("output messages", result.messages_out),
+            ("equal in both runs", "yes" if result.same_bytes else "NO"),
+            ("sha256 of outputs", result.digest),
             (
                 "errors",
-                f"{result.errors}{result.last_error and f', the last: {result.last_error}'}",
+                f"{result.errors}{result.last_error and f', last error: {result.last_error}'}",
             ),
         ]
     )
     print()
     print_table(
-        ("topic", "recorded", "replayed", "paired", f"beyond {result.tolerance:g}", "worst field"),
+        (
+            "topic",
+            "recorded",
+            "replayed",
+            "compared",
+            f"above {result.tolerance:g}",
+            "field of maximum error",
+        ),
         [
             (
                 topic,
@@ -314,33 +342,33 @@ def _print_verification(result: Verification) -> None:
                 one.replayed,
                 one.compared,
                 one.beyond_tolerance,
-                _worst(one.worst) if one.compared else "none paired",
+                _format_worst(one.worst) if one.compared else "none compared",
             )
             for topic, one in result.topics.items()
         ],
     )
 
 
-def _verdict(result: Verification) -> str:
-    """What it comes to, and where to read on."""
+def _describe_result(result: Verification) -> str:
+    """Describe the result of a verification, with the likely cause of a difference."""
     if result.errors:
-        return "the node failed; its last error is above"
+        return "the node failed; see its last error above"
     if not result.same_bytes:
         return (
-            "not repeatable: the node goes by something that is not in the bag, as the real time "
-            "or the order of a set (docs/replay.md)"
+            "not repeatable: the node depends on data outside the bag, such as the system time or "
+            "the order of a set (docs/replay.md)"
         )
     if result.as_live:
-        return "repeatable, and as it was live"
+        return "repeatable, and equal to the live outputs"
     why = (
-        f"{result.missing} messages that it took live are not in the bag"
+        f"{result.missing} messages that the node read are not in the bag"
         if result.missing
-        else "the code has changed, or the recording began when the node had something to remember"
+        else "the code has changed, or the recording started after the node had stored state"
     )
-    return f"repeatable, but other than live: {why} (docs/replay.md)"
+    return f"repeatable, but different from the live outputs: {why} (docs/replay.md)"
 
 
-def _worst(fields: dict[str, float]) -> str:
+def _format_worst(fields: dict[str, float]) -> str:
     if not fields:
         return "all equal"
     name = max(fields, key=lambda field: fields[field])
@@ -373,11 +401,13 @@ async def _record(
         attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
     )
     written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
-    wanted = Recorder.further_inputs(parameters, written)
-    for name in wanted:
+    names = Recorder.further_inputs(parameters, written)
+    for name in names:
         if name not in plan.writers:
             option = "--include" if name in include else "--topic"
-            raise CommandError(f"{option} {name}: nobody writes it in the running graph", BAD_INPUT)
+            raise CommandError(
+                f"{option} {name}: the topic has no writer in the running graph", BAD_INPUT
+            )
     config = NodeConfig(
         name="bag_record",
         type="recorder",
@@ -388,42 +418,42 @@ async def _record(
                 topic=name,
                 endpoints=local_sources(run, plan.sources_to_read(name, tools_host(run))),
             )
-            for name in wanted
+            for name in names
         ),
         outputs=(),
         plan_hash=plan.hash,
         keys_file=ring_file(run, tools_host(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
-    words.print(f"recording {len(wanted)} topics; Ctrl-C ends", markup=False)
+    words.print(f"recording {len(names)} topics; press Ctrl-C to stop", markup=False)
     stop = asyncio.Event()
     work = asyncio.create_task(run_node(config, stop))
-    counting = asyncio.create_task(_count_down(bag.name, seconds))
+    countdown = asyncio.create_task(_show_remaining(bag.name, seconds))
     try:
         await asyncio.wait((work,), timeout=seconds)
     finally:
-        # Also when interrupted: the bag is closed in order.
-        counting.cancel()
+        # Close the bag properly after an interruption, too.
+        countdown.cancel()
         stop.set()
         await work
     return 0
 
 
-async def _count_down(what: str, duration_s: float | None) -> None:
-    """Shows how much of a recording is left, where that is known."""
+async def _show_remaining(label: str, duration_s: float | None) -> None:
+    """Show the remaining time of a recording of known duration."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
     begun_s = loop.time()
-    with progress_bar(what) as progress:
+    with progress_bar(label) as progress:
         while True:
             progress(min(loop.time() - begun_s, duration_s), duration_s)
-            await asyncio.sleep(SHOWN_EVERY_S)
+            await asyncio.sleep(PROGRESS_PERIOD_S)
 
 
 @dataclass(frozen=True, slots=True)
-class Playing:
-    """What is to be played, and how."""
+class PlayRequest:
+    """Bag to play, with the topics, speed and start position."""
 
     bag: Path
     topics: tuple[str, ...]
@@ -433,46 +463,48 @@ class Playing:
     as_json: bool
 
 
-async def _play(how: Playing, launch: Path | None, run_directory: Path | None) -> int:
+async def _play(request: PlayRequest, launch: Path | None, run_directory: Path | None) -> int:
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.supervisor import RunningGraph
 
     if launch is None:
         plan, run = running_graph(run_directory)
-        return await _play_into(how, plan, run)
+        return await _play_into(request, plan, run)
     plan = load_graph(launch)
     async with RunningGraph(plan) as graph:
         with words.status(f"starting {launch}"):
             await graph.wait_ready()
-        return await _play_into(how, plan, graph.run)
+        return await _play_into(request, plan, graph.run)
 
 
-async def _play_into(how: Playing, plan: ResolvedGraph, run: Run) -> int:
+async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int:
     from flexsheet.launch.bags.player import play as play_bag
     from flexsheet.launch.bags.player import select_topics
     from flexsheet.messages.bag import BagReader
 
-    selection = select_topics(BagReader(how.bag).topics, plan, how.topics)
+    selection = select_topics(BagReader(request.bag).topics, plan, request.topics)
     for name, why in selection.left_out.items():
-        words.print(f"not played: {name} ({why})", markup=False)
+        words.print(f"not played: {name}: {why}", markup=False)
     if not selection.topics:
-        raise CommandError(f"{how.bag}: nothing in it can be played into {plan.launch_file}")
+        raise CommandError(
+            f"{request.bag}: contains no topic that can be played into {plan.launch_file}"
+        )
     sent = 0
     while True:
-        with progress_bar(f"playing {how.bag.name}") as progress:
+        with progress_bar(f"playing {request.bag.name}") as progress:
             sent += await play_bag(
-                how.bag,
+                request.bag,
                 plan,
                 run,
                 topics=selection.topics,
-                rate=how.rate,
-                start_s=how.start_s,
+                rate=request.rate,
+                start_s=request.start_s,
                 progress=progress,
             )
-        if not how.loop:
+        if not request.loop:
             break
-    if how.as_json:
-        print_json({"bag": str(how.bag), "messages": sent, "topics": list(selection.topics)})
+    if request.as_json:
+        print_json({"bag": str(request.bag), "messages": sent, "topics": list(selection.topics)})
     else:
         words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
     return 0

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate`: calibrate a stereo rig with images of a board, and check it."""
+"""`flexsheet calibrate`: calibrate a stereo rig with images of a board, and check the result."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,12 +17,14 @@ from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
     print_table,
     words,
 )
+from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
     from flexsheet.messages.calibration import Board, StereoCalibration
@@ -32,18 +35,19 @@ app = typer.Typer(
 )
 
 LeftOption = Annotated[
-    str, typer.Option(metavar="GLOB", help="Left images, in the order of names.")
+    str, typer.Option(metavar="GLOB", help="Pattern of the left images, sorted by name.")
 ]
 RightOption = Annotated[
-    str, typer.Option(metavar="GLOB", help="Right images, in the order of names.")
+    str, typer.Option(metavar="GLOB", help="Pattern of the right images, sorted by name.")
 ]
 BoardOption = Annotated[
-    str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the board, such as 9x6.")
+    str,
+    typer.Option(metavar="COLUMNSxROWS", help="Number of inner corners of the board, such as 9x6."),
 ]
-SquareOption = Annotated[float, typer.Option(help="Side length of a square, mm.", min=1e-3)]
+SquareOption = Annotated[float, typer.Option(help="Side length of a board square, mm.", min=1e-3)]
 MarkerOption = Annotated[
     float | None,
-    typer.Option(help="Side length of a marker, mm; makes the board a ChArUco board.", min=1e-3),
+    typer.Option(help="Side length of a ChArUco marker, mm; default: a chessboard.", min=1e-3),
 ]
 DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
 FOUR_BITS = "DICT_4X4_50"
@@ -61,18 +65,21 @@ def stereo(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Stereo calibration file to write.")
+    ],
     left: Annotated[
-        str | None, typer.Option(metavar="GLOB", help="Left images, in the order of names.")
+        str | None, typer.Option(metavar="GLOB", help="Pattern of the left images, sorted by name.")
     ] = None,
     right: Annotated[
-        str | None, typer.Option(metavar="GLOB", help="Right images, in the order of names.")
+        str | None,
+        typer.Option(metavar="GLOB", help="Pattern of the right images, sorted by name."),
     ] = None,
     device_source: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Capture images live from the source of a camera node: "
+            help="Source of a camera node for live capture, such as "
             "'{kind: opencv, left: 0, right: 1}'.",
         ),
     ] = None,
@@ -81,27 +88,28 @@ def stereo(
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene with the image size and exposure of the live camera.",
+            help="Scene file with the image size and exposure of the live camera.",
         ),
     ] = None,
     twin: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="Capture images from the simulator of this scene."),
+        typer.Option(metavar="SCENE", help="Scene file whose camera is simulated."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the simulated poses and noise.")] = 1,
-    pairs: Annotated[int, typer.Option(help="Image pairs to capture live.", min=5)] = 20,
+    seed: Annotated[int, typer.Option(help="Random seed of the simulated poses and noise.")] = 1,
+    pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="New folder for captured images.")
     ] = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     device: Annotated[
-        str | None, typer.Option(help='Name of the rig; default: the scene\'s, or "stereo".')
+        str | None, typer.Option(help='Name of the rig; default: from the scene, else "stereo".')
     ] = None,
     distance_mm: Annotated[
         float | None,
         typer.Option(
-            help="Distance of the reported uncertainty; default: the scene's or the boards'.",
+            help="Distance at which the uncertainty is reported, mm; default: from the scene or "
+            "the board images.",
             min=1.0,
         ),
     ] = None,
@@ -110,9 +118,10 @@ def stereo(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate both cameras and their relative pose.
+    """Calibrate both cameras of a stereo rig and their relative pose.
 
-    From pictures (--left, --right), from a device (--device-source, --scene) or from the twin.
+    The images are files (--left, --right), captured live (--device-source, --scene) or simulated
+    (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
     from flexsheet.launch.calibration.corners import CalibrationError
@@ -121,44 +130,43 @@ def stereo(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration import save_calibration
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
-    _one_source(left, right, device_source, twin)
-    described = _board(board, square_mm, marker_mm, dictionary)
+    check_folder("-o", output)
+    _check_single_source(left, right, device_source, twin)
+    described = _parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
-    made = ["flexsheet", "calibrate", "stereo"]
+    command = ["flexsheet", "calibrate", "stereo"]
     try:
         if left is not None and right is not None:
-            left_paths, right_paths = _pictures("--left", left), _pictures("--right", right)
-            made += ["--left", left, "--right", right]
+            left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
+            command += ["--left", left, "--right", right]
             scene = None if scene_file is None else load_scene(scene_file)
         else:
-            chosen = twin or scene_file
-            if chosen is None:
-                raise CommandError("--device-source: name the scene with --scene too", BAD_INPUT)
-            scene = load_scene(chosen)
-            taking = Capture(
+            camera_scene = twin or scene_file
+            if camera_scene is None:
+                raise CommandError("--device-source: missing --scene FILE", BAD_INPUT)
+            scene = load_scene(camera_scene)
+            pose_capture = Capture(
                 described,
                 lens=scene.camera.left,
                 size=(scene.camera.width_px, scene.camera.height_px),
                 pairs=pairs,
-                still_pictures=1 if device_source is None else 4,
+                still_images=1 if device_source is None else 4,
             )
             if device_source is None:
-                shown = capture.twin_pictures(scene, described, pairs=pairs, seed=seed)
-                made += ["--twin", str(chosen), "--pairs", str(pairs), "--seed", str(seed)]
+                views = capture.simulate_views(scene, described, pairs=pairs, seed=seed)
+                command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
             else:
-                shown = capture.device_pictures(device_source, scene)
-                made += ["--device-source", device_source, "--scene", str(chosen)]
+                views = capture.read_device_views(device_source, scene)
+                command += ["--device-source", device_source, "--scene", str(camera_scene)]
             folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
-            capture.take_pairs(shown, taking, folder)
+            capture.write_pairs(views, pose_capture, folder)
             left_paths = sorted(folder.glob("left*.png"))
             right_paths = sorted(folder.glob("right*.png"))
-        made += ["--board", board, "--square-mm", f"{square_mm:g}"]
+        command += ["--board", board, "--square-mm", f"{square_mm:g}"]
         if marker_mm is not None:
-            made += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
-        made += ["-o", str(output)]
-        with _progress("looking for the board") as progress:
+            command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
+        command += ["-o", str(output)]
+        with _progress("detecting the board") as progress:
             calibrated = calibrate_stereo(
                 left_paths,
                 right_paths,
@@ -169,16 +177,18 @@ def stereo(
             )
     except CalibrationError as error:
         raise CommandError(str(error), BAD_INPUT) from error
-    save_calibration(calibrated.calibration, output, comment=shlex.join(made))
+    save_calibration(calibrated.calibration, output, comment=shlex.join(command))
     page: Path | None = None
     if report is not None:
         from flexsheet.launch.calibration.report import write_report
 
         page = write_report(calibrated, report)
-    _tell(calibrated.calibration, output, page, as_json)
+    _print_result(calibrated.calibration, output, page, as_json)
 
 
-def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool) -> None:
+def _print_result(
+    calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool
+) -> None:
     used = sum(pair.used for pair in calibration.pairs)
     baseline_mm = float((calibration.right_from_left[:3, 3] ** 2).sum() ** 0.5) * 1e3
     uncertainty = calibration.uncertainty
@@ -211,8 +221,8 @@ def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_js
             ("focal lengths", f"{calibration.left.fx_px:.1f}, {calibration.right.fx_px:.1f} px"),
             (
                 "uncertainty",
-                f"{1e3 * uncertainty.depth_std_m:.2f} mm in depth, "
-                f"{1e3 * uncertainty.lateral_std_m:.2f} mm across, "
+                f"{1e3 * uncertainty.depth_std_m:.2f} mm depth, "
+                f"{1e3 * uncertainty.lateral_std_m:.2f} mm lateral, "
                 f"at {1e3 * uncertainty.working_distance_m:.0f} mm",
             ),
             *([] if page is None else [("report", page)]),
@@ -220,7 +230,7 @@ def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_js
     )
     for pair in calibration.pairs:
         if not pair.used:
-            words.print(f"left out: {pair.left}: {pair.reason}", markup=False)
+            words.print(f"excluded: {pair.left}: {pair.reason}", markup=False)
 
 
 @app.command(
@@ -231,7 +241,7 @@ def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_js
 )
 def check(
     *,
-    calibration: Annotated[Path, typer.Option(help="Calibration file.")],
+    calibration: Annotated[Path, typer.Option(help="Stereo calibration file to check.")],
     left: LeftOption,
     right: RightOption,
     board: BoardOption,
@@ -240,7 +250,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure a board of known size with a calibration, on pictures that did not make it."""
+    """Measure a board of known size with a calibration, in images not used to calibrate."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.messages.calibration import load_calibration
@@ -250,23 +260,23 @@ def check(
         with _progress("measuring the board") as progress:
             result = check_stereo(
                 load_calibration(calibration),
-                _pictures("--left", left),
-                _pictures("--right", right),
-                board=_board(board, square_mm, marker_mm, dictionary),
+                _find_images("--left", left),
+                _find_images("--right", right),
+                board=_parse_board(board, square_mm, marker_mm, dictionary),
                 progress=progress,
             )
     except (CalibrationError, CalibrationFileError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
-    again = result["used_to_calibrate"]
-    if isinstance(again, list) and again:
+    reused = result["used_to_calibrate"]
+    if isinstance(reused, list) and reused:
         words.print(
-            f"pictures that made this calibration flatter it: {', '.join(again)}; check on others",
+            f"{', '.join(reused)}: used to calibrate, so errors are underestimated; use others",
             markup=False,
         )
     if as_json:
         print_json(result)
     else:
-        print_fields((name, _figure(value)) for name, value in result.items() if value != again)
+        print_fields((name, _format(value)) for name, value in result.items() if value != reused)
 
 
 @app.command(
@@ -284,19 +294,24 @@ def cross_check(
     square_mm: SquareOption,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    leave_out: Annotated[int, typer.Option(help="Number of pairs left out at a time.", min=1)] = 1,
+    leave_out: Annotated[
+        int, typer.Option(help="Number of image pairs excluded at a time.", min=1)
+    ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Leave pairs out in turn, measure them with what the rest gives, beside plain OpenCV."""
+    """Cross-validate a calibration: measure each pair with a calibration from the other pairs.
+
+    Prints the errors beside those of plain OpenCV.
+    """
     from flexsheet.launch.calibration import check
     from flexsheet.launch.calibration.corners import CalibrationError
 
     try:
-        with _progress("leaving pairs out") as progress:
+        with _progress("cross-validating") as progress:
             result = check.cross_check(
-                _pictures("--left", left),
-                _pictures("--right", right),
-                board=_board(board, square_mm, marker_mm, dictionary),
+                _find_images("--left", left),
+                _find_images("--right", right),
+                board=_parse_board(board, square_mm, marker_mm, dictionary),
                 leave_out=leave_out,
                 progress=progress,
             )
@@ -309,12 +324,12 @@ def cross_check(
     plain: Any = result.pop("calibrate_plain_opencv")
     print_table(
         ("pair", "distance, m", "rigid fit, mm", "plain OpenCV, mm"),
-        [[row["left"], *(_figure(value) for value in list(row.values())[1:])] for row in rows],
+        [[row["left"], *(_format(value) for value in list(row.values())[1:])] for row in rows],
     )
     print_table(
-        ("all left-out pairs", "here", "plain OpenCV"),
+        ("all excluded pairs", "flexsheet", "plain OpenCV"),
         [
-            (name, _figure(value), _figure(None if plain is None else plain[name]))
+            (name, _format(value), _format(None if plain is None else plain[name]))
             for name, value in result.items()
         ],
     )
@@ -331,18 +346,19 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, typer.Option("-o", "--output", help="File to write: .svg or .png.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Image file to write (.svg or .png).")
+    ],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a board to print at true size: a chessboard, or with --marker-mm a ChArUco board."""
+    """Write a board to print at true size: a chessboard, or a ChArUco board with --marker-mm."""
     from flexsheet.launch.calibration.corners import CalibrationError
-    from flexsheet.launch.calibration.printing import caption, write_board
+    from flexsheet.launch.calibration.printing import make_caption, write_board
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
-    described = _board(board, square_mm, marker_mm, dictionary)
+    check_folder("-o", output)
+    described = _parse_board(board, square_mm, marker_mm, dictionary)
     try:
         write_board(described, output)
     except CalibrationError as error:
@@ -350,14 +366,14 @@ def print_board(
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:
-        print_fields([("file", output), ("board", caption(described))])
+        print_fields([("file", output), ("board", make_caption(described))])
 
 
-def _figure(value: object) -> str:
+def _format(value: object) -> str:
     return "-" if value is None else f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-def _one_source(
+def _check_single_source(
     left: str | None, right: str | None, device_source: str | None, twin: Path | None
 ) -> None:
     """Raise CommandError unless exactly one source of images is chosen."""
@@ -365,26 +381,29 @@ def _one_source(
     chosen = [files, device_source is not None, twin is not None]
     if sum(chosen) != 1 or (files and (left is None or right is None)):
         raise CommandError(
-            "give pictures by --left and --right, or a device by --device-source and --scene, or "
-            "the twin by --twin; one of the three",
+            "give exactly one source of images: --left with --right, --device-source with --scene, "
+            "or --twin",
             BAD_INPUT,
         )
 
 
-def _pictures(option: str, pattern: str) -> list[Path]:
+def _find_images(option: str, pattern: str) -> list[Path]:
     paths = [Path(name) for name in sorted(glob.glob(pattern))]
     if not paths:
-        raise CommandError(f"{option} {pattern}: no file matches; quote the pattern", BAD_INPUT)
+        raise CommandError(
+            f"{option} {pattern}: no file matches; put the pattern in quotes", BAD_INPUT
+        )
     return paths
 
 
-def _board(text: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
     from flexsheet.messages.calibration import Board
 
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= 3):
         raise CommandError(
-            f"--board {text}: give the inner corners along both sides, 3 or more, as 9x6", BAD_INPUT
+            f"--board {text}: expected COLUMNSxROWS of inner corners, at least 3x3, such as 9x6",
+            BAD_INPUT,
         )
     charuco = marker_mm is not None
     return Board(
@@ -398,7 +417,7 @@ def _board(text: str, square_mm: float, marker_mm: float | None, dictionary: str
 
 
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
-    """Return the requested distance, else that of the scene's screen centre, else None."""
+    """Return the given distance, else that of the scene's screen centre, else None, m."""
     if distance_mm is not None:
         return 1e-3 * distance_mm
     if scene is None:
@@ -407,12 +426,56 @@ def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float
 
 
 @contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr, and yield the function that updates it."""
+def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
+    """Yield a scene's YAML tree to change; then write it to `copy` with comments and layout.
+
+    Raises BadInputError if the changed scene is invalid.
+    """
+    from ruamel.yaml import YAML
+
+    from flexsheet.launch.plans.plan import load_scene
+
+    yaml = YAML(typ="rt", pure=True)
+    yaml.width = 4096
+    yaml.preserve_quotes = True
+    yaml.indent(sequence=4, offset=2)
+    tree = yaml.load(scene_file.read_text(encoding="utf-8"))
+    yield tree
+    text = StringIO()
+    yaml.dump(tree, text)
+    write_file(copy, text.getvalue())
+    load_scene(copy)
+
+
+def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
+    """Load a stereo calibration for the scene's camera, or return None without a path."""
+    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+
+    if path is None:
+        return None
+    try:
+        calibration = load_calibration(path)
+        refuse_other_camera(calibration, scene.camera)
+    except CalibrationFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    except CalibrationMismatchError as error:
+        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
+    return calibration
+
+
+def round_digits(value: float) -> float:
+    """Round to 1e-9 m, rad or px, below the accuracy of any calibration; make -0.0 positive."""
+    return round(float(value), 9) + 0.0
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Yield a function of (done, total, text) that updates a progress bar on stderr."""
     from rich.progress import Progress
 
     with Progress(console=words.console, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total, now: bar.update(
-            task, completed=done, total=total, description=now
+        task = bar.add_task(label, total=None)
+        yield lambda done, total, text: bar.update(
+            task, completed=done, total=total, description=text
         )

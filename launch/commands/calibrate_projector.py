@@ -1,18 +1,19 @@
-"""`flexsheet calibrate projector`: measure the projector's pose and lens distortion."""
+"""`flexsheet calibrate projector`: calibrate the projector's pose and lens distortion."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from io import StringIO
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands.calibrate import edit_scene, load_optics, round_digits
 from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -47,54 +48,64 @@ def projector(
     *,
     scene_file: Annotated[
         Path,
-        typer.Option("--scene", metavar="FILE", help="Scene with the projector's nominal data."),
+        typer.Option(
+            "--scene", metavar="FILE", help="Scene file with the projector's nominal data."
+        ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Scene file to write; may be the same file."),
+        typer.Option("-o", "--output", help="Scene file to write; may be that of --scene."),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Stereo calibration file; default: the optics of the scene."
+            metavar="FILE", help="Stereo calibration file; default: the camera of the scene."
         ),
     ] = None,
     write_patterns: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Write the patterns to this folder and exit."),
+        typer.Option(
+            metavar="FOLDER", help="Folder to write the Gray-code patterns to; no calibration."
+        ),
     ] = None,
     pictures: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Folder with one folder per pose: left00.png, right00.png, ..."
+            metavar="FOLDER",
+            help="Folder with one subfolder of images per pose: left00.png, right00.png, ...",
         ),
     ] = None,
     corners: Annotated[
         str | None,
         typer.Option(
             metavar="'X,Y X,Y X,Y X,Y'",
-            help="Manual calibration: pixels at the corners of --rectangle-mm on the imaginary "
-            "screen; left bottom, right bottom, right top, left top, as the user sees them.",
+            help="Pixels at the corners of --rectangle-mm on the virtual screen: bottom left, "
+            "bottom right, top right, top left, from the user's view.",
         ),
     ] = None,
     rectangle_mm: Annotated[
         str,
         typer.Option(
-            metavar="WIDTHxHEIGHT", help="Rectangle around the screen's centre, for --corners."
+            metavar="WIDTHxHEIGHT",
+            help="Size of the rectangle around the screen's centre for --corners, mm.",
         ),
     ] = "200x200",
     twin: Annotated[
         bool,
-        typer.Option("--twin", help="Simulate a projector with unknown deviations from the scene."),
+        typer.Option(
+            "--twin", help="Calibrate a simulated projector that deviates from the scene."
+        ),
     ] = False,
-    poses: Annotated[int, typer.Option(min=3, help="Poses of the simulated sheet.")] = 6,
-    seed: Annotated[int, typer.Option(help="Seed of the simulated deviations and noise.")] = 1,
+    poses: Annotated[int, typer.Option(min=3, help="Number of poses of the simulated sheet.")] = 6,
+    seed: Annotated[
+        int, typer.Option(help="Random seed of the simulated deviations and noise.")
+    ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate the projector and write it into a scene.
+    """Calibrate the projector and write the result into a scene.
 
-    From pictures of Gray code on the sheet, seen by the stereo camera in three poses or more
-    (--pictures), from four corners found by hand (--corners), or in the twin (--twin).
+    The data are stereo images of Gray code on the sheet in three or more poses (--pictures), four
+    corners set manually (--corners), or simulated images (--twin).
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import (
@@ -107,33 +118,33 @@ def projector(
     scene = load_scene(scene_file)
     size = scene.projector.width_px, scene.projector.height_px
     if write_patterns is not None:
-        shown = gray_code.patterns(*size)
+        shown = gray_code.make_patterns(*size)
         _write_patterns(shown, write_patterns)
         if as_json:
             print_json({"folder": str(write_patterns), "patterns": len(shown)})
         return
     if (pictures is not None) + (corners is not None) + twin != 1:
         raise CommandError(
-            "give pictures by --pictures, corners by --corners, or the twin by --twin; one of the "
-            "three (or --write-patterns FOLDER first)",
+            "give exactly one of --pictures, --corners and --twin; to capture images, first write "
+            "the patterns with --write-patterns FOLDER",
             BAD_INPUT,
         )
-    if output is not None and not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    if output is not None:
+        check_folder("-o", output)
     true: Projector | None = None
     try:
         if corners is not None:
-            fit = _by_corners(scene, corners, rectangle_mm)
+            fit = _fit_corners(scene, corners, rectangle_mm)
         else:
             if twin:
                 from flexsheet.nodes.twin.projector import make_true_projector
 
                 true = make_true_projector(scene.projector, seed=seed)
-                views = list(_twin_views(scene, true, poses, seed))
+                views = list(_simulate_views(scene, true, poses, seed))
             else:
                 assert pictures is not None
-                views = list(_read_views(pictures, len(gray_code.patterns(*size))))
-            camera = _camera(scene, calibration)
+                views = list(_read_views(pictures, len(gray_code.make_patterns(*size))))
+            camera = _load_camera(scene, calibration)
             fit = calibrate_projector(
                 measure_points(views, camera, scene.projector), scene.projector
             )
@@ -141,7 +152,7 @@ def projector(
         raise CommandError(str(error), BAD_INPUT) from error
     if output is not None:
         write_scene(scene_file, fit.projector, output)
-    _tell(scene, fit, true, output, as_json=as_json)
+    _print_result(scene, fit, true, output, as_json=as_json)
 
 
 def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
@@ -151,7 +162,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
     for number, pattern in enumerate(patterns):
         write_file(folder / f"pattern{number:02}.png", encode_png(pattern))
     words.print(
-        f"{len(patterns)} patterns in {folder}: show them pixel for pixel, take a picture of each",
+        f"{len(patterns)} patterns in {folder}: project each unscaled, capture with both cameras",
         markup=False,
     )
 
@@ -161,15 +172,17 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
-        raise CommandError(f"--pictures {folder}: no folders in it, one for each pose", BAD_INPUT)
+        raise CommandError(
+            f"--pictures {folder}: does not contain a subfolder for each pose", BAD_INPUT
+        )
     for pose in poses:
         sides = []
         for side in ("left", "right"):
             paths = sorted(pose.glob(f"{side}*.png"))
             if len(paths) != count:
                 raise CommandError(
-                    f"--pictures {pose}: {len(paths)} pictures {side}*.png, the patterns are "
-                    f"{count}",
+                    f"--pictures {pose}: expected {count} files {side}*.png, one per pattern, "
+                    f"found {len(paths)}",
                     BAD_INPUT,
                 )
             try:
@@ -179,33 +192,26 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
         yield sides[0], sides[1]
 
 
-def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
-    """Yield the simulated images of the patterns on the sheet, pose by pose."""
+def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
+    """Yield the simulated images of the patterns on the sheet, one pair of lists per pose."""
     from rich.progress import track
 
-    from flexsheet.launch.calibration.gray_code import patterns
+    from flexsheet.launch.calibration.gray_code import make_patterns
     from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
     from flexsheet.nodes.twin.rig import make_true_camera
 
-    shown = patterns(scene.projector.width_px, scene.projector.height_px)
+    shown = make_patterns(scene.projector.width_px, scene.projector.height_px)
     lit = LitSheet(scene, make_true_camera(scene.camera), true, seed=seed)
-    held = track(sheet_poses(poses), "taking pictures", console=words.console, transient=True)
-    for world_from_sheet in held:
+    tracked = track(sheet_poses(poses), "simulating images", console=words.console, transient=True)
+    for world_from_sheet in tracked:
         yield lit.pair(shown, world_from_sheet)
 
 
-def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
+def _load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """Return the scene's camera with the optics of a calibration file."""
-    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-
-    if calibration is None:
+    optics = load_optics(calibration, scene)
+    if optics is None:
         return scene.camera
-    try:
-        optics = load_calibration(calibration)
-        refuse_other_camera(optics, scene.camera)
-    except (CalibrationFileError, CalibrationMismatchError) as error:
-        raise CommandError(f"--calibration {calibration}: {error}", BAD_INPUT) from error
     return scene.camera.model_copy(
         update={
             "left": optics.left,
@@ -215,64 +221,47 @@ def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     )
 
 
-def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
+def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     import numpy as np
 
-    from flexsheet.launch.calibration.projector import keystone
+    from flexsheet.launch.calibration.projector import fit_keystone
 
     try:
         pixels = np.array([[float(x) for x in pair.split(",")] for pair in corners.split()])
         width_mm, height_mm = (float(side) for side in rectangle_mm.lower().split("x"))
         if pixels.shape != (4, 2) or not min(width_mm, height_mm) > 0.0:
-            raise ValueError("wants four pairs and two lengths")
+            raise ValueError("expected four pixel pairs and two positive lengths")
     except ValueError as error:
         raise CommandError(
-            f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; write four pixels as "
-            "'599,499 199,499 199,99 599,99' and the rectangle as 200x200",
+            f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; for example "
+            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200",
             BAD_INPUT,
         ) from error
-    return keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, scene.projector)
+    return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, scene.projector)
 
 
-def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
-    """Write the scene with this projector; keep comments and layout."""
-    from ruamel.yaml import YAML
-
-    from flexsheet.launch.plans.plan import load_scene
-
-    yaml = YAML(typ="rt", pure=True)
-    yaml.width = 4096
-    yaml.preserve_quotes = True
-    yaml.indent(sequence=4, offset=2)
-    tree = yaml.load(scene_file.read_text(encoding="utf-8"))
-    lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
-    for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
-        lens[key] = _rounded(getattr(found.lens, key))
-    if any(found.lens.distortion) or "distortion" in lens:
-        lens["distortion"] = _in_a_row([_rounded(value) for value in found.lens.distortion])
-    for key in ("position_m", "rpy_rad"):
-        values = getattr(found.world_from_projector, key)
-        pose[key] = _in_a_row([_rounded(value) for value in values])
-    text = StringIO()
-    yaml.dump(tree, text)
-    write_file(copy, text.getvalue())
-    load_scene(copy)
+def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
+    """Write the scene with this projector to `copy`, with comments and layout preserved."""
+    with edit_scene(scene_file, copy) as tree:
+        lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
+        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            lens[key] = round_digits(getattr(projector.lens, key))
+        if any(projector.lens.distortion) or "distortion" in lens:
+            lens["distortion"] = _make_flow_list(projector.lens.distortion)
+        for key in ("position_m", "rpy_rad"):
+            pose[key] = _make_flow_list(getattr(projector.world_from_projector, key))
 
 
-def _in_a_row(values: list[float]) -> Any:
+def _make_flow_list(values: Iterable[float]) -> Any:
+    """Make a YAML list of rounded values on one line."""
     from ruamel.yaml.comments import CommentedSeq
 
-    row = CommentedSeq(values)
+    row = CommentedSeq([round_digits(value) for value in values])
     row.fa.set_flow_style()
     return row
 
 
-def _rounded(value: float) -> float:
-    """Round to a nanometre, nanoradian or billionth of a pixel; further digits are noise."""
-    return round(float(value), 9) + 0.0
-
-
-def _tell(
+def _print_result(
     scene: Scene, fit: ProjectorFit, true: Projector | None, output: Path | None, *, as_json: bool
 ) -> None:
     held_out = None if fit.held_out_rms_px != fit.held_out_rms_px else fit.held_out_rms_px
@@ -306,16 +295,16 @@ def _tell(
     if as_json:
         print_json(result)
         return
-    apart = "-" if held_out is None else f"{held_out:.2f} px rms"
+    held_out_text = "-" if held_out is None else f"{held_out:.2f} px rms"
     print_fields(
         [
-            ("scene", "not written (-o FILE)" if output is None else output),
+            ("scene", "not written (no -o FILE)" if output is None else output),
             ("points", f"{fit.points} in {fit.poses} poses, {fit.outliers} outliers excluded"),
             ("before", f"{fit.before_rms_px:.2f} px rms"),
             ("after", f"{fit.rms_px:.2f} px rms, {1e3 * fit.rms_m:.2f} mm on the sheet"),
-            ("poses held out", apart),
-            ("coverage", f"{100 * fit.coverage_ratio:.0f} % of the picture"),
-            ("depth", f"{1e3 * fit.depth_range_m:.0f} mm along the light"),
+            ("held-out poses", held_out_text),
+            ("coverage", f"{100 * fit.coverage_ratio:.0f} % of the image"),
+            ("depth", f"{1e3 * fit.depth_range_m:.0f} mm along the projection"),
         ]
     )
     for when, error in result.get("eye_error_mm", {}).items():
@@ -324,13 +313,13 @@ def _tell(
         )
 
 
-def _eye_errors_mm(scene: Scene, found: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the true image errors at the eye before and after the calibration."""
+def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
+    """Return the true image errors at the eye before and after the calibration, mm."""
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
     result = {}
-    for when, predicted in (("before", scene.projector), ("after", found)):
+    for when, predicted in (("before", scene.projector), ("after", fitted)):
         errors = 1e3 * errors_at_eye(predicted, true, eye, planes, VOLUME_HALF_M)
         result[when] = {"mean": float(errors.mean()), "max": float(errors.max())}
     return result

@@ -13,6 +13,7 @@ from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -40,76 +41,87 @@ def register(app: typer.Typer) -> None:
 
 def sheet(
     *,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Sheet calibration file to write.")
+    ],
     rows: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Measured pushes; see docs/sheet.md for its columns."),
+        typer.Option(metavar="CSV", help="CSV file of measured pushes; columns: docs/sheet.md."),
     ] = None,
     scene_file: Annotated[
-        Path, typer.Option("--scene", metavar="FILE", help="Scene of the measured sheet.")
+        Path,
+        typer.Option(
+            "--scene", metavar="FILE", help="Scene file of the measured sheet, for --rows."
+        ),
     ] = SCENE_FILE,
     twin: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="Simulate the pushes on the sheet of this scene."),
+        typer.Option(
+            metavar="SCENE",
+            help="Scene file whose sheet is pushed in simulation instead of measured.",
+        ),
     ] = None,
     places: Annotated[
         bool,
         typer.Option(
-            "--places", help="Simulate pushes over the whole sheet instead of its centre."
+            "--places", help="Simulate pushes over the whole sheet, not only at its centre."
         ),
     ] = False,
     table: Annotated[
-        bool, typer.Option("--table", help="Keep a table of what the fitted law leaves, too.")
+        bool, typer.Option("--table", help="Also store a table of the fitted model's residuals.")
     ] = False,
     mooney: Annotated[
-        bool, typer.Option("--mooney", help="Fit Mooney's share too; wants stretches past 1.15.")
+        bool,
+        typer.Option(
+            "--mooney", help="Also fit the Mooney weight; needs stretch ratios above 1.15."
+        ),
     ] = False,
     noise_n: Annotated[
-        float, typer.Option(help="Noise of the simulated force gauge, N.", min=0.0)
+        float,
+        typer.Option(help="Standard deviation of the simulated force gauge's noise, N.", min=0.0),
     ] = 0.005,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of the noise.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit modulus x thickness, slack width and cubic term of a sheet to pushes.
+    """Fit modulus times thickness, slack width and cubic term of a sheet to measured forces.
 
-    From measured rows of a CSV (--rows, --scene) or from the twin (--twin).
+    The pushes are rows of a CSV file (--rows, --scene) or are simulated (--twin).
     """
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
-    if not output.parent.is_dir():
-        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    check_folder("-o", output)
     if (rows is None) == (twin is None):
-        raise CommandError("give measured pushes by --rows, or the twin by --twin", BAD_INPUT)
-    made = ["flexsheet", "calibrate", "sheet"]
+        raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
+    command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
         scene = load_scene(scene_file)
         pushes, lines = read_rows(rows, scene.sheet, scene.finger.radius_m)
-        made += ["--rows", str(rows), "--scene", str(scene_file)]
+        command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
     else:
         assert twin is not None
         scene = load_scene(twin)
-        pushes = _twin_rows(scene, places, noise_n, seed)
+        pushes = _simulate_pushes(scene, places, noise_n, seed)
         lines = list(range(1, len(pushes) + 1))
-        made += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
-        made += ["--places"] if places else []
+        command += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
+        command += ["--places"] if places else []
         source = f"twin of {scene.name}"
-    made += ["--table"] if table else []
-    made += ["--mooney"] if mooney else []
+    command += ["--table"] if table else []
+    command += ["--mooney"] if mooney else []
     try:
-        calibration = fitted(
+        calibration = make_calibration(
             scene, pushes, lines, source=source, with_mooney=mooney, with_table=table
         )
     except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}", BAD_INPUT) from error
-    save_sheet_calibration(calibration, output, comment=shlex.join([*made, "-o", str(output)]))
-    _tell(calibration, output, as_json)
+    save_sheet_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    _print_result(calibration, output, as_json)
 
 
-def fitted(
+def make_calibration(
     scene: Scene,
     pushes: list[MeasuredPush],
     lines: list[int],
@@ -118,7 +130,10 @@ def fitted(
     with_mooney: bool,
     with_table: bool,
 ) -> SheetCalibration:
-    """Return the calibration from pushes; SheetModelFitError if they do not determine one."""
+    """Fit the sheet model to pushes. Raises SheetModelFitError if they do not determine it.
+
+    lines: number of each push's line in its file.
+    """
     from importlib.metadata import version
 
     from flexsheet.launch.calibration.sheet_fit import fit_sheet_model, tabulate_pushes
@@ -137,10 +152,10 @@ def fitted(
             fit.names, fit.values, fit.standard_deviations, strict=True
         )
     }
-    kept = None
+    table = None
     if with_table:
         entries = tabulate_pushes(fit.law, pushes, fit.used, scene.sheet.width_m)
-        kept = SheetTable(
+        table = SheetTable(
             stretch_ratios=entries.stretches,
             depths_m=entries.depths_m,
             xs_m=entries.xs_m,
@@ -171,17 +186,17 @@ def fitted(
         least_stretch_ratio=min(stretches),
         largest_stretch_ratio=max(stretches),
         deepest_m=max(push.depth_m for push in pushes),
-        table=kept,
+        table=table,
     )
 
 
-def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
+def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
     from rich.progress import Progress
 
     from flexsheet.launch.calibration.sheet_rows import simulate_rows
 
     with Progress(console=words.console, transient=True) as bar:
-        task = bar.add_task("pushing the twin's sheet", total=None)
+        task = bar.add_task("simulating pushes", total=None)
         return simulate_rows(
             scene,
             places=places,
@@ -191,9 +206,9 @@ def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[Me
         )
 
 
-def _tell(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
+def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
     mooney = calibration.mooney_share
-    told = {
+    fitted = {
         "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
         "slack_width_m": calibration.slack_width_m,
         "cubic_ratio": calibration.cubic_ratio,
@@ -208,15 +223,15 @@ def _tell(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
                 "residual_rms_ratio": calibration.residual_rms_ratio,
                 "residual_worst_ratio": calibration.residual_worst_ratio,
                 "table": calibration.table is not None,
-                **{name: one.model_dump() for name, one in told.items()},
+                **{name: one.model_dump() for name, one in fitted.items()},
             }
         )
         return
     units = {
         "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
         "slack_width_m": ("slack width", 1e3, "mm"),
-        "cubic_ratio": ("cubic term, of ideal rubber's", 1.0, ""),
-        "mooney_share": ("Mooney's share", 1.0, ""),
+        "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
+        "mooney_share": ("Mooney weight", 1.0, ""),
     }
     print_fields(
         [
@@ -228,17 +243,17 @@ def _tell(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
                     f"{units[name][1] * one.value:.4g} "
                     f"± {units[name][1] * one.standard_deviation:.2g} {units[name][2]}".rstrip(),
                 )
-                for name, one in told.items()
+                for name, one in fitted.items()
             ),
             (
                 "residuals",
                 f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
-                f"{100 * calibration.residual_worst_ratio:.1f} % at most",
+                f"{100 * calibration.residual_worst_ratio:.1f} % max",
             ),
             ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
         ]
     )
     for one in calibration.left_out:
         words.print(
-            f"left out: row of line {one.line}, {100 * one.residual_ratio:+.0f} % off", markup=False
+            f"excluded line {one.line}: residual {100 * one.residual_ratio:+.0f} %", markup=False
         )

@@ -25,11 +25,14 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""Simulated poses per requested pair, as not all of them add coverage."""
+"""Simulated poses per requested pair; not every pose adds coverage."""
 
 
-def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
-    """Yield grey image pairs from a camera node's `source`, given in YAML."""
+def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
+    """Yield grey image pairs from a camera node's `source`, given in YAML.
+
+    Raises CommandError for an invalid source and for a device that fails.
+    """
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
 
@@ -39,23 +42,23 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
     try:
         described: Any = TypeAdapter(AnySource).validate_python(parse_value(source))
     except (YAMLError, ValidationError) as error:
-        said = str(error).splitlines()[0]
+        problem = str(error).splitlines()[0]
         if isinstance(error, ValidationError):
             mistakes = [(".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
-            said = "; ".join(f"{where}: {what}" for where, what in mistakes)
+            problem = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
-            f"--device-source {source}: {said}; describe it as a camera node's source, as "
-            "'{kind: opencv, left: 0, right: 1}'",
+            f"--device-source {source}: {problem}; use the format of a camera node's source, such "
+            "as '{kind: opencv, left: 0, right: 1}'",
             BAD_INPUT,
         ) from error
     if described.kind == "twin":
         raise CommandError(
-            "--device-source twin: the twin has no board in a graph; use --twin SCENE", BAD_INPUT
+            "--device-source twin: a running simulator has no board; use --twin SCENE", BAD_INPUT
         )
-    return _read(described, source, scene)
+    return _read_views(described, source, scene)
 
 
-def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
+def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
     from flexsheet.nodes.camera.devices import open_reader
     from flexsheet.nodes.camera.image_pair import DeviceError, check_size
 
@@ -63,15 +66,15 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
             for warning in reader.warnings:
                 words.print(f"camera: {warning}", markup=False)
-            while (pictures := reader.read()) is not None:
-                check_size(pictures, scene.camera, source)
-                yield pictures.left, pictures.right
+            while (images := reader.read()) is not None:
+                check_size(images, scene.camera, source)
+                yield images.left, images.right
     except DeviceError as error:
         raise CommandError(str(error)) from error
 
 
-def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """Yield simulated image pairs of a board, pose by pose."""
+def simulate_views(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
+    """Yield simulated image pairs of a board, one per pose. Raises CommandError."""
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
 
@@ -83,60 +86,61 @@ def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Itera
         raise CommandError(str(error), BAD_INPUT) from error
 
 
-def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int:
+def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     """Write the pairs that `capture` accepts as left01.png, right01.png, ... to a new folder.
 
-    Stops at full coverage, at the end of the images, or at Ctrl-C, and prints missing coverage.
+    Stops at full coverage, after the last pair or at Ctrl-C, and prints the missing coverage.
     Returns the number of pairs, at least one.
     """
-
     if folder.exists():
-        raise CommandError(f"--pictures {folder}: exists already; name a new folder", BAD_INPUT)
-    taken = 0
+        raise CommandError(f"--pictures {folder}: the folder exists; name a new folder", BAD_INPUT)
+    accepted = 0
     try:
-        with _shown(capture) as show:
-            for left, right in pictures:
-                seen = capture.see(left, right)
-                if seen.taken:
-                    taken += 1
+        with _show_coverage(capture) as show:
+            for left, right in views:
+                view = capture.add_pair(left, right)
+                if view.accepted:
+                    accepted += 1
                     folder.mkdir(parents=True, exist_ok=True)
-                    for side, picture in (("left", left), ("right", right)):
-                        write_file(folder / f"{side}{taken:02}.png", encode_png(picture))
-                show(seen.hint, seen.taken)
+                    for side, image in (("left", left), ("right", right)):
+                        write_file(folder / f"{side}{accepted:02}.png", encode_png(image))
+                show(view.hint, view.accepted)
                 if capture.complete:
                     break
     except KeyboardInterrupt:
-        words.print("stopped; going on with what was taken")
+        words.print("capture stopped; using the pairs captured so far")
     missing = capture.missing()
     if missing:
         listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
         words.print(f"not covered: {listed}", markup=False)
-    if not taken:
-        raise CommandError("no pair was taken: the board was never seen at rest in both pictures")
-    words.print(f"{taken} pairs in {folder}", markup=False)
-    return taken
+    if not accepted:
+        raise CommandError(
+            "no pair was accepted: the board was never at rest and visible in both images"
+        )
+    words.print(f"{accepted} pairs in {folder}", markup=False)
+    return accepted
 
 
 @contextmanager
-def _shown(capture: Capture) -> Iterator[Any]:
-    """Yield a function of (hint, taken) that updates the view, or prints lines if piped."""
+def _show_coverage(capture: Capture) -> Iterator[Any]:
+    """Yield a function of (hint, accepted) that updates the view, or prints lines if piped."""
     if not words.is_terminal:
 
-        def tell(hint: str, taken: bool) -> None:
-            if taken:
+        def print_accepted(hint: str, accepted: bool) -> None:
+            if accepted:
                 missing = len(capture.missing())
-                words.print(f"pair taken; {missing} things not covered yet", markup=False)
+                words.print(f"pair accepted; {missing} coverage bins incomplete", markup=False)
 
-        yield tell
+        yield print_accepted
         return
     from rich.live import Live
 
-    with Live(coverage_view(capture, "waiting for pictures"), console=words.console) as live:
-        yield lambda hint, taken: live.update(coverage_view(capture, hint))
+    with Live(coverage_view(capture, "waiting for images"), console=words.console) as live:
+        yield lambda hint, accepted: live.update(coverage_view(capture, hint))
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Draw how often each image cell, tilt and distance was seen and is needed."""
+    """Draw the actual and required number of pairs per image cell, tilt and distance."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.table import Table
@@ -144,20 +148,22 @@ def coverage_view(capture: Capture, hint: str) -> RenderableType:
 
     from flexsheet.launch.calibration.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
 
-    def count(one: Bin) -> Text:
-        have, often = capture.counts[one], capture.needed.get(one, 0)
-        style = "green" if have >= often else "yellow" if have else "red"
-        return Text(f"{have}/{often}" if often else f"{have}", style=style if often else "dim")
+    def cell(one: Bin) -> Text:
+        count, required = capture.counts[one], capture.needed.get(one, 0)
+        style = "green" if count >= required else "yellow" if count else "red"
+        return Text(
+            f"{count}/{required}" if required else f"{count}", style=style if required else "dim"
+        )
 
     tables = []
     for side in ("left", "right"):
-        cells = Table(title=f"{side} picture", show_header=False)
+        cells = Table(title=f"{side} image", show_header=False)
         for row in range(ROWS):
-            cells.add_row(*(count(Bin(f"{side} cell", f"{x},{row}")) for x in range(COLUMNS)))
+            cells.add_row(*(cell(Bin(f"{side} cell", f"{x},{row}")) for x in range(COLUMNS)))
         tables.append(cells)
     for group, names in (("tilt", TILTS), ("distance", DISTANCES), ("pairs", ("",))):
         table = Table(title=group, show_header=False)
         for name in names:
-            table.add_row(name, count(Bin(group, name)))
+            table.add_row(name, cell(Bin(group, name)))
         tables.append(table)
     return Group(Columns(tables), Text(hint, style="bold"))

@@ -40,35 +40,36 @@ def chart(
     *,
     family: Annotated[
         str | None,
-        typer.Argument(help="Method family; default: all.", autocompletion=complete.families),
+        typer.Argument(
+            help="Method family to measure; default: all.", autocompletion=complete.families
+        ),
     ] = None,
     scene_file: Annotated[
         Path,
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene for the measurements.",
+            help="Scene file for the measurements.",
             autocompletion=complete.yaml_files,
         ),
     ] = SCENE_FILE,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="Folder for charts and numbers.")
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder for the charts and results.")
     ] = Path("runs/charts"),
     redraw: Annotated[
         bool,
-        typer.Option(
-            "--redraw", help="Draw the stored numbers in --output again without measuring."
-        ),
+        typer.Option("--redraw", help="Redraw the results stored in --output without measuring."),
     ] = False,
     cases: Annotated[
-        bool, typer.Option("--cases", help="Print every case instead of one line per method.")
+        bool,
+        typer.Option("--cases", help="Print one line per case instead of one line per method."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure and draw speed against accuracy of a family's methods on this computer.
 
     Prints the maximum median time and the maximum error of each method over the cases in its range.
-    The front has the methods that no other method dominates in both.
+    Methods on the Pareto front are marked "front".
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts
@@ -78,7 +79,7 @@ def chart(
     if redraw:
         results = charts.read_charts(output)
         if not results:
-            raise CommandError(f"--output {output}: has no charts to redraw", BAD_INPUT)
+            raise CommandError(f"--output {output}: does not contain charts to redraw", BAD_INPUT)
         for result in results:
             charts.write_chart(result, output)
         words.print(f"charts: {charts.write_overview(output)}")
@@ -87,7 +88,7 @@ def chart(
         return
     scene = load_scene(scene_file)
     try:
-        families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
+        families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:
         raise CommandError(str(error), BAD_INPUT) from None
     if busy := describe_load():
@@ -97,9 +98,9 @@ def chart(
         with progress_words() as progress:
             report = partial(_report, progress, each.name)
             points = charts.measure_family(each, scene, progress=report)
-        result = replace_non_finite(charts.chart_result(each, scene, points))
-        picture, _ = charts.write_chart(result, output)
-        words.print(f"chart: {picture}")
+        result = replace_non_finite(charts.make_chart_result(each, scene, points))
+        image, _ = charts.write_chart(result, output)
+        words.print(f"chart: {image}")
         results.append(result)
         if not as_json:
             (_print_points if cases else _print_methods)(result)
@@ -113,12 +114,12 @@ def _report(progress: Callable[[str], None], family: str, text: str) -> None:
 
 
 def _print_methods(result: dict[str, Any]) -> None:
-    from flexsheet.launch.methods.charts import duration, summarize_methods
+    from flexsheet.launch.methods.charts import format_duration, summarize_methods
 
     rows = [
         (
             one["method"],
-            duration(one["median_s"]),
+            format_duration(one["median_s"]),
             "-" if one["error"] is None else f"{one['error']:.3g}",
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",

@@ -1,6 +1,6 @@
 """Complete names in the shell; modules are imported only when they are needed.
 
-Without a match the shell completes file names.
+If no name matches, the shell completes file names.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import typer
 
 
 def topics(incomplete: str) -> list[str]:
+    """Complete topic names."""
     from flexsheet.messages.topics import TOPICS
 
     return _filter(TOPICS, incomplete)
 
 
 def node_types(incomplete: str) -> list[str]:
+    """Complete node types."""
     from flexsheet.nodes import NODES
 
     return _filter(NODES, incomplete)
@@ -36,32 +38,35 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
+    """Complete the method families that `tune` can choose from."""
     from flexsheet.launch.methods.tune import TUNABLES
 
     return _filter((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
+    """Complete gestures, or else CSV files."""
     from flexsheet.launch.experiments.gestures import GESTURES
 
     return _filter(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
-    """Suggest the directories of running graphs for shell completion."""
+    """Complete the directories of running graphs."""
     from flexsheet.launch.running.runs import live_runs
 
     return _filter((str(run.directory) for run in live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
+    """Complete the method families that `chart` can measure."""
     from flexsheet.launch.methods.charts import FAMILIES
 
     return _filter(FAMILIES, incomplete)
 
 
 def files(*suffixes: str) -> Callable[[str], list[str]]:
-    """Make a completion of files with these suffixes, and of their folders."""
+    """Make a completion of files with these suffixes, and of the folders beside them."""
 
     def complete(incomplete: str) -> list[str]:
         folder, _, start = incomplete.rpartition("/")
@@ -71,7 +76,7 @@ def files(*suffixes: str) -> Callable[[str], list[str]]:
             return []
         matches = sorted(entry for entry in parent.iterdir() if entry.name.startswith(start))
         found = [prefix + entry.name for entry in matches if entry.suffix in suffixes]
-        # If there are folders only, the shell completes them better itself.
+        # Without matching files, the shell's own completion of folders is better.
         folders = [f"{prefix}{entry.name}/" for entry in matches if found and entry.is_dir()]
         return found + folders
 

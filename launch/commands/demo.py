@@ -13,9 +13,9 @@ from flexsheet.launch.commands.experiment import (
     LaunchOption,
     OutputOption,
     SettingsOption,
+    make_result_folder,
     print_followed,
     print_strokes,
-    result_folder,
 )
 from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
@@ -35,8 +35,8 @@ def demo(
         str | None,
         typer.Option(
             metavar="NAME_OR_FILE",
-            help="Gesture name, or recorded finger path (CSV with t_s,x_mm,y_mm,z_mm), instead of "
-            "the strokes.",
+            help="Gesture, or CSV file of a recorded finger path (columns t_s,x_mm,y_mm,z_mm); "
+            "replaces the strokes.",
             autocompletion=complete.gestures,
         ),
     ] = None,
@@ -45,10 +45,10 @@ def demo(
 ) -> None:
     """Stroke, tilt and push the simulated sheet on this computer, and draw the results."""
     from flexsheet.launch.experiments.demo import run_demo
-    from flexsheet.launch.experiments.gestures import finger_path as path_of
+    from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    path = None if finger_path is None else path_of(launch_file, finger_path)
-    folder = result_folder(output, "demo")
+    path = None if finger_path is None else load_path(launch_file, finger_path)
+    folder = make_result_folder(output, "demo")
     with progress_words() as progress:
         result = run_demo(
             launch_file, settings or (), folder, progress, path=path, apparatus=apparatus
@@ -59,7 +59,7 @@ def demo(
                 "strokes": result.strokes,
                 "followed": result.followed,
                 "bag": str(result.bag),
-                "pictures": [str(picture) for picture in result.pictures],
+                "pictures": [str(image) for image in result.images],
             }
         )
         return
@@ -68,5 +68,5 @@ def demo(
     if result.followed is not None:
         print_followed([result.followed])
     words.print(f"bag: {result.bag}")
-    for picture in result.pictures:
-        words.print(f"picture: {picture}")
+    for image in result.images:
+        words.print(f"image: {image}")

@@ -1,4 +1,4 @@
-"""`flexsheet doctor`: check this computer, the arms' reach, and the hosts of a graph."""
+"""`flexsheet doctor`: check this computer, a scene's reachability, and the hosts of a graph."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    check_folder,
     examples,
     print_fields,
     print_json,
@@ -36,13 +37,15 @@ def doctor(
     context: typer.Context,
     sweep: Annotated[
         bool,
-        typer.Option("--sweep", help="First end the processes that ended launchers have left."),
+        typer.Option(
+            "--sweep", help="First end processes left over from launchers that have exited."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check this computer; exit code 1 if a check fails.
 
-    If a graph of several computers runs here, all of them are checked, too.
+    If a graph of several computers is running, also checks its hosts.
     """
     if context.invoked_subcommand is not None:
         return
@@ -52,25 +55,25 @@ def doctor(
 
     if sweep:
         ended = sweep_leftovers()
-        words.print(f"ended {len(ended)} processes of ended launchers")
+        words.print(f"ended {len(ended)} leftover processes")
     findings = []
     with words.status("checking") as status:
         for finding in check_all():
             status.update(f"checked {finding.check}")
             findings.append(finding)
         status.update("checking all hosts")
-        of_hosts = check_running_graph()
+        host_findings = check_running_graph()
     if as_json:
-        print_json([asdict(one) for one in findings] + [asdict(one) for one in of_hosts])
+        print_json([asdict(one) for one in findings] + [asdict(one) for one in host_findings])
     else:
         print_table(
-            ("check", "state", "what", "what to do"),
+            ("check", "state", "finding", "remedy"),
             [(one.check, one.state, one.what, one.remedy) for one in findings],
         )
-        if of_hosts:
+        if host_findings:
             print()
-            print_findings(of_hosts)
-    states = {one.state for one in findings} | {one.state for one in of_hosts}
+            print_findings(host_findings)
+    states = {one.state for one in findings} | {one.state for one in host_findings}
     if "failed" in states:
         raise typer.Exit(FAILED)
 
@@ -89,23 +92,24 @@ def check_scene(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="PICTURE", help="Draw the reachable range to this file."
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="Image file for the reachable range (.png or .svg).",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check that both arms reach a scene's whole working range; exit code 1 if they do not.
 
-    The check covers every contact within the scene's tilt and depth, at the minimum and maximum
-    stretch.  It also reports how fast a finger may move for the arms to follow.
+    Checks every contact within the scene's tilt and depth, at minimum and maximum stretch, and
+    prints the maximum finger speed that the arms can follow.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
     from flexsheet.launch.plans.plan import load_scene
 
-    if output is not None and not output.resolve().parent.is_dir():
-        raise CommandError(
-            f"--output {output}: the folder {output.parent} does not exist", BAD_INPUT
-        )
+    if output is not None:
+        check_folder("--output", output)
     scene = load_scene(scene_file)
     with progress_words() as progress:
         layout = check_layout(scene, progress=progress)
@@ -117,7 +121,7 @@ def check_scene(
             raise CommandError(
                 f"--output {output}: cannot be written: {error}; name a .png or .svg", BAD_INPUT
             ) from error
-        words.print(f"picture: {output}", markup=False)
+        words.print(f"image: {output}", markup=False)
     if as_json:
         print_json(result)
     else:
@@ -126,22 +130,22 @@ def check_scene(
         raise typer.Exit(FAILED)
 
 
-def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
+def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     arms = result["arms"]
     print_fields(
         [
             ("scene", result["scene"]),
             ("reachable", "yes" if result["reachable"] else "NO"),
             (
-                "share",
-                f"{100 * result['share']:.1f} % of {result['samples']} samples, "
+                "reachable samples",
+                f"{100 * result['share']:.1f} % of {result['samples']}, "
                 + ", ".join(f"{side} {100 * one['share']:.1f} %" for side, one in arms.items()),
             ),
             *((f"{side} branch", ", ".join(one["branch"].values())) for side, one in arms.items()),
             (
                 "speed",
-                f"{1e3 * asked_m_per_s:.0f} mm/s asked; followed everywhere: "
-                f"{1e3 * result['speed_everywhere_m_per_s']:.0f} mm/s, at half of the places: "
+                f"{1e3 * required_m_per_s:.0f} mm/s required; possible at all samples: "
+                f"{1e3 * result['speed_everywhere_m_per_s']:.0f} mm/s, at half of the samples: "
                 f"{1e3 * result['speed_at_half_m_per_s']:.0f} mm/s",
             ),
         ]
@@ -159,10 +163,10 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
         for one in arm["binding"]
     ]
     if binding:
-        print_table(("arm", "what binds", "share", "first at tilt", "depth"), binding)
+        print_table(("arm", "active limit", "samples", "first at tilt", "depth"), binding)
         print()
     print_table(
-        ("arm", "least margin of", "which", "margin", "at tilt", "depth"),
+        ("arm", "minimum margin of", "limit", "margin", "at tilt", "depth"),
         [
             (
                 side,
@@ -176,12 +180,12 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
             for kind, one in arm["least_margins"].items()
         ],
     )
-    for way in result["broken_ways"]:
-        words.print(f"no way {way}", markup=False)
+    for path in result["broken_ways"]:
+        words.print(f"no path {path}", markup=False)
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
     if not result["reachable"] and not result["remedies"]:
-        words.print("no single change of those that were tried makes all of it reachable")
+        words.print("no single change that was tried makes the whole working range reachable")
 
 
 def _margin(value: float, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""`flexsheet doctor compliance`: can a scene's sheet present its object; if not, by how much."""
+"""`flexsheet doctor compliance`: compare the sheet's force with that of a scene's object."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flexsheet.launch.commands.output import (
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to `flexsheet doctor`."""
+    """Add the command to `flexsheet doctor`."""
     app.command(
         "compliance",
         epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
@@ -38,13 +38,16 @@ def compliance(
     ],
     calibration: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Of the sheet, by `flexsheet calibrate sheet`."),
+        typer.Option(
+            metavar="FILE", help="Sheet calibration file, written by `flexsheet calibrate sheet`."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that the sheet can yield as a scene's object does; exit code 1 when it cannot.
+    """Check that the sheet can render the compliance of a scene's object; exit code 1 if not.
 
-    Pushed in the middle, by the planner's law: presented and wanted force to the scene's depth.
+    Compares the object's force with the rendered force, for pushes at the centre to the maximum
+    depth of the scene.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
@@ -59,7 +62,7 @@ def compliance(
         law = make_force_model(
             scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
         )
-        with words.status("working out the soft body"):
+        with words.status("computing the soft body's force curve"):
             curve = ObjectCurve.from_rows(compute_front_curve(scene))
     except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
@@ -68,7 +71,7 @@ def compliance(
         print_json(result)
     else:
         print_table(
-            ("depth, mm", "wanted, N", "presented, N", "error, %", "sheet retreats, mm"),
+            ("depth, mm", "object, N", "rendered, N", "error, %", "normal offset, mm"),
             [
                 (
                     f"{row['depth_mm']:.0f}",
@@ -83,10 +86,10 @@ def compliance(
         print_fields(
             [
                 ("stretch", f"{result['stretch_ratio']:.3f}"),
-                ("pull at the clamps", f"{result['largest_edge_force_n']:.1f} N at most"),
-                ("coming towards the finger", f"{result['advance_per_depth']:.2f} of its push"),
-                ("largest error", f"{100 * result['worst_error_ratio']:.1f} %"),
-                ("verdict", result["note"] or "presented within what is aimed for"),
+                ("maximum edge force", f"{result['largest_edge_force_n']:.1f} N"),
+                ("advance per depth", f"{result['advance_per_depth']:.2f}"),
+                ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),
+                ("result", result["note"] or "the error is within the tolerance"),
             ]
         )
     if result["note"]:

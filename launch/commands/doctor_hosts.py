@@ -46,25 +46,28 @@ def hosts(
         Path | None,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="Launch file; default: that of the graph that runs here.",
+            help="Launch file; default: that of the graph running on this computer.",
             autocompletion=complete.yaml_files,
         ),
     ] = None,
     host: Annotated[
         str | None,
         typer.Option(
-            help="Name of this computer in the launch file; default: by its address.",
+            help="Host name of this computer in the launch file; default: found by its address.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     patience: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Time to wait for answers.", min=1.5)
+        float,
+        typer.Option(
+            metavar="SECONDS", help="Maximum time to wait for the hosts' answers, s.", min=1.5
+        ),
     ] = TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
     """Check all hosts of a launch file; exit code 1 if a check fails.
 
-    Before the graph is started, the command checks this computer and the network.
+    Before the graph is started, checks this computer and the network only.
     """
     plan, run = _find_graph(launch_file)
     here = find_host(plan, run, host)
@@ -75,14 +78,14 @@ def hosts(
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
     else:
-        words.print(f"{plan.launch_file}, plan {plan.hash}, asked from {here}", markup=False)
+        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}", markup=False)
         print_findings(findings)
     if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)
 
 
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
-    """Return the findings about all hosts of the running graph; none for a single host."""
+    """Return the findings about all hosts of the running graph; an empty list for a single host."""
     from flexsheet.launch.running.runs import live_runs
     from flexsheet.launch.running.tools import tools_host
 
@@ -95,8 +98,7 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved launch file, and its running graph on this computer, if any."""
-
+    """Return the resolved launch file, and its run on this computer or None."""
     from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
@@ -110,20 +112,20 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
     return plan, run if same or running.hash == plan.hash else None
 
 
-def find_host(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
-    """Return the name of this computer in the graph.  Raises CommandError if it is ambiguous."""
+def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
+    """Return the name of this computer in the graph. Raises CommandError if it is ambiguous."""
     from flexsheet.launch.health.doctor_hosts import own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN
     from flexsheet.launch.running.tools import tools_host
 
-    if wanted is not None:
-        if wanted not in plan.hosts:
+    if requested is not None:
+        if requested not in plan.hosts:
             raise CommandError(
-                f"--host {wanted}: unknown host; {did_you_mean(wanted, list(plan.hosts))}",
+                f"--host {requested}: unknown host; {did_you_mean(requested, list(plan.hosts))}",
                 BAD_INPUT,
             )
-        return wanted
+        return requested
     if run is not None:
         return tools_host(run)
     own = own_addresses()
@@ -131,7 +133,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
     if MAIN in found or len(found) == 1:
         return MAIN if MAIN in found else found[0]
     raise CommandError(
-        f"this computer has none of the addresses in {plan.launch_file} "
+        f"no address of this computer is in {plan.launch_file} "
         f"({', '.join(plan.hosts.values())}); name the host with --host NAME",
         BAD_INPUT,
     )
@@ -162,15 +164,15 @@ async def check_hosts(
         probes = await probe_all(plan, here=here, keys=keys, run=run, timeout_s=timeout_s)
     findings = evaluate_probes(plan, here, probes)
     if probes[here].status is None:
-        seen = await asyncio.to_thread(lambda: list(check_before_start(plan, here, key_problem)))
+        local = await asyncio.to_thread(lambda: list(check_before_start(plan, here, key_problem)))
         first = next((i for i, one in enumerate(findings) if one.host == here), 0)
         last = first + sum(one.host == here for one in findings)
-        findings[last:last] = seen
+        findings[last:last] = local
     return findings
 
 
 def print_findings(findings: list[HostFinding]) -> None:
-    """Print one line per host and check; the first line of a host has its name."""
+    """Print one line per host and check; only the first line of a host has its name."""
     rows = []
     before = ""
     for one in findings:
@@ -178,4 +180,4 @@ def print_findings(findings: list[HostFinding]) -> None:
             (one.host if one.host != before else "", one.check, one.state, one.what, one.remedy)
         )
         before = one.host
-    print_table(("host", "check", "state", "what", "what to do"), rows)
+    print_table(("host", "check", "state", "finding", "remedy"), rows)

@@ -34,14 +34,16 @@ LaunchOption = Annotated[
     typer.Option(
         "--launch",
         metavar="FILE",
-        help="Launch file of the graph.",
+        help="Launch file of the graph; default: the demo graph.",
         autocompletion=complete.yaml_files,
     ),
 ]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
-        "--output", metavar="FOLDER", help="Folder for the bag and results; default: runs/..."
+        "--output",
+        metavar="FOLDER",
+        help="Folder for the bag and results; default: a new folder in runs/.",
     ),
 ]
 SettingsOption = Annotated[
@@ -55,13 +57,13 @@ MapOption = Annotated[
     typer.Option(
         "--map",
         metavar="FILE.png",
-        help="Also measure and draw the error at each visible point; takes twice as long.",
+        help="Image file for a map of the error at each visible point; doubles the duration.",
     ),
 ]
 
 
-def result_folder(output: Path | None, name: str) -> Path:
-
+def make_result_folder(output: Path | None, name: str) -> Path:
+    """Create the folder for an experiment's bag and results, `output` or a new one in runs/."""
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
@@ -102,13 +104,13 @@ def stroke(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stroke the cylinder by 60 degrees (section V, Table I)."""
+    """Stroke the cylinder over 60 degrees, and measure the sheet's errors (section V, Table I)."""
     from flexsheet.launch.experiments import stroke as experiment
-    from flexsheet.launch.experiments.run import stroke_procedure
+    from flexsheet.launch.experiments.run import make_stroke_procedure
 
-    bag = result_folder(output, "stroke") / "stroke.mcap"
+    bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
-        procedure = stroke_procedure([seconds], progress)
+        procedure = make_stroke_procedure([seconds], progress)
         _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
@@ -133,8 +135,8 @@ def tilt(
     """Measure image errors on an inclined sheet (section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
 
-    bag = result_folder(output, "tilt") / "tilt.mcap"
-    _photograph(
+    bag = make_result_folder(output, "tilt") / "tilt.mcap"
+    _measure_images(
         TILT, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
     )
 
@@ -151,13 +153,15 @@ def push(
         typer.Option(
             "--at",
             metavar="MM",
-            help="Contact position along the cylinder's axis, from its middle.",
+            help="Contact position along the cylinder's axis from its centre, mm.",
         ),
     ] = 0.0,
     tilt_deg: Annotated[
         float,
         typer.Option(
-            "--tilt", metavar="DEG", help="Contact angle around the axis, which inclines the sheet."
+            "--tilt",
+            metavar="DEG",
+            help="Contact angle around the cylinder's axis, degrees; inclines the sheet.",
         ),
     ] = 0.0,
     map_file: MapOption = None,
@@ -169,18 +173,21 @@ def push(
 ) -> None:
     """Measure image errors on a pushed sheet (section VI-C, Fig. 13).
 
-    As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
-    all of the push.  `--set planner.compliance_mode=force_curve` has it comply.
+    As in the paper, the sheet is tilted but does not comply: the finger's whole push deflects it.
+    `--set planner.compliance_mode=force_curve` enables compliance.
     """
-    from flexsheet.launch.experiments.image import pushed_at
-    from flexsheet.launch.experiments.run import settings_of_type
+    from flexsheet.launch.experiments.image import make_push_series
+    from flexsheet.launch.experiments.run import make_settings
 
     settings = [
-        *settings_of_type(launch_file, "planner", "compliance_mode=stiffness"),
+        *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
         *(settings or ()),
     ]
-    bag, series = result_folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
-    _photograph(
+    bag, series = (
+        make_result_folder(output, "push") / "push.mcap",
+        make_push_series(at_mm, tilt_deg),
+    )
+    _measure_images(
         series, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
     )
 
@@ -194,21 +201,21 @@ def compliance(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the force on the finger with that of the object over the push depth."""
+    """Compare the force on the finger with the object's force, over the push depth."""
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
 
-    folder = result_folder(output, "compliance")
-    bag, picture = folder / "compliance.mcap", folder / "compliance.png"
+    folder = make_result_folder(output, "compliance")
+    bag, image = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
-        procedure = experiment.compliance_procedure(progress)
+        procedure = experiment.make_compliance_procedure(progress)
         _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
-        draw_compliance(result, picture)
+        draw_compliance(result, image)
     if as_json:
-        print_json({**result, "picture": str(picture)})
+        print_json({**result, "picture": str(image)})
         return
-    columns = ["place", "depth, mm", "wanted, N", "presented, N", "off, %", "retreat, mm"]
+    columns = ["position", "depth, mm", "object, N", "rendered, N", "error, %", "offset, mm"]
     cells = [
         [cell if isinstance(cell, str) else f"{cell:.2f}" for cell in row.values()]
         for row in result["rows"]
@@ -216,15 +223,15 @@ def compliance(
     print_table(columns, cells)
     moving = result["moving"]
     words.print(
-        f"in and out at {moving['speed_mm_per_s']:g} mm/s: {moving['rms_percent']:.0f} % rms, "
-        f"{moving['worst_percent']:.0f} % at most; people notice "
+        f"in motion at {moving['speed_mm_per_s']:g} mm/s: {moving['rms_percent']:.0f} % rms, "
+        f"{moving['worst_percent']:.0f} % max; noticeable from "
         f"{result['noticed_percent'][0]:.0f} to {result['noticed_percent'][1]:.0f} %"
     )
     words.print(f"bag: {bag}")
-    words.print(f"picture: {picture}")
+    words.print(f"image: {image}")
 
 
-def _photograph(
+def _measure_images(
     series: Series,
     bag: Path,
     launch_file: Path,
@@ -236,15 +243,15 @@ def _photograph(
 ) -> None:
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
-    from flexsheet.launch.experiments.run import picture_procedure
+    from flexsheet.launch.experiments.run import make_image_procedure
 
     mapped = map_file is not None
     with progress_words() as progress:
-        procedure = picture_procedure(
+        procedure = make_image_procedure(
             series, series.values, image.CORRECTIONS, progress, with_maps=mapped
         )
         _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
-        pictures = image.read_pictures(bag)
+        pictures = image.read_images(bag)
         rows = image.make_rows(pictures, series, with_maps=mapped)
         if map_file is not None:
             draw_error_maps(pictures, series, map_file)
@@ -273,7 +280,11 @@ def gestures(
     *,
     names: Annotated[
         str | None,
-        typer.Option("--names", metavar="NAME,...", help="Gestures to run; default: all."),
+        typer.Option(
+            "--names",
+            metavar="NAME,...",
+            help="Gestures to run, separated by commas; default: all.",
+        ),
     ] = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
@@ -281,15 +292,15 @@ def gestures(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure how well a fingertip is tracked in strokes, taps, reaches, stops and turns."""
+    """Measure the tracking error of a fingertip in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
 
-    wanted = experiment.select_gestures(names)
-    bag = result_folder(output, "gestures") / "gestures.mcap"
+    selected = experiment.select_gestures(names)
+    bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
-        procedure = experiment.gestures_procedure(wanted, progress)
+        procedure = experiment.make_gestures_procedure(selected, progress)
         _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
-        result = experiment.gestures_result(bag, wanted)
+        result = experiment.gestures_result(bag, selected)
     if as_json:
         print_json(result)
     else:
@@ -299,7 +310,7 @@ def gestures(
 
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """Print a line per gesture: errors in mm, delays in ms."""
+    """Print one line per gesture: errors in mm, delays in ms."""
 
     def shown(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
@@ -320,7 +331,7 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print a line per path: error between true sheet and true finger in contact."""
+    """Print one line per path: error between true sheet and true finger during contact."""
 
     def shown(values: dict[str, float] | None) -> list[str]:
         if values is None:
@@ -345,14 +356,14 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
     columns = ["moving time"]
     for name, unit in (("Δd", "mm"), ("Δθ", "°")):
-        columns += [f"{name} paper, {unit}", f"{name} ours, {unit}", f"true {name}, {unit}"]
+        columns += [f"{name} paper, {unit}", f"{name} measured, {unit}", f"true {name}, {unit}"]
     rows = []
     for result in results:
         row = [f"{result['seconds']:g} s"]
         for key in ("delta_d_mm", "delta_theta_deg"):
             paper = PAPER_TABLE_1.get(result["seconds"], {}).get(key)
             row.append("-" if paper is None else f"{paper[0]:.3f} ± {paper[1]:.3f}")
-            for ours in (result[key], result[f"true_{key}"]):
-                row.append(f"{ours['mean']:.3f} ± {ours['std']:.3f}")
+            for measured in (result[key], result[f"true_{key}"]):
+                row.append(f"{measured['mean']:.3f} ± {measured['std']:.3f}")
         rows.append(row)
     print_table(columns, rows)

@@ -1,4 +1,4 @@
-"""`flexsheet explain`: what an error or a note means, and what to do."""
+"""`flexsheet explain`: print the meaning and remedy of an error or note."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3
 MIN_WORD_LETTERS = 3
 MIN_SHARED_WORDS = 2
-"""Words that a text and an entry must share to be a close match."""
+"""Minimum number of words that a text and a close match have in common."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One kind of error or note.
 
-    name: name of the class.  phrase: part of every text of the kind.  Empty where there is none.
+    name: name of the class, or empty. phrase: text that all notes of this kind contain, or empty.
     """
 
     code: str
@@ -42,7 +42,7 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return the errors of all packages by code, the notes, and the reasons of fingertips."""
+    """Return the entries of all errors, node notes and fingertip rejection reasons."""
     from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
 
     for package in PACKAGES:
@@ -61,7 +61,7 @@ def entries() -> tuple[Entry, ...]:
 
 
 def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
-    """Yield the project's classes that derive from an error, without those of tests and users."""
+    """Yield the project's subclasses of an error, without those of tests and users."""
     for derived in kind.__subclasses__():
         if derived.__module__.startswith("flexsheet."):
             yield derived
@@ -73,10 +73,10 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the entries for a code, a class name, or the text of an error; the best one first.
+    """Return the entries for a code, a class name or an error text, the best match first.
 
-    A text matches an entry whose class it names or whose phrase it contains. Otherwise, those
-    entries match that share `MIN_SHARED_WORDS` words with it; rare words count more.
+    A text matches entries whose class name or phrase it contains; otherwise entries that have at
+    least `MIN_SHARED_WORDS` words in common with it, weighted by rarity.
     """
     if exact := [entry for entry in entries() if text in (entry.code, entry.name)]:
         return exact
@@ -107,12 +107,10 @@ def _words(text: str) -> set[str]:
     )
 )
 def explain(
-    message: Annotated[
-        str, typer.Argument(help="Code of an error or note, name of its class, or its text.")
-    ],
+    message: Annotated[str, typer.Argument(help="Code, class name or text of an error or note.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Print what an error or a note means and what to do; docs/errors.md lists all of them."""
+    """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""
     found = [
         {"code": one.code, "means": one.meaning, "what to do": one.remedy}
         for one in find_entries(message)[:MAX_ENTRIES]
@@ -124,4 +122,4 @@ def explain(
             print()
         print_fields(entry.items())
     if not found:
-        raise CommandError(f'"{message}" matches no error or note; docs/errors.md lists all codes')
+        raise CommandError(f'"{message}": unknown error or note; docs/errors.md lists all codes')

@@ -22,7 +22,7 @@ RunOption = Annotated[
     Path | None,
     typer.Option(
         "--run",
-        help="Directory of the run; default: the newest run that is alive.",
+        help="Directory of the run; default: the newest running graph.",
         autocompletion=complete.runs,
     ),
 ]
@@ -46,7 +46,10 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """Return the graph and the run in `directory`, or of the newest run that is alive."""
+    """Return the graph and run of `directory`, default: of the newest running launcher.
+
+    Raises CommandError for a directory without a plan, NoGraphError if no graph is running.
+    """
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run, live_runs
 
@@ -54,7 +57,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
         run = Run(directory.resolve().name, directory.resolve())
         if not run.plan_file.is_file():
             raise CommandError(
-                f"--run {directory}: the directory has no plan.json; name the directory of a run",
+                f"--run {directory}: does not contain plan.json; name the directory of a run",
                 BAD_INPUT,
             )
     else:

@@ -26,10 +26,12 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help="Manage the k
 
 
 class KeyCommand(TyperCommand):
-    """Accept a last argument that is a key and begins with "-"."""
+    """Command whose last argument may be a key that starts with "-"."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move such a key behind "--", where click expects no option."""
+        """Move a key that starts with "-" behind "--", so that click does not parse it as an
+        option.
+        """
         keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
         if keys and "--" not in args:
             args = [one for one in args if one not in keys] + ["--", *keys]
@@ -45,13 +47,16 @@ HostArgument = Annotated[
 def new(
     host: HostArgument,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Replace the existing key, which is then lost.")
+        bool,
+        typer.Option(
+            "--replace", help="Replace the host's existing key, which cannot be restored."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Create the key pair of a host, on that host, and print the public key.
+    """Create the key pair of a host, and print its public key; run the command on that host.
 
-    The secret key stays in a file that only its owner can read.
+    Stores the secret key in a file that only its owner can read.
     """
     import re
 
@@ -60,7 +65,7 @@ def new(
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(
-            f'"{host}" is not a host name; use small letters, digits and _', BAD_INPUT
+            f'"{host}": invalid host name; use lower-case letters, digits and _', BAD_INPUT
         )
     public, secret = make_key_pair()
     file = secret_file(host)
@@ -68,7 +73,7 @@ def new(
         write_secret(file, secret, replace=replace)
     except SecurityError as error:
         raise CommandError(str(error)) from error
-    words.print(f"the secret key is {file}; it stays on this computer", markup=False)
+    words.print(f"secret key: {file}; do not copy it to another computer", markup=False)
     words.print(
         f"on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
     )
@@ -81,17 +86,22 @@ def new(
 @app.command(epilog=examples("flexsheet keys show", "flexsheet keys show arm_left"))
 def show(
     host: Annotated[
-        str | None, typer.Argument(metavar="HOST", help="Name of the host; default: all hosts.")
+        str | None,
+        typer.Argument(
+            metavar="HOST", help="Name of the host in the launch file; default: all hosts."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the public keys of the key pairs here; exit code 1 if one cannot be used."""
+    """Print the public keys of this computer's key pairs; exit code 1 if a key cannot be read."""
     from flexsheet.launch.running.keys import directory, secret_file
     from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
-        raise CommandError(f"{directory()} holds no keys; create one: flexsheet keys new HOST")
+        raise CommandError(
+            f"{directory()}: does not contain keys; create one: flexsheet keys new HOST"
+        )
     rows = []
     problems = []
     for file in files:
@@ -132,14 +142,14 @@ def install(
     key: Annotated[
         str | None,
         typer.Argument(
-            metavar="KEY", help="Public key; default: that of the key pair on this computer."
+            metavar="KEY", help="Public key; default: from the key pair on this computer."
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a host's public key into a launch file.
 
-    A graph that runs from that file uses it within two seconds, without a restart.
+    A graph that runs from that file uses the new key within two seconds, without a restart.
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file
@@ -154,4 +164,4 @@ def install(
     if as_json:
         print_json({"launch_file": str(file), "host": host, "public": key})
     else:
-        words.print(f"{file}: hosts.{host}.key is {key}", markup=False)
+        words.print(f"{file}: hosts.{host}.key = {key}", markup=False)

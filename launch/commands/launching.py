@@ -1,4 +1,4 @@
-"""`flexsheet launch`: start a graph, keep it running, and end it."""
+"""`flexsheet launch`: start a graph, supervise it, and stop it."""
 
 from __future__ import annotations
 
@@ -47,15 +47,13 @@ def launch(
     host: Annotated[
         str | None,
         typer.Option(
-            help="Start only the nodes of this host; default: all nodes.",
+            help="Host whose nodes are started; default: the nodes of all hosts.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option(
-            "--dry-run", help="Check the file and print the resolved graph; do not start it."
-        ),
+        typer.Option("--dry-run", help="Print the resolved graph without starting it."),
     ] = False,
     settings: Annotated[
         list[str] | None,
@@ -65,21 +63,24 @@ def launch(
     ] = None,
     apparatus: ApparatusOption = None,
     record: Annotated[
-        Path | None, typer.Option(metavar="BAG", help="Record the logged topics to this bag.")
+        Path | None,
+        typer.Option(metavar="BAG", help="Bag file for the topics of the launch file's `log`."),
     ] = None,
     console: Annotated[
         bool,
-        typer.Option("--console", help="Add the console in the browser, and a recorder for it."),
+        typer.Option("--console", help="Add a browser console and its recorder to the graph."),
     ] = False,
     duration: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Stop this long after all nodes are ready."),
+        typer.Option(
+            metavar="SECONDS", help="Time until the graph stops after all nodes are ready, s."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Start the nodes of a launch file and keep them running until Ctrl-C.
+    """Start the nodes of a launch file and supervise them until Ctrl-C.
 
-    With --json it prints one line about the run when all nodes are ready; with --dry-run the
+    With --json, prints one line about the run when all nodes are ready; with --dry-run, the
     resolved graph.
 
     Exit codes: 0 stopped on request, 1 a node failed, 2 the input is invalid.
@@ -104,7 +105,7 @@ def launch(
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """Return what scripts need to know of a ready graph."""
+    """Return the run directory, plan hash and node names of a ready graph, for scripts."""
     nodes = [node.name for node in plan.nodes_on(host)]
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes}
 
@@ -143,7 +144,7 @@ async def _run_until(
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run the graph until `stop_requested`, or `duration_s` after ready; return the exit code."""
+    """Run the graph until `stop_requested`, or until `duration_s` after it is ready."""
     from flexsheet.launch.running.supervisor import NodeFailedError
     from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 
@@ -158,7 +159,9 @@ async def _run_until(
                 if ready.done():
                     ready.result()
                     notify_systemd("READY=1")
-                    words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
+                    words.print(
+                        f"[green]all {len(graph.nodes)} nodes are ready[/]; press Ctrl-C to stop"
+                    )
                     when_ready(graph.run)
                     await asyncio.wait(
                         (end, stop), timeout=duration_s, return_when=asyncio.FIRST_COMPLETED
@@ -181,7 +184,7 @@ async def _run_until(
 
 
 def _print_log_line(node: str, line: str) -> None:
-    """Print one line of a node's log; JSON from structlog becomes readable text."""
+    """Print one line of a node's log; format JSON from structlog as readable text."""
     style, text = "", line
     if line.startswith("{"):
         try:
@@ -201,14 +204,14 @@ def _print_log_line(node: str, line: str) -> None:
 
 
 def _format_settings(node: ResolvedNode) -> str:
-    """Return the parameters that differ from their defaults, as text."""
+    """Format the parameters that differ from their defaults."""
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes import node_class
     from flexsheet.nodes.node import find_parameters_type
 
     fields = find_parameters_type(node_class(node.type)).model_fields
-    # As plans store them; a default factory has no fixed value to compare with.
+    # Convert defaults as plans do; a default factory has no fixed value to compare with.
     defaults = {
         name: to_jsonable_python(field.default)
         for name, field in fields.items()
@@ -226,13 +229,7 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
     if plan.apparatus is not None:
         words.print(f"apparatus {plan.apparatus['origin']}: differs from the scene")
     print_table(
-        (
-            "node",
-            "type",
-            "host",
-            "restart",
-            "parameters",
-        ),
+        ("node", "type", "host", "restart", "parameters"),
         [
             (
                 node.name,

@@ -63,7 +63,9 @@ def list_nodes(as_json: JsonOption = False) -> None:
 def describe(
     node: Annotated[
         str,
-        typer.Argument(help='Node type, or "module:Class".', autocompletion=complete.node_types),
+        typer.Argument(
+            help='Node type of the project, or "module:Class".', autocompletion=complete.node_types
+        ),
     ],
     as_json: JsonOption = False,
 ) -> None:
@@ -105,7 +107,7 @@ def describe(
 def _parameter(name: str, field: Any) -> dict[str, Any]:
     from flexsheet.messages.field_types import describe_field_type
 
-    # As in docs/parameters.md, without the links.
+    # Same text as in docs/parameters.md, without the links.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     kind = re.sub(r"[`\\]", "", kind)
     return {

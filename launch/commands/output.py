@@ -1,4 +1,4 @@
-"""Print the output of commands: data on stdout, messages on stderr; define exit codes."""
+"""Command output: data on stdout, messages on stderr, exit codes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import replace_non_finite
@@ -21,20 +22,26 @@ FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
 class CommandError(FlexsheetError):
-    """Ends a command with a sentence and an exit code."""
+    """Error in a command's options or input; ends the command with an exit code."""
 
     code = "command"
-    remedy = "The text names the option or file, and what to give instead."
+    remedy = "Correct the option or file that the error names."
 
     def __init__(self, text: str, exit_code: int = FAILED) -> None:
         super().__init__(text)
         self.exit_code = exit_code
 
 
-class Words:
-    """Print messages for people on stderr; rich is imported with the first message.
+def check_folder(option: str, file: Path) -> None:
+    """Raise CommandError if the folder of an output file does not exist."""
+    if not file.resolve().parent.is_dir():
+        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist", BAD_INPUT)
 
-    Colours and progress bars appear in terminals only, and colours not if NO_COLOR is set.
+
+class Words:
+    """Printer of messages for the user on stderr; imports rich with the first message.
+
+    Uses progress bars in terminals only, and colours in terminals unless NO_COLOR is set.
     """
 
     @cached_property
@@ -55,7 +62,7 @@ class Words:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
-        """Show a status line during the work, in terminals only."""
+        """Show a status line until the context ends, in terminals only."""
         return self.console.status(text)
 
 
@@ -65,12 +72,12 @@ EXAMPLES = "[bold]Examples[/]"
 
 
 def examples(*lines: str) -> str:
-    """Format example calls for the end of a command's help."""
+    """Format example calls for the epilog of a command's help."""
     return "\n".join([EXAMPLES, *(line.replace("[", r"\[") for line in lines)])
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """Return the calls that `examples` has formatted."""
+    """Return the calls formatted by `examples`."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
@@ -86,7 +93,7 @@ def print_json_line(data: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table on stdout; fold cells only if it is wider than the terminal."""
+    """Print a table on stdout; fold its cells if it is wider than the terminal."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
     in_terminal = sys.stdout.isatty()
@@ -122,7 +129,10 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 
 @contextmanager
 def progress_words() -> Iterator[Callable[[str], None]]:
-    """Show progress messages with the elapsed time on stderr; one line each without a terminal."""
+    """Yield a function that shows a progress message with the elapsed time on stderr.
+
+    Without a terminal it prints one line per message.
+    """
     if not words.is_terminal:
         yield lambda text: words.print(text, markup=False)
         return
@@ -135,7 +145,7 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
+def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr, updated by (done, total); in terminals only."""
     if not words.is_terminal:
         yield lambda done, total: None
@@ -156,14 +166,14 @@ def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
         TextColumn("left"),
     )
     with Progress(*columns, console=words.console, transient=True) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def logs_on_stderr() -> None:
     """Send warnings and errors that nodes and caches log inside a command to stderr.
 
-    Call it before they are created; stdout is for the command's own output.
+    Call this before any logger is created, since stdout is for the command's output.
     """
     import logging
 
@@ -176,6 +186,6 @@ def logs_on_stderr() -> None:
             structlog.processors.format_exc_info,
             structlog.dev.ConsoleRenderer(colors=words.in_colour),
         ],
-        # sys.stderr is looked up for each line, because a caller may replace it.
+        # Look up sys.stderr for each line, because a caller may replace it.
         logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
     )

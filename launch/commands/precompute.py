@@ -34,30 +34,32 @@ def precompute(
     ],
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", metavar="FOLDER", help="Folder of the cache; default: the user's."),
+        typer.Option(
+            "--cache", metavar="FOLDER", help="Folder of the cache; default: the user's cache."
+        ),
     ] = None,
     skin_spacing_m: Annotated[
         float | None,
         typer.Option(
             "--skin-spacing",
             metavar="METRES",
-            help="Also compute the soft body's nonlinear table for this skin_spacing_m (minutes).",
+            help="Node spacing of the soft body's nonlinear table, m; computes it too (minutes).",
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Scheduler of dask.distributed, such as tcp://host:8786, whose workers compute "
-            "the table; default: the processors of this computer.",
+            help="Address of a dask.distributed scheduler whose workers compute the table, such as "
+            "tcp://host:8786; default: compute on this computer.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the deflection shapes of a scene's sheet, unless the cache has them.
+    """Compute the deflection shapes of a scene's sheet, unless the cache contains them.
 
-    For a scene with the method `sheet_force: table` it also computes that table, in about two
-    minutes.  Experiments and the demo compute missing shapes by themselves.
+    If the scene sets `sheet_force: table`, also computes that table, which takes about two minutes.
+    Experiments and the demo compute missing shapes automatically.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import (
@@ -69,7 +71,7 @@ def precompute(
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter(
-            "is used for the nonlinear table only; give --skin-spacing, too",
+            "applies to the nonlinear table only; add --skin-spacing",
             param_hint="--scheduler",
         )
     scene = load_scene(scene_file)

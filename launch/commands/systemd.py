@@ -38,19 +38,21 @@ def install(
             autocompletion=complete.yaml_files,
         ),
     ],
-    host: Annotated[str, typer.Option(help="Name of this computer in the launch file.")],
+    host: Annotated[str, typer.Option(help="Host name of this computer in the launch file.")],
     user: Annotated[
-        str, typer.Option(help="User that runs the service; it must exist.")
+        str, typer.Option(help="Existing user account that runs the service.")
     ] = "flexsheet",
-    root: Annotated[Path, typer.Option(help="Root folder of the system.")] = Path("/"),
+    root: Annotated[Path, typer.Option(help="Root folder of the file system to write to.")] = Path(
+        "/"
+    ),
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the files instead of writing them.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write flexsheet@.service, the host's environment and settings for TCP.
+    """Write the unit flexsheet@.service, the host's environment file and the TCP settings.
 
-    The command does not start the service.
+    Does not start the service.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.systemd import STATE_FOLDER, list_bags, make_files
@@ -58,17 +60,18 @@ def install(
     plan = load_graph(launch_file)
     if host not in plan.hosts:
         raise CommandError(
-            f'--host "{host}": {launch_file} has no such host; it has {", ".join(plan.hosts)}',
+            f'--host "{host}": unknown host; {launch_file} defines {", ".join(plan.hosts)}',
             BAD_INPUT,
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(
-            f'--user "{user}": not a user name; use small letters, digits, _ and -', BAD_INPUT
+            f'--user "{user}": invalid user name; use lower-case letters, digits, _ and -',
+            BAD_INPUT,
         )
     for bag in list_bags(plan, host):
         if not bag.is_relative_to(STATE_FOLDER):
             words.print(
-                f"{bag}: the service can write to {STATE_FOLDER} only; change the bag's path in "
+                f"{bag}: the service can only write to {STATE_FOLDER}; change the bag's path in "
                 "the launch file",
                 markup=False, style="yellow",
             )  # fmt: skip

@@ -43,11 +43,11 @@ TopicArgument = Annotated[
     str,
     typer.Argument(help="Name of the topic, such as twin/finger.", autocompletion=complete.topics),
 ]
-PATIENCE_S = 3.0
-"""Time after which a missing message is reported."""
+REPORT_DELAY_S = 3.0
+"""Time without a message after which that is reported."""
 
 SHORT_ARRAY = 36
-"""Longer arrays than a 6x6 matrix are abbreviated."""
+"""Maximum number of elements of an array that is printed in full."""
 
 
 @app.command(
@@ -55,7 +55,7 @@ SHORT_ARRAY = 36
     epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
 )
 def list_topics(as_json: JsonOption = False) -> None:
-    """List all topics."""
+    """List all topics with message type, delivery, rate and description."""
     from flexsheet.messages.topics import TOPICS
 
     rows = [_describe(topic) for topic in TOPICS.values()]
@@ -81,7 +81,7 @@ def list_topics(as_json: JsonOption = False) -> None:
 @app.command(epilog=examples("flexsheet topic info fingertip"))
 def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
     """Print the type and fields of a topic, and its writers and readers in the running graph."""
-    found = _topic(topic)
+    found = _find_topic(topic)
     description = _describe(found)
     schema = found.message.model_json_schema()
     description["fields"] = {
@@ -109,7 +109,7 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
         for name, value in description.items()
     )
     print()
-    print_table(("field", "what"), fields.items())
+    print_table(("field", "description"), fields.items())
 
 
 @app.command(
@@ -121,48 +121,51 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
 def echo(
     *,
     topic: TopicArgument,
-    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print one message and exit.")] = False,
     count: Annotated[
-        int | None, typer.Option(help="Stop after this number of messages.", min=1)
+        int | None, typer.Option(help="Number of messages after which the command exits.", min=1)
     ] = None,
     timeout: Annotated[
-        float | None, typer.Option(help="Fail if no message arrives for this time, s.")
+        float | None,
+        typer.Option(help="Maximum time without a message, s; then the command fails."),
     ] = None,
     field: Annotated[
-        str | None, typer.Option(help="Print only this field, such as left.fx_px.")
+        str | None, typer.Option(help="Field to print instead of the message, such as left.fx_px.")
     ] = None,
-    full: Annotated[bool, typer.Option("--full", help="Do not abbreviate arrays.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the messages of a topic as they arrive; --json prints one document per line."""
-    found = _topic(topic)
-    wanted = 1 if once else count
+    found = _find_topic(topic)
+    limit = 1 if once else count
+
+    from dataclasses import asdict
 
     def show(message: Message, header: Header) -> None:
-        value = _field(message, field, topic)
+        value = _get_field(message, field, topic)
         if as_json:
-            print_json_line({"header": _header(header), "message": to_plain(value, full=full)})
+            print_json_line({"header": asdict(header), "message": to_plain(value, full=full)})
             return
         seconds = f"{header.source_ns * 1e-9:.6f}"
         print(f"--- {header.writer} #{header.sequence}, source {seconds} s")
-        print("\n".join(_lines(to_plain(value, full=full))), flush=True)
+        print("\n".join(_format_lines(to_plain(value, full=full))), flush=True)
 
-    raise typer.Exit(run_interruptible(_read(found, run, show, wanted, timeout)))
+    raise typer.Exit(run_interruptible(_read(found, run, show, limit, timeout)))
 
 
 @app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
 def hz(
     topic: TopicArgument,
-    duration: Annotated[float, typer.Option(help="Measurement time, s.", min=0.1)] = 5.0,
+    duration: Annotated[float, typer.Option(help="Duration of the measurement, s.", min=0.1)] = 5.0,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the rate of each writer of a topic, by its stamps and sequence numbers."""
-    found = _topic(topic)
+    """Measure the rate of each writer of a topic, from stamps and sequence numbers."""
+    found = _find_topic(topic)
     headers: list[Header] = []
     run_interruptible(_collect_headers(found, run, headers, duration))
-    rows = rates(headers)
+    rows = measure_rates(headers)
     if as_json:
         print_json(rows)
     else:
@@ -181,7 +184,7 @@ def hz(
             ],
         )
     if not rows:
-        raise silence(topic, duration)
+        raise make_silence_error(topic, duration)
 
 
 @app.command(
@@ -193,29 +196,38 @@ def hz(
 def pub(
     *,
     topic: TopicArgument,
-    message: Annotated[str, typer.Argument(help="Message in YAML or JSON, or @FILE.")],
-    rate: Annotated[float | None, typer.Option(help="Repeat the message at this rate, Hz.")] = None,
-    count: Annotated[int | None, typer.Option(help="Number of messages to send.", min=1)] = None,
+    message: Annotated[
+        str, typer.Argument(help="Message in YAML or JSON, or @FILE to read it from a file.")
+    ],
+    rate: Annotated[
+        float | None,
+        typer.Option(help="Rate at which the message is repeated, Hz; default: send it once."),
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option(
+            help="Number of messages to send; default: 1, or unlimited with --rate.", min=1
+        ),
+    ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Publish a message to the running graph.
 
-    Topics with any number of writers and those of `external_topics` are open to it.
-
-    A latched message is kept for late subscribers only while this command runs.
+    The topic must allow several writers or be listed in the launch file's `external_topics`. Late
+    subscribers receive a latched message only while this command runs.
     """
-    found = _topic(topic)
+    found = _find_topic(topic)
     built = _parse_message(found, message)
     times = count if count is not None else (None if rate else 1)
     sent = 0
 
-    def told(count: int) -> None:
+    def on_sent(count: int) -> None:
         nonlocal sent
         sent = count
 
     code = run_interruptible(
-        _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, told=told)
+        _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, on_sent=on_sent)
     )
     if as_json:
         print_json({"topic": topic, "sent": sent})
@@ -224,15 +236,15 @@ def pub(
     raise typer.Exit(code)
 
 
-def silence(topic: str, duration_s: float) -> CommandError:
+def make_silence_error(topic: str, duration_s: float) -> CommandError:
     return CommandError(
-        f'nothing came on "{topic}" in {duration_s:g} s; see that its writer runs: '
+        f'no message on "{topic}" within {duration_s:g} s; check that its writer is running: '
         "flexsheet topic echo status"
     )
 
 
-def rates(headers: list[Header]) -> list[dict[str, Any]]:
-    """Return per writer: rate, received and lost messages, intervals between stamps."""
+def measure_rates(headers: list[Header]) -> list[dict[str, Any]]:
+    """Return the rate, received and lost messages and stamp intervals of each writer."""
     import numpy as np
 
     rows = []
@@ -263,7 +275,7 @@ def rates(headers: list[Header]) -> list[dict[str, Any]]:
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
-    """Convert a message or field to JSON types; long arrays to type, shape and range."""
+    """Convert a message or field to JSON types; summarize long arrays by type, shape and range."""
     import numpy as np
     from pydantic import BaseModel
 
@@ -285,27 +297,27 @@ def to_plain(value: Any, *, full: bool) -> Any:
     return value
 
 
-def _lines(value: Any, indent: str = "") -> list[str]:
+def _format_lines(value: Any, indent: str = "") -> list[str]:
     if not isinstance(value, dict):
-        return [f"{indent}{_word(value)}"]
+        return [f"{indent}{_format_value(value)}"]
     lines = []
     for name, item in value.items():
         if isinstance(item, dict):
-            lines += [f"{indent}{name}:", *_lines(item, indent + "  ")]
+            lines += [f"{indent}{name}:", *_format_lines(item, indent + "  ")]
         else:
-            lines.append(f"{indent}{name}: {_word(item)}")
+            lines.append(f"{indent}{name}: {_format_value(item)}")
     return lines
 
 
-def _word(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return f"[{', '.join(_word(item) for item in value)}]"
+        return f"[{', '.join(_format_value(item) for item in value)}]"
     return str(value)
 
 
-def _topic(name: str) -> Topic:
+def _find_topic(name: str) -> Topic:
     from flexsheet.messages.topics import UnknownTopicError, find_topic
 
     try:
@@ -327,13 +339,7 @@ def _describe(topic: Topic) -> dict[str, Any]:
     }
 
 
-def _header(header: Header) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(header)
-
-
-def _field(message: Message, path: str | None, topic: str) -> Any:
+def _get_field(message: Message, path: str | None, topic: str) -> Any:
     value: Any = message
     for name in path.split(".") if path else ():
         fields = getattr(type(value), "model_fields", {})
@@ -341,7 +347,7 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
             from flexsheet.launch.plans.documents import did_you_mean
 
             raise CommandError(
-                f'--field {path}: topic "{topic}" has no field "{name}" there; '
+                f'--field {path}: topic "{topic}" does not contain the field "{name}"; '
                 f"{did_you_mean(name, list(fields))}",
                 BAD_INPUT,
             )
@@ -349,28 +355,38 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
     return value
 
 
-def _still_waits(topic: Topic) -> None:
-    when = "it is sent on change" if topic.rate_hz is None else "see: flexsheet topic echo status"
-    words.print(f'nothing on "{topic.name}" yet ({when}); Ctrl-C ends', markup=False, style="dim")
+def _report_no_message(topic: Topic) -> None:
+    when = (
+        "it is published on change only"
+        if topic.rate_hz is None
+        else "check its writer: flexsheet topic echo status"
+    )
+    words.print(
+        f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop',
+        markup=False,
+        style="dim",
+    )
 
 
 async def _read(
-    topic: Topic, run: Path | None, show: Any, wanted: int | None, timeout_s: float | None
+    topic: Topic, run: Path | None, show: Any, limit: int | None, timeout_s: float | None
 ) -> int:
     arrived: asyncio.Queue[tuple[Any, Any]] = asyncio.Queue()
-    subscriber = listener(topic, run, lambda message, header: arrived.put_nowait((message, header)))
-    waiting = asyncio.get_running_loop().call_later(PATIENCE_S, _still_waits, topic)
+    subscriber = make_listener(
+        topic, run, lambda message, header: arrived.put_nowait((message, header))
+    )
+    waiting = asyncio.get_running_loop().call_later(REPORT_DELAY_S, _report_no_message, topic)
     subscriber.start()
     try:
         shown = 0
-        while wanted is None or shown < wanted:
+        while limit is None or shown < limit:
             async with asyncio.timeout(timeout_s):
                 message, header = await arrived.get()
             waiting.cancel()
             show(message, header)
             shown += 1
     except TimeoutError:
-        raise silence(topic.name, timeout_s or 0.0) from None
+        raise make_silence_error(topic.name, timeout_s or 0.0) from None
     finally:
         waiting.cancel()
         subscriber.close()
@@ -380,7 +396,7 @@ async def _read(
 async def _collect_headers(
     topic: Topic, run: Path | None, headers: list[Header], duration_s: float
 ) -> int:
-    subscriber = listener(topic, run, lambda _, header: headers.append(header), raw=True)
+    subscriber = make_listener(topic, run, lambda _, header: headers.append(header), raw=True)
     subscriber.start()
     try:
         await asyncio.sleep(duration_s)
@@ -389,15 +405,15 @@ async def _collect_headers(
     return 0
 
 
-def listener(
+def make_listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, raw: bool = False
 ) -> Subscriber:
-    """Make a subscriber to a topic of the running graph.  Raises CommandError without a writer."""
+    """Make a subscriber to a topic of the running graph; CommandError without a writer."""
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
-        raise CommandError(f'nobody writes "{topic.name}" in the graph that runs ({run.directory})')
+        raise CommandError(f'"{topic.name}" has no writer in the running graph {run.directory}')
     return make_subscriber(
         topic.name,
         plan,
@@ -423,12 +439,14 @@ def _parse_message(topic: Topic, text: str) -> Message:
     try:
         try:
             value = parse_json(text)
-        except ValueError:  # YAML's own errors say what is wrong with either
+        except ValueError:  # YAML's errors describe faults of both formats
             value = parse_value(text)
     except YAMLError as error:
         raise CommandError(f"{source}: not valid YAML or JSON: {error}", BAD_INPUT) from error
     if not isinstance(value, dict):
-        raise CommandError(f"{source}: holds no fields of {topic.message.__name__}", BAD_INPUT)
+        raise CommandError(
+            f"{source}: expected a mapping with the fields of {topic.message.__name__}", BAD_INPUT
+        )
     return validate(
         topic.message, Document(Path(f"{source} ({topic.message.__name__})"), value, text, {})
     )
@@ -441,7 +459,7 @@ async def _publish(
     run: Path | None,
     rate_hz: float,
     times: int | None,
-    told: Callable[[int], None],
+    on_sent: Callable[[int], None],
 ) -> int:
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
@@ -455,8 +473,8 @@ async def _publish(
                 await asyncio.sleep(1.0 / rate_hz)
             writer.publish(topic.name, message)
             sent += 1
-            told(sent)
-        # Latched messages reach readers that are only now connecting.
+            on_sent(sent)
+        # Wait for readers that are still connecting, since a latched message ends with its writer.
         await asyncio.sleep(READER_RECONNECT_S / 2)
     finally:
         writer.close()

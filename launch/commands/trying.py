@@ -1,4 +1,4 @@
-"""`flexsheet try`: simulate the whole display on this computer, and touch it in the browser."""
+"""`flexsheet try`: simulate the display on this computer, and operate it in the browser."""
 
 from __future__ import annotations
 
@@ -32,12 +32,14 @@ def try_it(
         typer.Option(
             "--launch",
             metavar="FILE",
-            help="Launch file of another graph.",
+            help="Launch file; default: the demo graph.",
             autocompletion=complete.yaml_files,
         ),
     ] = DEMO_FILE,
-    port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = 8080,
-    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    port: Annotated[
+        int, typer.Option(help="TCP port of the console page.", min=1, max=65535)
+    ] = 8080,
+    browser: Annotated[bool, typer.Option(help="Open the console page in the browser.")] = True,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -47,14 +49,16 @@ def try_it(
     apparatus: ApparatusOption = None,
     duration: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Stop this long after all nodes are ready."),
+        typer.Option(
+            metavar="SECONDS", help="Time until the graph stops after all nodes are ready, s."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Touch a virtual object in the browser, without hardware.
 
-    The command starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From
-    another computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
+    Starts the demo graph with a console, prints the address of its page, and runs until Ctrl-C.
+    From another computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.precompute import precompute_graph

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code if no method of some family meets the tolerance, so the best one was chosen."""
+"""Exit code if some family has no method within the tolerance; the best one is chosen."""
 
 
 app = typer.Typer(add_completion=False)
@@ -49,30 +49,30 @@ def tune(
         typer.Option(
             "--family",
             metavar="NAME",
-            help="Tune only this family; may be repeated.",
+            help="Method family to tune; repeat for several; default: all.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", metavar="FILE", help="Write a copy to this file instead of changing SCENE."
+            "--output", metavar="FILE", help="File for the tuned copy; default: change SCENE."
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not write any file.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the choices without writing a file.")
+    ] = False,
     margin: Annotated[
         float,
-        typer.Option(
-            min=0.0, max=0.9, help="Fraction of each tolerance that must remain as a margin."
-        ),
+        typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance reserved as margin."),
     ] = 0.2,
     as_json: JsonOption = False,
 ) -> None:
     """Choose the cheapest methods that meet a scene's tolerances, and write them into the scene.
 
-    Measures each family on this machine over the scene's working range, which takes seconds to
-    minutes the first time.  Prints the reason for each choice.  Nodes with the parameter value
-    `auto` use the choice.  Exit code 3: a family has no sufficient method.
+    Measures each family on this computer over the scene's working range: seconds to minutes the
+    first time. Prints the reason for each choice. Nodes whose parameter is `auto` use the chosen
+    method. Exit code 3: a family has no method within its tolerance.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune
@@ -81,18 +81,18 @@ def tune(
 
     scene = load_scene(scene_file)
     try:
-        tunables = tune.tunables_named(family or [])
+        tunables = tune.find_tunables(family or [])
     except tune.UnknownTunableError as error:
         raise CommandError(f"--family: {error}", BAD_INPUT) from None
     target = None if dry_run else output or scene_file
     if target is not None:
-        tune.check_target(scene_file, target)  # before minutes of measuring
+        tune.check_target(scene_file, target)  # fail before the long measurement
     if busy := describe_load():
         words.print(busy, style="yellow")
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)
     for choice in choices:
-        words.print(choice.sentence(), markup=False)
+        words.print(choice.explain(), markup=False)
     met = all(choice.met for choice in choices)
     if as_json:
         report = {
@@ -109,28 +109,28 @@ def tune(
         _print_choices(choices)
     if target is not None:
         tune.write_choices(scene_file, target, choices)
-    words.print("written: nothing (--dry-run)" if target is None else f"written: {target}")
+    words.print("no file written (--dry-run)" if target is None else f"written: {target}")
     if not met:
         raise typer.Exit(NOT_MET)
 
 
 def _print_choices(choices: Sequence[Choice]) -> None:
-    from flexsheet.launch.methods.charts import duration
+    from flexsheet.launch.methods.charts import format_duration
 
     rows = [
         (
             choice.family,
             choice.chosen.method,
-            duration(choice.chosen.median_s),
-            duration(choice.chosen.slowest_s),
+            format_duration(choice.chosen.median_s),
+            format_duration(choice.chosen.slowest_s),
             f"{choice.chosen.error:.3g}",
             f"{choice.tolerance:.3g} {choice.unit}",
             f"{100 * choice.spare_ratio:.0f} %" if choice.met else "-",
             ""
             if choice.met
-            else f"missed in {choice.chosen.missed} of {choice.chosen.cases} cases",
+            else f"outside in {choice.chosen.missed} of {choice.chosen.cases} cases",
         )
         for choice in choices
     ]
-    columns = ("family", "method", "median", "slowest", "leaves", "of", "to spare", "")
+    columns = ("family", "method", "median", "maximum", "error", "tolerance", "margin", "")
     print_table(columns, rows)

@@ -1,8 +1,8 @@
-"""Compare the force that the simulated sheet presents with that of the soft body.
+"""Compare the rendered force of the simulated sheet with that of the soft body.
 
-The finger pushes at a few positions and rests at several depths; then it moves in and out without
-a stop.  At each evaluated instant, the simulator's membrane between the true edges, under the true
-fingertip, gives the presented force.  The desired force is that of the published force curve at the
+The finger pushes at a few positions and rests at several depths; then it moves in and out without a
+stop. At each evaluated time, the simulator's membrane between the true edges and under the true
+fingertip gives the rendered force. The object's force is that of the published force curve at the
 finger's true depth.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
@@ -42,24 +42,24 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""Along the object, and around it from its front, m."""
+"""Positions along the object, and around it from its front, m."""
 
 DEPTH_RATIOS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Depths at which the finger rests, over the scene's push depth."""
+"""Depths at which the finger rests, as fractions of the scene's push depth."""
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""Time at each depth, and its last part, in which the force is evaluated."""
+"""Duration of a rest, and of its last part, in which the force is evaluated."""
 
-HELD_SAMPLES = 3
+REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 
 @dataclass(frozen=True, slots=True)
-class Hold:
-    """Hold an evaluated interval at a depth, in the path's time (s)."""
+class RestInterval:
+    """Evaluated interval of a rest at a depth, in the path's time (s)."""
 
     depth_m: float
     begin_s: float
@@ -68,65 +68,72 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """Hold one path of the finger with its intervals at rest; empty for the moving press.
+    """Path of the finger in one push, with the intervals at rest; none for the moving push.
 
-    place: name of the pushed position.  surface, normal: (3,) of the undeformed object there, in
-    the world.
+    place: name of the pushed position. surface, normal: (3,) of the undeformed object there, in the
+    world.
     """
 
     path: FingerPath
     place: str
     surface: Floats
     normal: Floats
-    holds: tuple[Hold, ...]
+    holds: tuple[RestInterval, ...]
 
 
 def make_presses(scene: Scene) -> list[Press]:
-    """Make all paths of the experiment."""
+    """Make all pushes of the experiment."""
     depths = scene.working_range.push_depth_m * np.array(DEPTH_RATIOS)
-    held = [_make_held_press(scene, along, around, depths) for along, around in POSITIONS_M]
-    return [*held, _make_moving_press(scene, float(depths[-1]))]
+    resting = [_make_resting_press(scene, along, around, depths) for along, around in POSITIONS_M]
+    return [*resting, _make_moving_press(scene, float(depths[-1]))]
 
 
-def _make_held_press(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Press:
+def _make_resting_press(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Press:
     times, heights, holds = [0.0, APPROACH_S], [HOVER_M, 0.0], []
     for depth in depths:
         begin_s = times[-1] + (depth + heights[-1]) / PUSH_M_PER_S
         times += [begin_s, begin_s + HOLD_S]
         heights += [-depth, -depth]
-        holds.append(Hold(float(depth), begin_s + HOLD_S - EVALUATED_S, begin_s + HOLD_S))
+        holds.append(RestInterval(float(depth), begin_s + HOLD_S - EVALUATED_S, begin_s + HOLD_S))
     times.append(times[-1] + (HOVER_M - heights[-1]) / PUSH_M_PER_S)
     heights.append(HOVER_M)
     place = f"at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
-    way = np.column_stack([times, heights])
-    return _make_press(scene, place, (along_m, around_m), way, tuple(holds))
+    motion = np.column_stack([times, heights])
+    return _make_press(scene, place, (along_m, around_m), motion, tuple(holds))
 
 
 def _make_moving_press(scene: Scene, deepest_m: float) -> Press:
-    way_s = deepest_m / PUSH_M_PER_S
-    times = np.cumsum([0.0, APPROACH_S, way_s, way_s, APPROACH_S])
+    stroke_s = deepest_m / PUSH_M_PER_S
+    times = np.cumsum([0.0, APPROACH_S, stroke_s, stroke_s, APPROACH_S])
     heights = [HOVER_M, 0.0, -deepest_m, 0.0, HOVER_M]
     return _make_press(scene, "in and out", POSITIONS_M[0], np.column_stack([times, heights]), ())
 
 
 def _make_press(
-    scene: Scene, place: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
+    scene: Scene,
+    place: str,
+    place_m: tuple[float, float],
+    motion: Floats,
+    holds: tuple[RestInterval, ...],
 ) -> Press:
-    """Make a press; way: times (s) and heights above the surface (m), (n, 2)."""
+    """Make a push.
+
+    motion: (n, 2), times (s) and heights above the surface (m).
+    """
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
         label=f"press {place}" if holds else place,
-        times_s=np.ascontiguousarray(way[:, 0]),
-        positions_world_m=surface + np.outer(way[:, 1], normal),
+        times_s=np.ascontiguousarray(motion[:, 0]),
+        positions_world_m=surface + np.outer(motion[:, 1], normal),
         wander_m=0.0,
         tremor_m=0.0,
     )
     return Press(path, place, surface, normal, holds)
 
 
-def compliance_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that pushes at each position, then in and out."""
+def make_compliance_procedure(progress: Progress) -> Procedure:
+    """Make a procedure that pushes at each position, then moves in and out."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for press in make_presses(scene):
@@ -138,10 +145,10 @@ def compliance_procedure(progress: Progress) -> Procedure:
 
 @dataclass(frozen=True, slots=True)
 class ComplianceRecording:
-    """Hold a bag's data for the evaluation.
+    """Data of a compliance experiment from a bag.
 
-    windows_ns: (begin, end) of each path, by label.  edges: rows (16,), poses of the clamped edges.
-    curves: the object's force over depth, (m, 2) each, at `curve_times_ns`.
+    windows_ns: (start, end) of each path, by label. edges: poses of the clamped edges as rows
+    (16,). curves: the object's force over depth, (m, 2) each, at `curve_times_ns`.
     """
 
     scene: Scene
@@ -154,7 +161,7 @@ class ComplianceRecording:
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
-    """Read the data from a bag; ExperimentError if it lacks scene or force curve."""
+    """Read the data from a bag. Raises ExperimentError if the scene or force curve is missing."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     finger: list[tuple[int, Floats]] = []
@@ -180,7 +187,9 @@ def read_bag(bag: Path) -> ComplianceRecording:
             case _:
                 pass
     if scene is None or not curves:
-        raise ExperimentError(f"{bag}: has no scene or no force curve of a soft body; record both")
+        raise ExperimentError(
+            f"{bag}: does not contain a scene and a force curve; record scene and soft_body"
+        )
     curves.sort(key=lambda entry: entry[0])
     return ComplianceRecording(
         scene=scene,
@@ -194,8 +203,8 @@ def read_bag(bag: Path) -> ComplianceRecording:
 
 
 @dataclass(frozen=True, slots=True)
-class PresentedForce:
-    """Hold one instant: finger depth, desired and presented force, and the sheet's depth."""
+class ForceSample:
+    """Finger depth, object force, rendered force and the sheet's normal offset at one time."""
 
     depth_m: float
     wanted_n: float
@@ -204,29 +213,29 @@ class PresentedForce:
 
     @property
     def error_ratio(self) -> float:
-        """Return the relative error; desired forces below the JND floor count as that floor."""
+        """Return the error relative to the object's force, at least FORCE_JND_FLOOR_N."""
         return (self.presented_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
 
 
 class ForceReference:
-    """Compute presented forces at instants of a recording by the simulator's membrane."""
+    """Reference for rendered forces in a recording: the simulator's membrane."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
         scene = apply_apparatus(recorded.scene, recorded.apparatus)
         self._recorded, self._radius_m = recorded, scene.finger.radius_m
         self._clamps = (
-            _transform(scene.arms.left.flange_from_edge),
-            _transform(scene.arms.right.flange_from_edge),
+            _make_transform(scene.arms.left.flange_from_edge),
+            _make_transform(scene.arms.right.flange_from_edge),
         )
         self._rubber = true_rubber(scene.sheet, recorded.apparatus)
 
-    def evaluate(self, at_ns: int, press: Press) -> PresentedForce:
-        """Return the forces at an instant; depths count from the pressed position."""
+    def evaluate(self, at_ns: int, press: Press) -> ForceSample:
+        """Return the forces at a time; the depth is measured from the pressed point."""
         recorded, times = self._recorded, np.array([at_ns])
-        tip = recorded.finger.at(times)[0]
+        tip = recorded.finger.interpolate(times)[0]
         depth_m = float((press.surface - tip) @ press.normal)
         left, right = (
-            edges.at(times)[0].reshape(4, 4) @ clamp
+            edges.interpolate(times)[0].reshape(4, 4) @ clamp
             for edges, clamp in zip(recorded.edges, self._clamps, strict=True)
         )
         pressed = solve(
@@ -237,46 +246,45 @@ class ForceReference:
             finger_radius_m=self._radius_m,
         )
         middle = 0.5 * (left[:3, 3] + right[:3, 3])
-        return PresentedForce(
+        return ForceSample(
             depth_m=depth_m,
-            wanted_n=self._wanted_n(at_ns, depth_m),
+            wanted_n=self._interpolate_curve_n(at_ns, depth_m),
             presented_n=float(pressed.finger_force_n @ press.normal),
             normal_offset_m=float((press.surface - middle) @ press.normal),
         )
 
-    def _wanted_n(self, at_ns: int, depth_m: float) -> float:
+    def _interpolate_curve_n(self, at_ns: int, depth_m: float) -> float:
         number = max(0, bisect_right(self._recorded.curve_times_ns, at_ns) - 1)
         rows = self._recorded.curves[number]
         curve = PchipInterpolator(rows[:, 0], rows[:, 1])
         return float(curve(np.clip(depth_m, 0.0, rows[-1, 0])))
 
 
-def _transform(pose: Pose) -> Floats:
+def _make_transform(pose: Pose) -> Floats:
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
-    """Return the figures of `experiment compliance --json` in mm, N and %."""
+    """Return the results of `experiment compliance --json`, in mm, N and %."""
     recorded = read_bag(bag)
     reference = ForceReference(recorded)
-    held: list[dict[str, Any]] = []
-    moving: list[PresentedForce] = []
+    resting: list[dict[str, Any]] = []
+    moving: list[ForceSample] = []
     for press in make_presses(recorded.scene):
         label = press.path.label
-        if label not in recorded.windows_ns:
-            have = ", ".join(recorded.windows_ns) or "none"
-            raise ExperimentError(f'the bag has no finger path "{label}"; it has: {have}')
         progress(f"evaluating: {label}")
-        begin_ns, end_ns = recorded.windows_ns[label]
+        begin_ns, end_ns = find_recorded(recorded.windows_ns, "finger path", label)
         for hold in press.holds:
-            times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, HELD_SAMPLES) * 1e9)
-            held.append(_row(press, hold, [reference.evaluate(int(at), press) for at in times]))
+            times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, REST_SAMPLES) * 1e9)
+            resting.append(
+                _make_row(press, hold, [reference.evaluate(int(at), press) for at in times])
+            )
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
-    errors = np.array([row["error_percent"] for row in held])
+    errors = np.array([row["error_percent"] for row in resting])
     errors_moving = 100.0 * np.array([one.error_ratio for one in moving])
     return {
-        "rows": held,
+        "rows": resting,
         "worst_percent": float(np.abs(errors).max()),
         "aimed_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
@@ -299,19 +307,19 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 def _evaluate_moving(
     reference: ForceReference, press: Press, begin_ns: int, end_ns: int
-) -> Iterator[PresentedForce]:
+) -> Iterator[ForceSample]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
-        felt = reference.evaluate(at_ns, press)
-        if max(felt.wanted_n, felt.presented_n) >= FORCE_JND_FLOOR_N:
-            yield felt
+        sample = reference.evaluate(at_ns, press)
+        if max(sample.wanted_n, sample.presented_n) >= FORCE_JND_FLOOR_N:
+            yield sample
 
 
-def _row(press: Press, hold: Hold, felt: Sequence[PresentedForce]) -> dict[str, Any]:
+def _make_row(press: Press, hold: RestInterval, samples: Sequence[ForceSample]) -> dict[str, Any]:
     return {
         "place": press.place,
         "depth_mm": 1e3 * hold.depth_m,
-        "wanted_n": float(np.mean([one.wanted_n for one in felt])),
-        "presented_n": float(np.mean([one.presented_n for one in felt])),
-        "error_percent": 100.0 * float(np.mean([one.error_ratio for one in felt])),
-        "retreat_mm": 1e3 * float(np.mean([one.normal_offset_m for one in felt])),
+        "wanted_n": float(np.mean([one.wanted_n for one in samples])),
+        "presented_n": float(np.mean([one.presented_n for one in samples])),
+        "error_percent": 100.0 * float(np.mean([one.error_ratio for one in samples])),
+        "retreat_mm": 1e3 * float(np.mean([one.normal_offset_m for one in samples])),
     }

@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.bags.report.strokes import read_followed
-from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.experiments import find_recorded, image, stroke
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
     Progress,
-    picture_procedure,
+    chain_procedures,
+    make_image_procedure,
+    make_settings,
+    make_stroke_procedure,
     run_experiment,
-    run_in_sequence,
-    settings_of_type,
-    stroke_procedure,
 )
 from flexsheet.messages.files import write_file
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
-"""The paper's resolution: sufficient for figures, four times as fast as the experiments' own."""
+"""Resolution of the paper's images: sufficient for figures, four times faster than the default."""
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -34,16 +34,16 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """Hold the demo's results: folder, bag, figures of the strokes, images.
+    """Results of the demo.
 
-    followed: figures of following a given path; None without one.
+    strokes: result of each stroke. followed: result of following a given path, or None.
     """
 
     folder: Path
     bag: Path
     strokes: list[dict[str, Any]]
     followed: dict[str, Any] | None
-    pictures: list[Path]
+    images: list[Path]
 
 
 def run_demo(
@@ -57,12 +57,12 @@ def run_demo(
 ) -> DemoResult:
     """Stroke in 10 s and in 30 s (or follow `path`), then image a tilted and a pushed sheet."""
     bag = folder / "demo.mcap"
-    procedure = run_in_sequence(
-        stroke_procedure(SECONDS, progress, path=path),
-        picture_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
-        picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
+    procedure = chain_procedures(
+        make_stroke_procedure(SECONDS, progress, path=path),
+        make_image_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
+        make_image_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
-    coarse = settings_of_type(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
+    coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     given = [*coarse, *settings]
     run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
     progress("reading the bag and drawing")
@@ -72,45 +72,36 @@ def run_demo(
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return the figures of following the path with that label.
+    """Return the result of following the path with that label.
 
-    Raises ExperimentError when the bag does not have it.
+    Raises ExperimentError if the bag does not contain it.
     """
     runs = {run["path"]: run for run in read_followed(bag)}
-    if label not in runs:
-        have = ", ".join(runs) or "none"
-        raise ExperimentError(f'the bag has no finger on a path "{label}"; it has: {have}')
-    return runs[label]
+    return find_recorded(runs, "finger path", label)
 
 
 def summarize(
     bag: Path, folder: Path, *, strokes: tuple[float, ...], path_label: str | None = None
 ) -> DemoResult:
-    """Compute the demo's figures from its bag and draw its pictures into `folder`."""
+    """Compute the demo's results from its bag, and draw its images into `folder`."""
     recording = stroke.read_recording(bag)
-    photographs = image.read_pictures(bag)
-    views, plot, latency = (
-        folder / "eye.png",
-        folder / "stroke.png",
-        folder / "latency.png",
-    )
+    eye_images = image.read_images(bag)
+    views, plot, latency = (folder / f"{name}.png" for name in ("eye", "stroke", "latency"))
     tilted = [
-        image.find_picture(photographs, image.TILT.label(TILT_DEG, name))
-        for name in TILT_CORRECTIONS
+        image.find_image(eye_images, image.TILT.label(TILT_DEG, name)) for name in TILT_CORRECTIONS
     ]
     pushed = [
-        image.find_picture(photographs, image.PUSH.label(DEPTH_MM, name))
-        for name in PUSH_CORRECTIONS
+        image.find_image(eye_images, image.PUSH.label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
     ]
     draw_eye_views(
         [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views
     )
     draw_latency(recording, latency)
-    pictures = [views, latency]
+    images = [views, latency]
     errors = {seconds: stroke.stroke_errors(recording, seconds) for seconds in strokes}
     if errors:
         draw_stroke(errors, plot)
-        pictures.append(plot)
+        images.append(plot)
     results = [
         stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
     ]
@@ -119,4 +110,4 @@ def summarize(
     if path_label is not None:
         followed = read_followed_path(bag, path_label)
         write_file(folder / "followed.json", json.dumps(followed, indent=1) + "\n")
-    return DemoResult(folder=folder, bag=bag, strokes=results, followed=followed, pictures=pictures)
+    return DemoResult(folder=folder, bag=bag, strokes=results, followed=followed, images=images)

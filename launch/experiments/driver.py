@@ -1,7 +1,7 @@
-"""Drive a running graph for an experiment: move the simulated finger, set the display.
+"""Drive a running graph for an experiment: move the simulated finger and set the display.
 
-The driver publishes as the writer "tools" and subscribes to the topics that it waits for.  Every
-wait has a deadline; its error names the awaited condition and the nodes' notes.
+The driver publishes as the writer "tools" and subscribes to the topics that it evaluates. Every
+wait has a deadline; its error contains the awaited condition and the nodes' notes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from flexsheet.messages.types import (
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
 
-# Noise of the measured finger moves the sheet; these limits distinguish rest from motion.
+# Noise of the measured finger moves the sheet; these limits separate rest from motion.
 SETTLED_POSITION_M = 1e-3
 SETTLED_SPEED_M_PER_S = 0.05
 SETTLED_RATE_RAD_PER_S = 0.8
@@ -45,11 +45,11 @@ PIXELS_EVERY = 10
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_LOAD_PER_CORE = 3.0
-"""Load above which the computer is busy; the demo itself causes less."""
+"""Load per core above which the computer is overloaded; the demo causes less."""
 
 
 class Driver:
-    """Publish to and subscribe to a running graph; use as an async context manager."""
+    """Publisher and subscriber of a running graph; an async context manager."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -67,7 +67,7 @@ class Driver:
                 name,
                 self._plan,
                 self._run,
-                self._handler(name),
+                self._make_handler(name),
                 on_problem=self._note_problem,
             )
             subscriber.start()
@@ -93,7 +93,7 @@ class Driver:
             raise RuntimeError("the driver is used outside of its context")
         self._writer.publish(topic, message)
 
-    def _handler(self, name: str) -> Callable[[Message, Header], None]:
+    def _make_handler(self, name: str) -> Callable[[Message, Header], None]:
         def handle(message: Message, header: Header) -> None:
             self._newest[name] = message
             if isinstance(message, Status):
@@ -118,8 +118,13 @@ class Driver:
         )
         self._settled_since = self._settled_since + 1 if settled else 0
 
-    async def wait_for(self, condition: Callable[[], bool], what: str, seconds: float) -> None:
-        """Wait until `condition` holds, checked at each message, at most `seconds`."""
+    async def wait_for(
+        self, condition: Callable[[], bool], description: str, seconds: float
+    ) -> None:
+        """Wait until `condition` is true, checked at each message. Raises ExperimentError.
+
+        description: of the condition, for the error. seconds: maximum time.
+        """
         if condition():
             return
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -131,7 +136,7 @@ class Driver:
         except TimeoutError:
             notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
             raise ExperimentError(
-                f"waited {seconds:g} s without success for {what}{_describe_load()}; "
+                f"timeout: waited {seconds:g} s for {description}{_describe_load()}; "
                 f"notes of the nodes:{notes or ' none'}"
             ) from None
         finally:
@@ -140,21 +145,21 @@ class Driver:
     def newest(self, topic: str) -> Message | None:
         return self._newest.get(topic)
 
-    async def wait_until_up(self) -> None:
-        """Wait until the soft body is published and both arms follow."""
+    async def wait_ready(self) -> None:
+        """Wait until the soft body is published and both arms are in the mode "follow"."""
 
-        def up() -> bool:
+        def ready() -> bool:
             arms = [self._newest.get(name) for name in ("arm_left", "arm_right")]
             following = all(isinstance(arm, ArmState) and arm.mode == "follow" for arm in arms)
             return following and "soft_body" in self._newest
 
-        await self.wait_for(up, "both arms to follow and the soft body to be published", 3 * WAIT_S)
+        await self.wait_for(ready, "both arms in mode follow and a soft body", 3 * WAIT_S)
 
     def move_finger(self, path: FingerPath) -> None:
         self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:
-        """Move the finger along a path and wait for its end."""
+        """Move the finger along a path, and wait until it has reached the end."""
         self.move_finger(path)
 
         def done() -> bool:
@@ -166,20 +171,20 @@ class Driver:
             )
 
         await self.wait_for(
-            done, f'the finger to end "{path.label}"', float(path.times_s[-1]) + WAIT_S
+            done, f'the end of the finger path "{path.label}"', float(path.times_s[-1]) + WAIT_S
         )
 
     async def wait_settled(self) -> None:
-        """Wait until the target rests and both arms are at their commanded poses."""
+        """Wait until the target is at rest and both arms are at their commanded poses."""
         self._settled_since = 0
         await self.wait_for(
-            lambda: self._settled_since >= SETTLED_MESSAGES, "the sheet to come to rest", WAIT_S
+            lambda: self._settled_since >= SETTLED_MESSAGES, "the sheet at rest", WAIT_S
         )
 
     def show(self, display: Display) -> None:
         self._publish("display", display)
 
-    async def take_picture(
+    async def capture_image(
         self,
         label: str,
         correction: Correction,
@@ -189,7 +194,7 @@ class Driver:
     ) -> TwinEye:
         """Show the object with that correction, and wait for the eye's image of it.
 
-        Flat shading shows an outline to measure, soft shading a picture for people.
+        Flat shading shows an outline for measurement, soft shading is for figures.
         """
         self.show(
             Display(
@@ -203,12 +208,12 @@ class Driver:
             )
         )
 
-        def taken() -> bool:
+        def received() -> bool:
             eye = self._newest.get("twin/eye")
             return isinstance(eye, TwinEye) and eye.label == label
 
-        await self.wait_for(taken, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
-        # Without a next image, frames need not carry their pixels.
+        await self.wait_for(received, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
+        # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))
         eye = self._newest["twin/eye"]
         assert isinstance(eye, TwinEye)
@@ -216,22 +221,22 @@ class Driver:
 
 
 def _describe_load() -> str:
-    """Return a hint if the computer is overloaded, the most likely cause of a time-out."""
+    """Return a hint if the computer is overloaded, the most likely cause of a timeout."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return ""
     return (
-        f"; this computer is busy (load {load:.0f} on {cores} cores): end other programs and try "
-        "again"
+        f"; this computer is overloaded (load {load:.0f} on {cores} cores); end other programs "
+        "and try again"
     )
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:
-    """Return whether the arm is at its commanded pose and the target rests."""
-    off = arm.world_from_flange[:3, 3] - arm.world_from_flange_commanded[:3, 3]
+    """Return whether the arm is at its commanded pose and the target is at rest."""
+    error = arm.world_from_flange[:3, 3] - arm.world_from_flange_commanded[:3, 3]
     return bool(
         arm.mode == "follow"
-        and np.linalg.norm(off) < SETTLED_POSITION_M
+        and np.linalg.norm(error) < SETTLED_POSITION_M
         and np.linalg.norm(target.twist_world[:3]) < SETTLED_SPEED_M_PER_S
         and np.linalg.norm(target.twist_world[3:]) < SETTLED_RATE_RAD_PER_S
     )

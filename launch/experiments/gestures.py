@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from flexsheet.launch.bags.report.strokes import read_followed
-from flexsheet.launch.experiments import ExperimentError, stroke
+from flexsheet.launch.experiments import ExperimentError, find_recorded, stroke
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.experiments.lag import lag_s
+from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.plans.plan import load_graph
@@ -32,10 +32,10 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
-"""From the exposure: none, the latency to the arm, and that with the arm's servo lag."""
+"""Times after the exposure: zero, the latency to the arm, and that plus the arm's servo lag."""
 
 MAX_LAG_S = 0.08
-"""Below half the period of the fastest taps, so that no tap is matched with its predecessor."""
+"""Maximum lag: less than half the period of the fastest taps, so that no tap matches another."""
 
 MIN_SAMPLES = 10
 GAP_PERIODS = 2.5
@@ -58,30 +58,30 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
 
 
 def select_gestures(names: str | None) -> list[str]:
-    """Return the gestures of a comma-separated list without repeats; None selects all."""
+    """Parse a comma-separated list of gestures and remove duplicates; None selects all."""
     if names is None:
         return list(GESTURES)
-    wanted = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
-    for name in wanted:
+    selected = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    for name in selected:
         if name not in GESTURES:
-            raise ExperimentError(f'no gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
-    if not wanted:
-        raise ExperimentError(f"no gesture is named; choose from: {', '.join(GESTURES)}")
-    return wanted
+            raise ExperimentError(f'unknown gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
+    if not selected:
+        raise ExperimentError(f"empty list of gestures; known gestures: {', '.join(GESTURES)}")
+    return selected
 
 
 def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
-    """Return the path of a gesture or of a recorded finger, in the launch file's scene."""
+    """Make the path of a gesture or of a recorded finger in the launch file's scene."""
     scene = load_graph(launch_file).scene_message()
     if scene is None:
-        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; add one')
+        raise ExperimentError(f'{launch_file}: missing key "scene", which a finger path requires')
     if name_or_file in GESTURES:
         return gesture_path(name_or_file, scene)
     file = Path(name_or_file)
     if not file.suffix and not file.exists():
         raise ExperimentError(
-            f'no gesture and no file "{name_or_file}"; '
-            f"{did_you_mean(name_or_file, list(GESTURES))} Or name a CSV file of a recorded finger"
+            f'"{name_or_file}" is neither a gesture nor a file; '
+            f"{did_you_mean(name_or_file, list(GESTURES))} Or give a CSV file of a recorded finger"
         )
     try:
         return recorded_path(file, scene)
@@ -89,7 +89,7 @@ def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
         raise ExperimentError(str(error)) from None
 
 
-def gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
+def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
     """Make a procedure that performs the gestures in sequence."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -102,48 +102,49 @@ def gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
-    """Hold the true finger at the exposures: times (n,) ns, positions and velocities (n, 3)."""
+class TrueFinger:
+    """True finger at the exposures: times (n,) ns, positions and velocities (n, 3)."""
 
     times_ns: Times
     positions: Floats
     velocities: Floats
 
-    def at(self, times_ns: Times) -> Floats:
+    def interpolate(self, times_ns: Times) -> Floats:
         """Return positions (m, 3) at other times, by cubic Hermite interpolation.
 
-        The error at 60 Hz is up to 45 um in the fastest taps, 13 um in slower ones, 8 um otherwise.
-        Positions are NaN between missed frames and outside all exposures.
+        The error at 60 Hz is at most 45 um in the fastest taps, 13 um in slower ones, 8 um
+        otherwise. Positions between missed frames and outside all exposures are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
-        asked = (times_ns - zero) * 1e-9
-        found = np.asarray(
-            CubicHermiteSpline(seconds, self.positions, self.velocities, extrapolate=False)(asked)
+        query = (times_ns - zero) * 1e-9
+        result = np.asarray(
+            CubicHermiteSpline(seconds, self.positions, self.velocities, extrapolate=False)(query)
         )
         steps = np.diff(seconds)
-        piece = np.clip(np.searchsorted(seconds, asked, side="right") - 1, 0, len(steps) - 1)
+        piece = np.clip(np.searchsorted(seconds, query, side="right") - 1, 0, len(steps) - 1)
         exact = np.isin(times_ns, self.times_ns)
-        found[(steps[piece] > GAP_PERIODS * np.median(steps)) & ~exact] = np.nan
-        return found
+        result[(steps[piece] > GAP_PERIODS * np.median(steps)) & ~exact] = np.nan
+        return result
 
 
 @dataclass(frozen=True, slots=True)
 class GestureRecording:
-    """Hold a bag's true finger, its fingertips in the order of exposure, and the window of each
-    gesture, in ns of the same clock."""
+    """Data of gestures from a bag, with times in ns of one clock.
 
-    truth: Truth
+    fingertips: in the order of exposure. windows_ns: start and end of each gesture.
+    """
+
+    truth: TrueFinger
     times_ns: Times
     fingertips: list[Fingertip]
     windows_ns: dict[str, tuple[int, int]]
 
 
 def read_gestures(bag: Path) -> GestureRecording:
-    """Read true finger and fingertips from a bag.
+    """Read the true finger and the fingertips from a bag.
 
-    A gesture's window is the time on its path, without the motion to its first point and the time
-    after its last.
+    A gesture's window excludes the motion to its first point and the time after its last.
     """
     truths: dict[int, TwinFinger] = {}
     tips: dict[int, Fingertip] = {}
@@ -156,7 +157,9 @@ def read_gestures(bag: Path) -> GestureRecording:
             case _:
                 pass
     if len(truths) < MIN_SAMPLES:
-        raise ExperimentError(f"{bag}: {len(truths)} messages of twin/finger; a gesture needs more")
+        raise ExperimentError(
+            f"{bag}: {len(truths)} messages of twin/finger, at least {MIN_SAMPLES} are required"
+        )
     on_path: dict[str, list[int]] = {}
     for at_ns in sorted(truths):
         finger = truths[at_ns]
@@ -165,7 +168,7 @@ def read_gestures(bag: Path) -> GestureRecording:
     times = sorted(truths)
     tip_times = sorted(tips)
     return GestureRecording(
-        truth=Truth(
+        truth=TrueFinger(
             np.array(times, dtype=np.int64),
             np.array([truths[time].position_world_m for time in times]),
             np.array([truths[time].velocity_world_m_per_s for time in times]),
@@ -177,11 +180,11 @@ def read_gestures(bag: Path) -> GestureRecording:
 
 
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
-    """Return the jumps of the estimate without the finger's own motion, in sigmas (n-1,).
+    """Return the jumps of consecutive estimates without the finger's motion, in sigmas (n-1,).
 
-    errors: (n, 3) m, of consecutive estimates.  covariances: (n, 3, 3) m^2, as stated by them.  The
-    difference of the errors excludes the finger's motion.  Sigma is that of the difference along
-    its direction, for independent estimates.
+    errors: (n, 3) m. covariances: (n, 3, 3) m^2, of the estimates. Differences of errors exclude
+    the finger's motion. Sigma is the standard deviation of the difference along its direction, for
+    independent estimates.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -192,7 +195,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """rms, 99 % and max (mm) of errors (n, 3) m; None without any."""
+    """Return rms, 99 % quantile and maximum of errors (n, 3) m, in mm; None without errors."""
     if len(errors) == 0:
         return {"rms": None, "p99": None, "max": None}
     lengths = 1e3 * np.linalg.norm(errors, axis=1)
@@ -206,8 +209,8 @@ def error_mm(errors: Floats) -> dict[str, float | None]:
 def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
     """Return the predicted positions (n, 3) of fingertips `lead_s` after their exposures."""
     if lead_s == 0.0:
-        return _rows([tip.position_world_m for tip in tips])
-    return _rows(
+        return _stack_rows([tip.position_world_m for tip in tips])
+    return _stack_rows(
         [
             interpolate_path(tip.predicted_path_world_m, tip.prediction_step_s, lead_s)[0]
             for tip in tips
@@ -215,27 +218,24 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
     )
 
 
-def _rows(points: Sequence[Floats]) -> Floats:
-    """Stack points as rows (n, 3), n may be 0."""
+def _stack_rows(points: Sequence[Floats]) -> Floats:
+    """Stack points as rows (n, 3); n may be 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
-    """Return the figures of one gesture in mm and ms; None for unknown ones.
+    """Return the results of one gesture in mm and ms; None for unknown values.
 
-    missing: number of exposures without a fingertip.  reasons: counts of the reasons of invalid
-    fingertips.  jump: between consecutive valid fingertips.
+    missing: number of exposures without a fingertip. reasons: counts of the reasons of invalid
+    fingertips. jump: between consecutive valid fingertips.
     """
-    if name not in recorded.windows_ns:
-        have = ", ".join(recorded.windows_ns) or "none"
-        raise ExperimentError(f'the bag has no gesture "{name}"; it has: {have}')
-    begin_ns, end_ns = recorded.windows_ns[name]
+    begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)
     exposures = recorded.truth.times_ns
     exposed = exposures[(exposures >= begin_ns) & (exposures <= end_ns)]
     inside = np.flatnonzero((recorded.times_ns >= begin_ns) & (recorded.times_ns <= end_ns))
     tips = [recorded.fingertips[i] for i in inside]
     velocities = recorded.truth.velocities[np.isin(exposures, exposed)]
-    truth = recorded.truth.at(recorded.times_ns[inside])
+    truth = recorded.truth.interpolate(recorded.times_ns[inside])
     valid = np.array([tip.valid for tip in tips], dtype=np.bool_)
     usable = np.flatnonzero(valid & np.isfinite(truth).all(axis=1))
     good = [tips[i] for i in usable]
@@ -250,16 +250,17 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
         "valid_ratio": float(valid.mean()) if tips else None,
         "reasons": dict(Counter(tip.reason for tip in tips if not tip.valid)),
         "error_mm": error_mm(errors),
-        "measured_error_mm": error_mm(_rows([tip.measured_world_m for tip in good]) - true),
-        "jump": _jump(errors, good),
+        "measured_error_mm": error_mm(_stack_rows([tip.measured_world_m for tip in good]) - true),
+        "jump": _summarize_jumps(errors, good),
         "prediction": [
-            _prediction(recorded.truth, times, good, lead) for lead in PREDICTION_HORIZONS_S
+            _evaluate_prediction(recorded.truth, times, good, lead)
+            for lead in PREDICTION_HORIZONS_S
         ],
     }
 
 
-def _jump(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """Return the maximum jump between consecutive fingertips (n,), and how many exceed SIGMAS."""
+def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
+    """Return the maximum jump between consecutive fingertips (n,), and the number above SIGMAS."""
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}
     sigmas = jump_sigmas(errors, np.array([tip.covariance[:3, :3] for tip in tips]))
@@ -270,17 +271,17 @@ def _jump(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
     }
 
 
-def _prediction(
-    truth: Truth, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
+def _evaluate_prediction(
+    truth: TrueFinger, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
 ) -> dict[str, Any]:
-    """Return error and lag of the predictions for `lead_s` after each exposure."""
+    """Return the error and lag of the predictions for `lead_s` after each exposure."""
     ahead_ns = times_ns + round(lead_s * 1e9)
-    true = truth.at(ahead_ns)
+    true = truth.interpolate(ahead_ns)
     known = np.isfinite(true).all(axis=1)
     follower, leader, at_ns = predict_positions(tips, lead_s)[known], true[known], ahead_ns[known]
     lag = None
     if len(at_ns) >= MIN_SAMPLES and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
-        lag = lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
+        lag = estimate_lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
     return {
         "lead_ms": lead_s * 1e3,
         **error_mm(follower - leader),
@@ -289,9 +290,9 @@ def _prediction(
 
 
 def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Return the figures of `experiment gestures --json` from its bag.
+    """Return the results of `experiment gestures --json` from its bag.
 
-    followed: errors of the sheet; None if the bag lacks arms or scene.
+    followed: errors of the sheet; None if the bag does not contain the arms or the scene.
     """
     recorded = read_gestures(bag)
     followed = {run["path"]: run for run in read_followed(bag)}

@@ -1,7 +1,7 @@
 """Section VI of the paper: the image on an inclined sheet (Fig. 11) and a pushed one (Fig. 13).
 
-Each case has a label, which the renderer puts into its frames and the simulated eye into its
-images.  The rows are computed from the images in the bag.
+Each case has a label, which is in the renderer's frames and the simulated eye's images. The results
+are computed from the images in the bag.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.stroke import object_pose
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, require_cylinder
@@ -32,9 +32,9 @@ REACH_S = 1.5
 def reach_path(
     scene: Scene, label: str, points: Sequence[tuple[float, float]], *, along_m: float = 0.0
 ) -> FingerPath:
-    """Make a path through points, each (angle around the cylinder, height above its side).
+    """Make a path through points, each given as (angle around the cylinder, height above its side).
 
-    along_m: position along the cylinder's axis, from its middle.
+    along_m: position along the cylinder's axis, from its centre.
     """
     radius = require_cylinder(scene).radius_m
     local = [
@@ -51,23 +51,23 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Make a path to a point above the cylinder, where the sheet waits inclined by that angle."""
+    """Make a path to a point above the cylinder, where the sheet is inclined by that angle."""
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Make a path that pushes the cylinder's side by that depth.
+    """Make a path that pushes the cylinder's side to that depth.
 
-    along_mm: position along the axis, from the middle.  tilt_deg: angle around the axis, from the
-    front.  Raises ExperimentError for a position that cannot be touched.
+    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
+    front. Raises ExperimentError for a position out of reach.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
         raise ExperimentError(
-            f"--at {along_mm:g} mm, --tilt {tilt_deg:g}°: the cylinder's side can be touched to "
-            f"{500.0 * cylinder.length_m:g} mm and 60° from the middle of its front"
+            f"--at {along_mm:g} mm, --tilt {tilt_deg:g}°: the limits on the cylinder's side are "
+            f"±{500.0 * cylinder.length_m:g} mm and ±60° from the centre of its front"
         )
     label, angle = f"push {depth_mm:g} mm", float(np.radians(tilt_deg))
     points = [(angle, HOVER_M), (angle, -depth_mm * 1e-3)]
@@ -76,10 +76,11 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Describe one of the two experiments: the varied value, the finger's path, the measured sizes.
+    """One of the two image experiments.
 
-    name: template of a case's name with the value.  sizes: function to the cylinder's sizes in an
-    image (m).  size_names: their letters in the paper.
+    key: result column of the varied value. name: format of a case's name with the value. path:
+    function that makes the finger's path. sizes: function that measures the cylinder's sizes in an
+    image, m. size_names: symbols of the sizes in the paper.
     """
 
     key: str
@@ -105,8 +106,8 @@ TILT = Series(
 PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (10, 20, 30, 40, 50))
 
 
-def pushed_at(along_mm: float, tilt_deg: float) -> Series:
-    """Return the pushes at a position on the cylinder's side; zeros are the middle of its front."""
+def make_push_series(along_mm: float, tilt_deg: float) -> Series:
+    """Make the pushes at a position on the cylinder's side; zeros are the centre of its front."""
     if not along_mm and not tilt_deg:
         return PUSH
     return replace(
@@ -116,18 +117,18 @@ def pushed_at(along_mm: float, tilt_deg: float) -> Series:
     )
 
 
-PLACES: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""Patterns from which a dense error map is made."""
+RAMPS: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
+"""Patterns for a dense error map."""
 
 
-def pattern_label(label: str, pattern: Pattern) -> str:
+def make_pattern_label(label: str, pattern: Pattern) -> str:
     """Return the label of a case's image of a pattern."""
     return f"{label}, {pattern}"
 
 
 @dataclass(frozen=True, slots=True)
 class EyeImage:
-    """Hold one image of the simulated eye from the bag."""
+    """Image of the simulated eye from a bag."""
 
     label: str
     correction: Correction
@@ -136,56 +137,53 @@ class EyeImage:
     expected: NDArray[np.uint8]
 
 
-def read_pictures(bag: Path) -> dict[str, EyeImage]:
-    """Return the newest image of each label."""
-    pictures = {}
+def read_images(bag: Path) -> dict[str, EyeImage]:
+    """Read the newest image of each label from a bag."""
+    images = {}
     for _, message, _, _ in BagReader(bag, topics=["twin/eye"]):
         if isinstance(message, TwinEye):
-            pictures[message.label] = EyeImage(
+            images[message.label] = EyeImage(
                 message.label,
                 message.correction,
                 message.metres_per_px,
                 message.seen,
                 message.expected,
             )
-    return pictures
+    return images
 
 
 def size_errors_mm(
-    picture: EyeImage, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
+    image: EyeImage, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
 ) -> list[float]:
-    """Return absolute differences (mm) between seen and expected sizes, as in the paper."""
-    seen = np.array(sizes(picture.seen, picture.metres_per_px))
-    expected = np.array(sizes(picture.expected, picture.metres_per_px))
-    return [float(error) for error in np.abs(seen - expected) * 1e3]
+    """Return absolute differences between measured and expected sizes, as in the paper, mm."""
+    measured = np.array(sizes(image.seen, image.metres_per_px))
+    expected = np.array(sizes(image.expected, image.metres_per_px))
+    return [float(error) for error in np.abs(measured - expected) * 1e3]
 
 
-def find_picture(pictures: dict[str, EyeImage], label: str) -> EyeImage:
-    """Return the image with that label; ExperimentError if the bag has none."""
-    if label not in pictures:
-        have = ", ".join(pictures) or "none"
-        raise ExperimentError(f'the bag has no image "{label}"; it has: {have}')
-    return pictures[label]
+def find_image(images: dict[str, EyeImage], label: str) -> EyeImage:
+    """Return the image with that label. Raises ExperimentError if the bag does not contain it."""
+    return find_recorded(images, "image", label)
 
 
-def make_error_map(pictures: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Return the errors at all visible points of a case, from its images of both patterns."""
-    x, y = (find_picture(pictures, pattern_label(label, pattern)) for pattern in PLACES)
+def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
+    """Compute the errors at all visible points of a case, from its images of both ramps."""
+    x, y = (find_image(images, make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
 def make_rows(
-    pictures: dict[str, EyeImage], series: Series, *, with_maps: bool = False
+    images: dict[str, EyeImage], series: Series, *, with_maps: bool = False
 ) -> list[dict[str, Any]]:
-    """Return the rows of an experiment, one for each value and correction.
+    """Return the results of an experiment, one row per value and correction.
 
     with_maps: add mean, 95 % quantile and maximum of the errors at all visible points.
     """
     result = []
     for value in series.values:
         for correction in CORRECTIONS:
-            picture = find_picture(pictures, series.label(value, correction))
-            errors = size_errors_mm(picture, series.sizes)
+            image = find_image(images, series.label(value, correction))
+            errors = size_errors_mm(image, series.sizes)
             row: dict[str, Any] = {series.key: value, "method": correction}
             row.update(
                 (f"delta_{name}_mm", error)
@@ -193,13 +191,13 @@ def make_rows(
             )
             row["mean_mm"] = float(np.mean(errors))
             if with_maps:
-                row |= map_figures(make_error_map(pictures, series.label(value, correction)))
+                row |= summarize_map(make_error_map(images, series.label(value, correction)))
             result.append(row)
     return result
 
 
-def map_figures(errors: ErrorMap) -> dict[str, float | None]:
-    """Return mean, 95 % quantile and maximum (mm) over all visible points; None without points."""
+def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
+    """Return mean, 95 % quantile and maximum over all visible points, mm; None without points."""
     sizes_mm = 1e3 * errors.sizes_m
     if len(sizes_mm) == 0:
         return dict.fromkeys(("map_mean_mm", "map_p95_mm", "map_max_mm"))

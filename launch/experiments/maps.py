@@ -1,4 +1,4 @@
-"""Draw the image error at each visible point, for each case and correction."""
+"""Draw the image error at each visible point, per case and correction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.launch.experiments.image import (
     EyeImage,
     Series,
     make_error_map,
-    map_figures,
+    summarize_map,
 )
 from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
 from flexsheet.nodes.twin.error_map import ErrorMap
@@ -22,31 +22,29 @@ MIN_MM, MAX_MM = 0.01, 10.0
 """Limits of the logarithmic colour scale."""
 
 
-def draw_error_maps(pictures: dict[str, EyeImage], series: Series, path: Path) -> None:
-    """Draw a row for each value of the series, a column for each correction.
+def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
+    """Draw one row per value of the series and one column per correction.
 
-    Raises ExperimentError if a case lacks an image of a pattern.
+    Raises ExperimentError if an image of a case is missing.
     """
     cases = [
         (series.name.format(value), [series.label(value, name) for name in CORRECTIONS])
         for value in series.values
     ]
-    maps = [
-        (title, [make_error_map(pictures, label) for label in labels]) for title, labels in cases
-    ]
+    maps = [(title, [make_error_map(images, label) for label in labels]) for title, labels in cases]
     figure = Figure(figsize=(2.9 * len(CORRECTIONS) + 0.9, 2.3 * len(maps)), layout="constrained")
     panels = figure.subplots(len(maps), len(CORRECTIONS), squeeze=False)
     shown = None
     for row, (title, errors) in zip(panels, maps, strict=True):
         box = _find_box(errors)
-        for panel, correction, of_it in zip(row, CORRECTIONS, errors, strict=True):
+        for panel, correction, error_map in zip(row, CORRECTIONS, errors, strict=True):
             panel.set_xticks([])
             panel.set_yticks([])
-            sizes_mm = 1e3 * np.linalg.norm(of_it.errors_m[box], axis=2)
+            sizes_mm = 1e3 * np.linalg.norm(error_map.errors_m[box], axis=2)
             shown = panel.imshow(sizes_mm, norm=LogNorm(MIN_MM, MAX_MM), cmap="viridis")
-            figures = [one for one in map_figures(of_it).values() if one is not None]
-            said = ", ".join(f"{one:.2f}" for one in figures) + " mm" if figures else "not seen"
-            panel.set_title(f"{title}\n{CORRECTION_NAMES[correction]}\n{said}", fontsize=8)
+            figures = [one for one in summarize_map(error_map).values() if one is not None]
+            text = ", ".join(f"{one:.2f}" for one in figures) + " mm" if figures else "not visible"
+            panel.set_title(f"{title}\n{CORRECTION_NAMES[correction]}\n{text}", fontsize=8)
     if shown is not None:
         figure.colorbar(shown, ax=panels, shrink=0.6, label="error, mm", extend="both")
     figure.suptitle("Error of the image at each visible point: mean, 95 %, maximum")
@@ -54,9 +52,9 @@ def draw_error_maps(pictures: dict[str, EyeImage], series: Series, path: Path) -
 
 
 def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
-    """Return the rows and columns in which any map has values; all of them if none has."""
-    seen = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
-    if not seen.any():
+    """Return the rows and columns in which any map has values, or all if none has."""
+    valid = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
+    if not valid.any():
         return slice(None), slice(None)
-    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -23,33 +23,33 @@ EVENTS = (
     "frame drawn",
 )
 
-BLACK = 8
-SHOWN = (0.18, 0.82)
-"""Part of the eye's image that is drawn; around it is only dark sheet."""
+MAX_BLACK = 8
+DRAWN_RANGE = (0.18, 0.82)
+"""Drawn part of the eye's image, as fractions of its size; the rest shows only dark sheet."""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
     "one_plane": "corrected for one plane",
     "four_triangles": "corrected for 4 triangles",
-    "two_pass": "projected onto the sheet's shape",
+    "two_pass": "corrected for the sheet's shape",
 }
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw one row per case: each image as the eye sees it, and last the expected image."""
-    columns = max(len(pictures) for _, pictures in rows) + 1
+    """Draw one row per case: the eye's image for each correction, and the expected image."""
+    columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
-    for row, (title, pictures) in zip(axes, rows, strict=True):
-        shown: list[tuple[str, np.ndarray, EyeImage]] = [
-            (CORRECTION_NAMES[picture.correction], picture.seen, picture) for picture in pictures
+    for row, (title, images) in zip(axes, rows, strict=True):
+        panels: list[tuple[str, np.ndarray, EyeImage]] = [
+            (CORRECTION_NAMES[image.correction], image.seen, image) for image in images
         ]
-        shown.append(("expected", pictures[0].expected, pictures[0]))
+        panels.append(("expected", images[0].expected, images[0]))
         for axis in row:
             axis.set_axis_off()
-        for axis, (name, pixels, picture) in zip(row, shown, strict=False):
+        for axis, (name, pixels, image) in zip(row, panels, strict=False):
             axis.imshow(pixels)
-            outline = outline_box(picture.expected)
+            outline = compute_outline(image.expected)
             if outline is not None:
                 left, top, width, height = outline
                 axis.add_patch(
@@ -57,27 +57,22 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -
                 )
             axis.set_title(f"{title}\n{name}", fontsize=9)
             rows_px, columns_px, _ = pixels.shape
-            axis.set_xlim(SHOWN[0] * columns_px, SHOWN[1] * columns_px)
-            axis.set_ylim(SHOWN[1] * rows_px, SHOWN[0] * rows_px)
-    figure.suptitle("What the user's eye sees (orange: the box around the expected image)")
+            axis.set_xlim(DRAWN_RANGE[0] * columns_px, DRAWN_RANGE[1] * columns_px)
+            axis.set_ylim(DRAWN_RANGE[1] * rows_px, DRAWN_RANGE[0] * rows_px)
+    figure.suptitle("Images at the user's eye (orange: bounding box of the expected image)")
     figure.savefig(path, dpi=110)
 
 
-def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Return left, top, width and height of the non-black part; None if all is black."""
-    ys, xs = np.nonzero(picture.max(axis=2) > BLACK)
+def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | None:
+    """Return left, top, width and height of the non-black part; None if all pixels are black."""
+    ys, xs = np.nonzero(image.max(axis=2) > MAX_BLACK)
     if len(xs) == 0:
         return None
-    return (
-        float(xs.min()),
-        float(ys.min()),
-        float(np.ptp(xs)),
-        float(np.ptp(ys)),
-    )
+    return float(xs.min()), float(ys.min()), float(np.ptp(xs)), float(np.ptp(ys))
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Draw position and angle error over time, one column per stroke, the paper's mean dashed."""
+    """Draw position and angle errors over time, one column per stroke, with the paper's mean."""
     figure = Figure(figsize=(5.5 * len(errors), 6), layout="constrained")
     axes = figure.subplots(2, len(errors), squeeze=False)
     for column, (seconds, stroke) in enumerate(errors.items()):
@@ -100,7 +95,7 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
         upper.set_title(f"60° in {seconds:g} s")
         upper.set_ylabel("position error Δd, mm")
         lower.set_ylabel("angle error Δθ, degrees")
-        lower.set_xlabel("time since the stroke began, s")
+        lower.set_xlabel("time since the start of the stroke, s")
         upper.legend(fontsize=8)
         for axis in (upper, lower):
             axis.set_ylim(bottom=0)
@@ -124,49 +119,49 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
     axes.invert_yaxis()
     longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
     axes.set_xlim(0, 1.25 * longest_ms)
-    axes.set_xlabel("ms since the middle of the exposure: 1-99 % (bar), median (line)")
+    axes.set_xlabel("time since the middle of the exposure, ms: 1-99 % (bar), median (line)")
     axes.set_title("Latency")
     axes.grid(visible=True, axis="x", alpha=0.2)
     figure.savefig(path, dpi=110)
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Draw force over depth, desired and presented, one panel per position, with people's JND."""
-    places = list(dict.fromkeys(row["place"] for row in result["rows"]))
-    figure = Figure(figsize=(4.2 * len(places), 4.4), layout="constrained")
-    panels = figure.subplots(1, len(places), squeeze=False, sharey=True)[0]
-    sure, surer = (0.01 * percent for percent in result["noticed_percent"])
+    """Draw object and rendered force over depth, one panel per position, with the JND."""
+    positions = list(dict.fromkeys(row["place"] for row in result["rows"]))
+    figure = Figure(figsize=(4.2 * len(positions), 4.4), layout="constrained")
+    panels = figure.subplots(1, len(positions), squeeze=False, sharey=True)[0]
+    jnd, bare_jnd = (0.01 * percent for percent in result["noticed_percent"])
     moving = result["moving"]["rows"]
-    for panel, place in zip(panels, places, strict=True):
-        rows = [row for row in result["rows"] if row["place"] == place]
+    for panel, position in zip(panels, positions, strict=True):
+        rows = [row for row in result["rows"] if row["place"] == position]
         depths = np.array([0.0, *(row["depth_mm"] for row in rows)])
-        wanted = np.array([0.0, *(row["wanted_n"] for row in rows)])
-        for ratio, strength in ((surer, 0.12), (sure, 0.18)):
+        forces = np.array([0.0, *(row["wanted_n"] for row in rows)])
+        for ratio, alpha in ((bare_jnd, 0.12), (jnd, 0.18)):
             panel.fill_between(
                 depths,
-                (1.0 - ratio) * wanted,
-                (1.0 + ratio) * wanted,
+                (1.0 - ratio) * forces,
+                (1.0 + ratio) * forces,
                 color="C0",
-                alpha=strength,
+                alpha=alpha,
                 linewidth=0,
-                label=f"within {100 * ratio:.0f} %: below the JND",
+                label=f"within {100 * ratio:.0f} % (JND)",
             )
-        panel.plot(depths, wanted, color="C0", label="the object")
-        if place == places[0]:
+        panel.plot(depths, forces, color="C0", label="object")
+        if position == positions[0]:
             panel.plot(
                 [row["depth_mm"] for row in moving],
                 [row["presented_n"] for row in moving],
                 ".",
                 color="0.5",
                 markersize=3,
-                label=f"presented at {result['moving']['speed_mm_per_s']:.0f} mm/s, in and out",
+                label=f"rendered, moving at {result['moving']['speed_mm_per_s']:.0f} mm/s",
             )
-        presented = [row["presented_n"] for row in rows]
-        panel.plot(depths[1:], presented, "o", color="C1", label="presented, at rest")
-        panel.set_title(place)
-        panel.set_xlabel("depth of the finger, mm")
+        rendered = [row["presented_n"] for row in rows]
+        panel.plot(depths[1:], rendered, "o", color="C1", label="rendered, at rest")
+        panel.set_title(position)
+        panel.set_xlabel("finger depth, mm")
         panel.grid(visible=True, alpha=0.2)
     panels[0].set_ylabel("force, N")
     panels[0].legend(fontsize=8)
-    figure.suptitle("Presented force of the object, by the simulated sheet")
+    figure.suptitle("Force of the simulated sheet and of the object")
     figure.savefig(path, dpi=110)

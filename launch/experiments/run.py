@@ -1,4 +1,4 @@
-"""Run an experiment: start the graph with a recorder, drive it and stop it."""
+"""Run an experiment: start the graph with a recorder, run a procedure, and stop the graph."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
-GRACE_S = 0.3
+DELIVERY_S = 0.3
 
 Progress = Callable[[str], None]
 Procedure = Callable[[Driver, Scene], Awaitable[None]]
 
 
 def new_folder(name: str, parent: Path = RUNS) -> Path:
-    """Create a folder for an experiment's bag and images: runs/20261121-164500-stroke."""
+    """Create a folder for an experiment's bag and images, such as runs/20261121-164500-stroke."""
     folder = parent / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder.mkdir(parents=True)
     return folder
@@ -38,37 +38,41 @@ def new_folder(name: str, parent: Path = RUNS) -> Path:
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
     """Start the plan's graph, run the procedure on it and stop it.
 
-    Raises the procedure's errors, and NodeFailedError as soon as a node has failed for good.
+    Raises the procedure's errors, and NodeFailedError when a node fails permanently.
     """
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(
-            f'{plan.launch_file}: key "scene": an experiment needs a scene; add one'
+            f'{plan.launch_file}: missing key "scene", which an experiment requires'
         )
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()
         async with Driver(plan, graph.run) as driver:
-            await _run_while_graph_runs(graph, _drive(driver, scene, procedure, progress))
+            await _run_while_graph_runs(graph, _run_procedure(driver, scene, procedure, progress))
 
 
-async def _drive(driver: Driver, scene: Scene, procedure: Procedure, progress: Progress) -> None:
+async def _run_procedure(
+    driver: Driver, scene: Scene, procedure: Procedure, progress: Progress
+) -> None:
     progress("waiting for the soft body and the arms")
-    await driver.wait_until_up()
+    await driver.wait_ready()
     await procedure(driver, scene)
-    # Messages caused by the last action are still on their way to the recorder.
-    await asyncio.sleep(GRACE_S)
+    # Let the messages caused by the last action arrive at the recorder.
+    await asyncio.sleep(DELIVERY_S)
 
 
 async def _run_while_graph_runs(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
-    """Do `work` while the graph runs; raise the reason if the graph ends first."""
+    """Await `work` while the graph runs; if the graph ends first, raise the reason."""
     task = asyncio.create_task(work)
     end = asyncio.create_task(graph.wait())
     try:
         await asyncio.wait((task, end), return_when=asyncio.FIRST_COMPLETED)
         if not task.done():
             end.result()
-            raise ExperimentError(f"the nodes ended before the experiment; logs: {graph.run.logs}")
+            raise ExperimentError(
+                f"the nodes exited before the experiment ended; see the logs in {graph.run.logs}"
+            )
         task.result()
     finally:
         for each in (task, end):
@@ -85,41 +89,41 @@ def run_experiment(
     *,
     apparatus: str | None = None,
 ) -> None:
-    """Run a procedure on a launch file's graph and record it to `bag`.
+    """Run a procedure on a launch file's graph, and record it to `bag`.
 
     apparatus: file or seed of what is true in the simulator; see `load_apparatus`.
     """
     plan = load_graph(launch_file, settings=settings, record=bag, apparatus=apparatus)
     precompute_graph(plan, progress)
     try:
-        asyncio.run(_interruptible(drive(plan, procedure, progress)))
+        asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
     except ExperimentError as error:
         if not bag.exists():
             raise
-        raise ExperimentError(f"{error}\nrecorded until the error: {bag}") from error
+        raise ExperimentError(f"{error}\nrecording until the error: {bag}") from error
 
 
-async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
-    """Do `work`; SIGINT and SIGTERM cancel it and raise ExperimentError."""
+async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
+    """Await `work`; SIGINT and SIGTERM cancel it and raise ExperimentError."""
     task = asyncio.create_task(work)
     with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
         try:
             await task
         except asyncio.CancelledError:
-            raise ExperimentError("interrupted; all nodes were stopped") from None
+            raise ExperimentError("interrupted; all nodes are stopped") from None
 
 
-def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Return the setting ("parameter=value") for each node whose class is that of a type."""
-    wanted = node_class(node_type)
+def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
+    """Make the setting "parameter=value" for each node of a type or of a class derived from it."""
+    base = node_class(node_type)
     return [
         f"{node.name}.{setting}"
         for node in load_graph(launch_file).nodes.values()
-        if issubclass(node_class(node.type), wanted)
+        if issubclass(node_class(node.type), base)
     ]
 
 
-def stroke_procedure(
+def make_stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
     """Make a procedure that strokes once for each duration, or follows `path`."""
@@ -130,13 +134,13 @@ def stroke_procedure(
             await driver.follow(path)
             return
         for duration in seconds:
-            progress(f"stroking 60° in {duration:g} s")
+            progress(f"stroke over 60° in {duration:g} s")
             await driver.follow(stroke.stroke_path(scene, duration))
 
     return procedure
 
 
-def picture_procedure(
+def make_image_procedure(
     series: image.Series,
     values: Sequence[float],
     corrections: Sequence[Correction],
@@ -147,7 +151,7 @@ def picture_procedure(
 ) -> Procedure:
     """Make a procedure that images each case with each correction.
 
-    with_maps: also image the coordinate ramps, from which dense error maps are made.
+    with_maps: also image the coordinate ramps, for dense error maps.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -157,16 +161,16 @@ def picture_procedure(
             for correction in corrections:
                 label = series.label(value, correction)
                 progress(label)
-                await driver.take_picture(label, correction, shading)
-                for pattern in image.PLACES if with_maps else ():
-                    of_pattern = image.pattern_label(label, pattern)
-                    await driver.take_picture(of_pattern, correction, pattern=pattern)
+                await driver.capture_image(label, correction, shading)
+                for pattern in image.RAMPS if with_maps else ():
+                    ramp_label = image.make_pattern_label(label, pattern)
+                    await driver.capture_image(ramp_label, correction, pattern=pattern)
 
     return procedure
 
 
-def run_in_sequence(*procedures: Procedure) -> Procedure:
-    """Join procedures into one that runs them in sequence on the same graph."""
+def chain_procedures(*procedures: Procedure) -> Procedure:
+    """Make a procedure that runs others in sequence on the same graph."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for each in procedures:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
-from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.experiments.lag import lag_s
+from flexsheet.launch.experiments import ExperimentError, find_recorded
+from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
@@ -44,25 +44,26 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""Mean and standard deviation by moving time (s)."""
+"""Mean and standard deviation, by duration of the stroke (s)."""
 
 
-NOTHING: Floats = np.empty(0)
+NO_VALUES: Floats = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """Hold the contents of drawn frames at the middle of their display.
+    """Contents of drawn frames, by the middle of their display time, ns.
 
-    fingertip: rows (3,), the drawn finger.  sheet: rows (6,), centre and normal of the sheet pose.
-    dented: rows (1,), display time minus the time of the finger that deforms the object.
+    fingertip: rows (3,), drawn finger.  sheet: rows (6,), centre and normal of the sheet.
+    deformation_ages: rows (1,), age of the finger that deforms the drawn object, s.
     """
 
     fingertip: list[tuple[int, Floats]]
     sheet: list[tuple[int, Floats]]
-    dented: list[tuple[int, Floats]]
+    deformation_ages: list[tuple[int, Floats]]
 
     def add(self, frame: Frame) -> None:
+        """Add the contents of a frame that was displayed."""
         if not frame.light_ns:
             return
         pose = frame.world_from_sheet
@@ -71,7 +72,7 @@ class DrawnFrames:
             self.fingertip.append((frame.light_ns, frame.fingertip_world_m[0]))
         if frame.shaped_for_ns:
             age_s = (frame.light_ns - frame.shaped_for_ns) * 1e-9
-            self.dented.append((frame.light_ns, np.array([age_s])))
+            self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
         """Return the contents at the true time of light, `late_ns` after the stated one.
@@ -87,11 +88,12 @@ class DrawnFrames:
 
 
 def stroke_label(seconds: float) -> str:
+    """Return the label of a stroke of that duration (s)."""
     return f"stroke {seconds:g} s"
 
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
-    """Make a path: approach, touch, dwell, stroke 60 degrees at constant speed, lift."""
+    """Make a path: approach, touch, dwell, stroke over 60 degrees at constant speed, lift."""
     radius = require_cylinder(scene).radius_m
     world_from_object = object_pose(scene)
     stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
@@ -124,42 +126,45 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
 
 
 def stroke_window_s(seconds: float) -> tuple[float, float]:
-    """Return begin and end of the stroke in the path's time."""
+    """Return the start and end of the stroke in the path's time, s."""
     begin = APPROACH_S + DWELL_S
     return begin, begin + seconds
 
 
 def object_pose(scene: Scene) -> Floats:
+    """Return world_from_object (4, 4) of a scene."""
     pose = scene.object.world_from_object
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """Hold samples of a motion: times (n,) ns, values (n, k)."""
+    """Samples of a motion: times (n,) ns, values (n, k)."""
 
     times_ns: NDArray[np.int64]
     values: Floats
 
-    def at(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Return values (m, k) at other times, linear between samples.
+    def interpolate(self, times_ns: NDArray[np.int64]) -> Floats:
+        """Interpolate values (m, k) linearly at other times.
 
-        Times count from the first sample, so that a float keeps the nanoseconds of a long uptime.
+        Times are taken from the first sample, so that floats resolve nanoseconds after a long
+        uptime.
         """
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
         return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
 
     def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return a mask (m,) of times within the samples."""
         inside: NDArray[np.bool_] = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
         return inside
 
 
-def make_motion(samples: list[tuple[int, Floats]], what: str) -> SampledMotion:
+def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
     """Sort samples (time, value) and drop repeated times; ExperimentError for fewer than two."""
     if len(samples) < 2:
         raise ExperimentError(
-            f"the bag has {len(samples)} samples of {what}; the experiment needs more"
+            f"the bag contains {len(samples)} samples of {name}, at least 2 are required"
         )
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([value for _, value in samples])
@@ -169,11 +174,11 @@ def make_motion(samples: list[tuple[int, Floats]], what: str) -> SampledMotion:
 
 @dataclass(frozen=True, slots=True)
 class StrokeRecording:
-    """Hold an experiment's data from a bag.
+    """Data of an experiment from a bag.
 
-    Edges are rows (9,): middle of the clamped edge, its y axis, its z axis, in the world.
-    delays_s: from the middle of an exposure to each event that it caused, by event.
-    drops: lost or refused messages, without those that a `latest` reader skipped.
+    Edges are rows (9,): centre of the clamped edge, its y axis and its z axis, in the world.
+    delays_s: from the middle of an exposure to each event that it caused, by event. drops: number
+    of lost or refused messages, except those that a `latest` reader skipped.
     """
 
     scene: Scene
@@ -185,29 +190,30 @@ class StrokeRecording:
     true_edges: tuple[SampledMotion, SampledMotion]
     delays_s: dict[str, Floats]
     drops: int
-    pictures: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
+    frames: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
 
     def arm_delays_s(self) -> Floats:
-        """Return delays (n,) from exposure to the written command, of both arms."""
-        both = [self.delays_s.get(f"{side} arm command", NOTHING) for side in ("left", "right")]
+        """Return the delays (n,) from exposure to the written command, of both arms, s."""
+        both = [self.delays_s.get(f"{side} arm command", NO_VALUES) for side in ("left", "right")]
         return np.concatenate(both)
 
 
 def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
-    """Return the delays (n,) of each event, from delays by (event, exposure)."""
+    """Group delays by (event, exposure) into arrays (n,) by event."""
     events: dict[str, list[float]] = {}
     for (event, _), delay_s in delays.items():
         events.setdefault(event, []).append(delay_s)
     return {event: np.array(values) for event, values in events.items()}
 
 
-def edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
+def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
+    """Return centre, y axis and z axis of an edge as a row (9,)."""
     edge = world_from_flange @ flange_from_edge
     return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
 
 
 def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
-    """Return the events of a frame and their times, ns."""
+    """Return the events of a frame with their times, ns."""
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
     events = [("frame begun", begun_ns), ("frame drawn", drawn_ns)]
@@ -215,7 +221,7 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
 
 
 def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
-    """Return the latency events of a message: (event, exposure ns, time ns)."""
+    """Return the latency events of a message as (event, exposure ns, time ns)."""
     exposure_ns = header.source_ns
     match message:
         case Fingertip() if message.valid:
@@ -233,8 +239,10 @@ def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
     return []
 
 
-def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str, tuple[int, int]]:
-    """Return begin and last stamp of each path, from samples (stamp, time on the path)."""
+def _find_windows_ns(
+    times_by_label: dict[str, list[tuple[int, float]]],
+) -> dict[str, tuple[int, int]]:
+    """Return the start and last stamp of each path, from samples (stamp, time on the path)."""
     return {
         label: (samples[-1][0] - round(samples[-1][1] * 1e9), samples[-1][0])
         for label, samples in times_by_label.items()
@@ -242,7 +250,7 @@ def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str,
 
 
 def read_recording(bag: Path) -> StrokeRecording:
-    """Read the data for the stroke's figures from a bag."""
+    """Read the data for the stroke's results from a bag. Raises ExperimentError."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
@@ -253,15 +261,15 @@ def read_recording(bag: Path) -> StrokeRecording:
         key: [] for key in ("left", "right", "true_left", "true_right")
     }
     delays: dict[tuple[str, int], float] = {}
-    pictures = DrawnFrames([], [], [])
+    frames = DrawnFrames([], [], [])
 
-    def delay(event: str, source_ns: int, event_ns: int) -> None:
+    def add_delay(event: str, source_ns: int, event_ns: int) -> None:
         delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
 
     losses: dict[tuple[str, int, str], int] = {}
     for _, message, header, _ in BagReader(bag):
         for event in list_events(message, header):
-            delay(*event)
+            add_delay(*event)
         match message:
             case Scene():
                 scene = message
@@ -281,20 +289,21 @@ def read_recording(bag: Path) -> StrokeRecording:
                 flanges["true_left"].append((header.source_ns, message.world_from_flange_left))
                 flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
             case Frame():
-                pictures.add(message)
+                frames.add(message)
             case Status():
                 for port in message.inputs:
-                    # Counters restart with the node; the last status of each start has the total.
+                    # Counters restart with the node, so the last status of each start contains its
+                    # total.
                     losses[message.node, header.epoch, port.topic] = port.gaps + port.rejected
             case _:
                 pass
     if scene is None:
-        raise ExperimentError(f"{bag}: no scene was recorded")
+        raise ExperimentError(f"{bag}: does not contain a scene; record the topic scene")
 
-    def edges(key: str, arm: ArmSpec) -> SampledMotion:
+    def make_edges(key: str, arm: ArmSpec) -> SampledMotion:
         pose = arm.flange_from_edge
         flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
-        rows = [(time, edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
+        rows = [(time, make_edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
         return make_motion(rows, f"arm {key}")
 
     true_arms = apply_apparatus(scene, apparatus).arms
@@ -305,23 +314,26 @@ def read_recording(bag: Path) -> StrokeRecording:
         fingertip=make_motion(fingertip, "fingertip"),
         measured=make_motion(measured, "fingertip"),
         finger=make_motion(finger, "twin/finger"),
-        windows_ns=_windows_ns(times_by_label),
-        measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
-        true_edges=(edges("true_left", true_arms.left), edges("true_right", true_arms.right)),
+        windows_ns=_find_windows_ns(times_by_label),
+        measured_edges=(make_edges("left", scene.arms.left), make_edges("right", scene.arms.right)),
+        true_edges=(
+            make_edges("true_left", true_arms.left),
+            make_edges("true_right", true_arms.right),
+        ),
         delays_s=group_by_event(delays),
         drops=sum(losses.values()),
-        pictures=pictures,
+        frames=frames,
     )
 
 
-def sheet_planes(
+def compute_sheet_planes(
     edges: tuple[SampledMotion, SampledMotion],
     world_from_object: Floats,
     times_ns: NDArray[np.int64],
 ) -> tuple[Floats, Floats]:
-    """Return the sheet's centres (n, 3) m and unit normals (n, 3), in the object's frame.
+    """Return centres (n, 3) m and unit normals (n, 3) of the plane through both edges.
 
-    The sheet is the plane through both edges.
+    They are in the object's frame.
     """
     object_from_world = inverse(world_from_object)
     left, right = (
@@ -333,7 +345,7 @@ def sheet_planes(
             ],
             axis=1,
         )
-        for row in (edges[0].at(times_ns), edges[1].at(times_ns))
+        for row in (edges[0].interpolate(times_ns), edges[1].interpolate(times_ns))
     )
     across = right[:, :3] - left[:, :3]
     normal = np.cross(across, left[:, 3:6] + right[:, 3:6])
@@ -347,33 +359,33 @@ def find_presented_points(
     times_ns: NDArray[np.int64],
     x_m: Floats,
 ) -> tuple[Floats, Floats]:
-    """Return the points D' (n, 3) that the sheet presents, in the object's frame, and angles (n,).
+    """Return the contact points D' (n, 3) of the sheet in the object's frame, and angles (n,).
 
-    D' is the plane's point nearest to the cylinder's axis at x = `x_m` (n,).  The angle is that of
-    the plane's normal about the axis.
+    D' is the plane's point nearest to the cylinder's axis at x = `x_m` (n,). The angle is that of
+    the plane's normal about the axis, rad.
     """
-    centre, normal = sheet_planes(edges, world_from_object, times_ns)
+    centre, normal = compute_sheet_planes(edges, world_from_object, times_ns)
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
     distance = np.einsum("ij,ij->i", centre - axis_point, normal)
     return axis_point + distance[:, None] * normal, np.arctan2(normal[:, 1], normal[:, 2])
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""A surface with less curvature counts as flat: a normal does not identify one of its points."""
+"""Minimum curvature; on a flatter surface a normal does not identify a point."""
 
 
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
-    """Return points D' (n, 3) presented near `foot` by planes through `centre` with `normal`.
+    """Return the contact points D' (n, 3) near `foot` of planes through `centre` with `normal`.
 
-    D' is the surface point with the plane's normal, projected onto the plane.  Along a flat
-    direction it is the foot itself.  The error is of second order in the angle between the normals.
+    D' is the surface point with the plane's normal, projected onto the plane. Along a flat
+    direction it is the foot itself. The error is of second order in the angle between the normals.
     """
     curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
     slopes = np.einsum("nki,ni->nk", directions, normal)
     curved = np.abs(curvatures) > MIN_CURVATURE_PER_M
-    ways_m = np.divide(slopes, curvatures, out=np.zeros_like(slopes), where=curved)
-    drop_m = 0.5 * (curvatures * ways_m**2).sum(axis=1)
-    point = foot.point + np.einsum("nk,nki->ni", ways_m, directions)
+    shifts_m = np.divide(slopes, curvatures, out=np.zeros_like(slopes), where=curved)
+    drop_m = 0.5 * (curvatures * shifts_m**2).sum(axis=1)
+    point = foot.point + np.einsum("nk,nki->ni", shifts_m, directions)
     point -= drop_m[:, None] * foot.normal
     gap_m = np.einsum("ni,ni->n", point - centre, normal)
     return np.asarray(point - gap_m[:, None] * normal)
@@ -388,25 +400,25 @@ def sheet_errors(
     *,
     shape: Shape | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any shape of object.
+    """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any object shape.
 
-    D is the object's point nearest to the finger.  The sheet presents the undeformed surface, so
-    the push depth is no error.  normal_offset_m (n,): commanded depth of the sheet below that
-    surface.  On a cylinder, delta theta is the angle about its axis, as in the paper; on others,
-    the angle between the normals.  shape: that of the scene, if the caller has it.
+    D is the object's point nearest to the finger. The sheet renders the undeformed surface, so the
+    push depth is not an error. normal_offset_m (n,): commanded depth of the sheet below that
+    surface. On a cylinder, delta theta is the angle about its axis, as in the paper; on other
+    shapes, the angle between the normals. shape: that of the scene, if already computed.
     """
     world_from_object = object_pose(scene)
-    points = apply(inverse(world_from_object), finger.at(times_ns))
+    points = apply(inverse(world_from_object), finger.interpolate(times_ns))
     if not isinstance(scene.object.geometry, Cylinder):
         foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
-        centre, normal = sheet_planes(edges, world_from_object, times_ns)
+        centre, normal = compute_sheet_planes(edges, world_from_object, times_ns)
         on_surface = (
             foot.point - np.broadcast_to(normal_offset_m, len(points))[:, None] * foot.normal
         )
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
-        off = on_surface - project_presented_point(foot, centre, normal)
-        return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
+        error = on_surface - project_presented_point(foot, centre, normal)
+        return np.linalg.norm(error, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
     radius = require_cylinder(scene).radius_m - normal_offset_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
@@ -418,9 +430,9 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Smooth the measurements offline, as a bound for causal methods.
+    """Smooth the measurements offline, as a lower bound for the error of causal methods.
 
-    One cubic smoothing spline per coordinate; generalized cross-validation sets the penalty.
+    Fits one cubic smoothing spline per coordinate, with generalized cross-validation.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
@@ -430,6 +442,7 @@ def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> Sampl
 
 
 def summary(values: Floats, scale: float) -> dict[str, float]:
+    """Return mean, standard deviation and maximum of values (n,) times `scale`."""
     scaled = values * scale
     return {
         "mean": float(scaled.mean()),
@@ -439,6 +452,7 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
+    """Return the median and 99 % quantile of times (n,) s, in ms; None without values."""
     if len(values_s) == 0:
         return {"p50": None, "p99": None}
     return {
@@ -449,13 +463,12 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """Hold the errors over time of a stroke, m and rad.
+    """Errors of a stroke over time, m and rad.
 
-    seconds: (n,) times of the measured errors since the stroke began: exposures with a valid
-        fingertip.
-    true_seconds: (m,) times of the true errors: all exposures, since a sheet that holds without a
-        fingertip has an error too.
-    arcs_m: (m, 2) arc lengths around the object of the true sheet and the true finger.
+    seconds: (n,) times of the measured errors since the start of the stroke: exposures with a valid
+    fingertip. true_seconds: (m,) times of the true errors: all exposures, since a sheet without a
+    fingertip also has an error. arcs_m: (m, 2) arc lengths around the object of the true sheet and
+    the true finger.
     """
 
     seconds: Floats
@@ -470,58 +483,63 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """Return begin and end of a stroke, ns; ExperimentError if the bag does not have it."""
-    label = stroke_label(seconds)
-    if label not in recording.windows_ns:
-        have = ", ".join(recording.windows_ns) or "none"
-        raise ExperimentError(f'the bag has no finger path "{label}"; it has: {have}')
-    zero_ns, end_ns = recording.windows_ns[label]
+    """Return the start and end of a stroke, ns. Raises ExperimentError if it is not in the bag."""
+    windows = recording.windows_ns
+    zero_ns, end_ns = find_recorded(windows, "finger path", stroke_label(seconds))
     begin_s, finish_s = stroke_window_s(seconds)
     return zero_ns + round(begin_s * 1e9), min(zero_ns + round(finish_s * 1e9), end_ns)
 
 
 def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
-    """Return the errors at each exposure of a stroke; ExperimentError if the bag lacks it."""
+    """Compute the errors at each exposure of a stroke. Raises ExperimentError if it is missing."""
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
-    def in_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    def select_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
         keep = (times >= begin_ns) & (times <= finish_ns)
         for edges in (*recording.measured_edges, *recording.true_edges, recording.finger):
             keep &= edges.covers(times)
         return times[keep]
 
     times, exposures = (
-        in_stroke(motion.times_ns) for motion in (recording.fingertip, recording.finger)
+        select_stroke(motion.times_ns) for motion in (recording.fingertip, recording.finger)
     )
     if len(times) < 10:
         label = stroke_label(seconds)
-        raise ExperimentError(f'only {len(times)} fingertips were recorded during "{label}"')
+        raise ExperimentError(
+            f'the bag contains {len(times)} fingertips of "{label}", at least 10 are required'
+        )
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
     true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, exposures)
     smooth = smooth_motion(recording.measured, times)
     world_from_object = object_pose(scene)
-    true_points = recording.finger.at(times)
+    true_points = recording.finger.interpolate(times)
     return StrokeErrors(
         seconds=np.asarray((times - begin_ns) * 1e-9, dtype=np.float64),
         delta_d_m=delta_d,
         delta_theta_rad=delta_theta,
-        smoother_m=tangential_distance(scene, world_from_object, smooth.at(times), true_points),
-        fingertip_m=np.linalg.norm(recording.fingertip.at(times) - true_points, axis=1),
+        smoother_m=tangential_distance(
+            scene, world_from_object, smooth.interpolate(times), true_points
+        ),
+        fingertip_m=np.linalg.norm(recording.fingertip.interpolate(times) - true_points, axis=1),
         true_seconds=np.asarray((exposures - begin_ns) * 1e-9, dtype=np.float64),
         true_delta_d_m=true_d,
         true_delta_theta_rad=true_theta,
-        arcs_m=arcs(scene, recording.true_edges, exposures, recording.finger.at(exposures)),
+        arcs_m=compute_arcs(
+            scene, recording.true_edges, exposures, recording.finger.interpolate(exposures)
+        ),
     )
 
 
-def arcs(
+def compute_arcs(
     scene: Scene,
     edges: tuple[SampledMotion, SampledMotion],
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return arc lengths (n, 2) m around the cylinder of the presented line and of the points."""
+    """Return arc lengths (n, 2) m around the cylinder of the sheet's contact line and of the
+    points.
+    """
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
     _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])
@@ -532,7 +550,7 @@ def arcs(
 def tangential_distance(
     scene: Scene, world_from_object: Floats, points: Floats, others: Floats
 ) -> Floats:
-    """Return the distances (n,) of the cylinder points nearest to `points` and `others` (n, 3)."""
+    """Return the distances (n,) m between the cylinder points nearest to two sets of points."""
     object_from_world = inverse(world_from_object)
     on_surface = []
     for array in (points, others):
@@ -544,11 +562,11 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """Return the lags of drawn contents at display, after prediction; None if unknown.
+    """Return the lags of drawn contents at display, after prediction, ms; None if unknown.
 
-    fingertip, sheet: the mark and the sheet's turn about the object, as drawn, against the true
-    ones, by the shift in time that makes them most alike.  object: the median age of the finger
-    that dents the drawn object, less what the solver predicted it by.
+    fingertip, sheet: lag of the drawn marker and of the sheet's rotation about the object behind
+    the true ones, by cross-correlation. object: median age of the finger that deforms the drawn
+    object, less the solver's prediction horizon.
     """
     span = stroke_span_ns(recording, seconds)
     world_from_object = object_pose(recording.scene)
@@ -557,22 +575,22 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
     def within(samples: list[tuple[int, Floats]]) -> list[tuple[int, Floats]]:
         return [sample for sample in samples if span[0] <= sample[0] <= span[1]]
 
-    def lag(
+    def measure_lag_ms(
         samples: list[tuple[int, Floats]], times_ns: NDArray[np.int64], truth: Floats
     ) -> float | None:
         if len(samples) < 20:
             return None
         drawn = make_motion(samples, "frame")
         inside = drawn.times_ns < times_ns[-1]
-        found = lag_s(
+        lag = estimate_lag_s(
             np.asarray((drawn.times_ns[inside] - span[0]) * 1e-9, dtype=np.float64),
             drawn.values[inside],
             truth,
             leader_times_s=np.asarray((times_ns - span[0]) * 1e-9, dtype=np.float64),
         )
-        return None if found is None else 1e3 * found
+        return None if lag is None else 1e3 * lag
 
-    def turns(normals: Floats) -> Floats:
+    def compute_arcs_m(normals: Floats) -> Floats:
         local = normals @ world_from_object[:3, :3]
         return np.asarray(radius * np.arctan2(local[:, 1], local[:, 2])[:, None])
 
@@ -581,24 +599,28 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
     _, angles = find_presented_points(
         recording.true_edges, world_from_object, true_ns, np.zeros(len(true_ns))
     )
-    sheet = [(time, turns(row[None, 3:])[0]) for time, row in within(recording.pictures.sheet)]
+    sheet = [
+        (time, compute_arcs_m(row[None, 3:])[0]) for time, row in within(recording.frames.sheet)
+    ]
     finger = recording.finger
-    dented = within(recording.pictures.dented)
+    ages = within(recording.frames.deformation_ages)
     return {
-        "fingertip": lag(within(recording.pictures.fingertip), finger.times_ns, finger.values),
-        "sheet": lag(sheet, true_ns, radius * angles),
-        "object": 1e3 * float(np.median([age[0] for _, age in dented])) if dented else None,
+        "fingertip": measure_lag_ms(
+            within(recording.frames.fingertip), finger.times_ns, finger.values
+        ),
+        "sheet": measure_lag_ms(sheet, true_ns, radius * angles),
+        "object": 1e3 * float(np.median([age[0] for _, age in ages])) if ages else None,
     }
 
 
 def stroke_result(
     recording: StrokeRecording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
-    """Return the figures of `experiment stroke --json` in mm, degrees and ms.
+    """Return the results of `experiment stroke --json`, in mm, degrees and ms.
 
     lag_ms: lag of the true sheet behind the true finger, by cross-correlation.
     """
-    lag = lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
+    lag = estimate_lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {
         "seconds": seconds,
         "valid_ratio": len(errors.seconds) / len(errors.true_seconds),
@@ -613,11 +635,11 @@ def stroke_result(
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
             "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
-            "exposure_to_frame": percentiles_ms(recording.delays_s.get("frame drawn", NOTHING)),
+            "exposure_to_frame": percentiles_ms(recording.delays_s.get("frame drawn", NO_VALUES)),
             "exposure_to_frame_begun": percentiles_ms(
-                recording.delays_s.get("frame begun", NOTHING)
+                recording.delays_s.get("frame begun", NO_VALUES)
             ),
-            "exposure_to_light": percentiles_ms(recording.delays_s.get("light", NOTHING)),
+            "exposure_to_light": percentiles_ms(recording.delays_s.get("light", NO_VALUES)),
         },
         "drops": recording.drops,
         "bag": str(bag),

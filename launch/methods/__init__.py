@@ -1,1 +1,1 @@
-"""Speed against accuracy of method families: measured, charted, and chosen for a scene."""
+"""Speed against accuracy of method families: measurement, charts, and choice for a scene."""

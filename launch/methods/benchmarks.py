@@ -1,4 +1,4 @@
-"""Make the method families whose reference is the simulator; only launch may import both."""
+"""Method families whose reference is the simulator; only launch may import both."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexsheet.launch.calibration.simulated_sheet import twin_errors, twin_force, twin_points
+from flexsheet.launch.calibration.simulated_sheet import (
+    make_error_function,
+    simulate_force,
+    simulate_points,
+)
 from flexsheet.launch.experiments.stroke import stroke_path
 from flexsheet.messages.scene import Cylinder, Scene
 from flexsheet.messages.types import FingerPath
@@ -19,24 +23,26 @@ from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_t
 from flexsheet.nodes.twin.finger import FingerMotion
 from flexsheet.nodes.twin.gestures import GESTURES
 
-CORRECTION = correction_family(twin_errors)
-QUICK_CORRECTION = correction_family(twin_errors, solved=False)
+CORRECTION = correction_family(make_error_function)
+QUICK_CORRECTION = correction_family(make_error_function, solved=False)
 
 TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
 RESTING = ("hold",)
 
 
-def finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
-    """Return motions of the simulated finger: gestures, and the paper's stroke on a cylinder."""
+def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
+    """Make motions of the simulated finger: gestures, and the paper's stroke on a cylinder."""
     paths: dict[str, FingerPath] = {}
     if isinstance(scene.object.geometry, Cylinder):
         paths["stroke"] = stroke_path(scene, 10.0)
     paths |= {name: GESTURES[name](scene) for name in TRACKED_GESTURES}
-    return {name: _motion(scene, path, resting=name in RESTING) for name, path in paths.items()}
+    return {
+        name: _make_motion(scene, path, resting=name in RESTING) for name, path in paths.items()
+    }
 
 
-def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
-    """Make the motion on a path with wander and tremor, from the path's first point on."""
+def _make_motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
+    """Make a finger motion with drift and tremor from the path's first point on."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
         0.0,
@@ -53,10 +59,12 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
     )
 
 
-TRACKING = make_tracking_family(finger_motions)
-true_force = lru_cache(maxsize=1024)(twin_force)
-SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_compute(scene, None))
-SHEET_LAWS = sheet_force_family(true_force, None)
-"""The methods without a long computation."""
-SHEET_SHAPE = sheet_shape_family(twin_points)
-QUICK_SHAPE = sheet_shape_family(twin_points, solved=False)
+TRACKING = make_tracking_family(make_finger_motions)
+compute_true_force = lru_cache(maxsize=1024)(simulate_force)
+SHEET_FORCE = sheet_force_family(
+    compute_true_force, lambda scene: force_table.load_or_compute(scene, None)
+)
+SHEET_LAWS = sheet_force_family(compute_true_force, None)
+"""Methods without a long computation."""
+SHEET_SHAPE = sheet_shape_family(simulate_points)
+QUICK_SHAPE = sheet_shape_family(simulate_points, solved=False)

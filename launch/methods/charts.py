@@ -1,4 +1,4 @@
-"""Measure speed and accuracy of a method family on this machine and a scene, and draw them."""
+"""Measure speed and accuracy of a method family on this machine and a scene, and draw charts."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FAMILIES: dict[str, str] = {
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Families by their name on the command line, as `module:NAME`."""
+"""Method families by their name on the command line, as `module:NAME`."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0
@@ -45,24 +45,26 @@ TITLE_WIDTH = 95
 
 
 class UnknownFamilyError(FlexsheetError, KeyError):
-    """Raised for an unknown family name; the text suggests the nearest one."""
+    """Raised for an unknown family name."""
 
     code = "unknown-family"
-    remedy = "Choose one of the names in the text (`flexsheet chart --help`)."
+    remedy = "Use one of the names that the error lists (`flexsheet chart --help`)."
 
 
-def family_named(name: str) -> Family:
-    """Return the family of that name; raises UnknownFamilyError with the nearest name."""
+def find_family(name: str) -> Family:
+    """Return the family of that name. Raises UnknownFamilyError."""
     if name not in FAMILIES:
         near = get_close_matches(name, FAMILIES, n=1)
-        hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
+        hint = (
+            f'; did you mean "{near[0]}"?' if near else f"; known families: {', '.join(FAMILIES)}"
+        )
         raise UnknownFamilyError(f'unknown family "{name}"{hint}')
     return load_family(FAMILIES[name])
 
 
-def load_family(place: str) -> Family:
+def load_family(path: str) -> Family:
     """Import the family at `module:NAME`."""
-    module_name, _, attribute = place.partition(":")
+    module_name, _, attribute = path.partition(":")
     family = getattr(import_module(module_name), attribute)
     assert isinstance(family, Family)
     return family
@@ -80,16 +82,16 @@ def measure_family(
     *,
     repeats: int = REPEATS,
     progress: Callable[[str], None] = lambda text: None,
-    wanted: Callable[[Trial], bool] = lambda trial: True,
+    select: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure all trials of the family that are wanted; report preparation and trials as progress.
+    """Measure all selected trials of the family, and report the progress.
 
-    Each trial is measured before the next is requested, since a family may then release its data.
+    Measures each trial before requesting the next, since a family may then release its data.
     """
-    family.prepare(scene, _with_time_left("computing the reference:", progress))
+    family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
     last_s = -math.inf
-    for trial in filter(wanted, family.trials(scene)):
+    for trial in filter(select, family.trials(scene)):
         if time.monotonic() - last_s >= PROGRESS_PERIOD_S:
             last_s = time.monotonic()
             progress(f"measuring {trial.method}, {len(points)} done")
@@ -97,8 +99,8 @@ def measure_family(
     return points
 
 
-def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Return a function that reports (done, total) with the time left, at intervals."""
+def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
+    """Make a function of (done, total) that periodically reports progress and remaining time."""
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
@@ -107,12 +109,12 @@ def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int
         left = f": {eta.text(done, total, now_s)}" if total else ""
         if now_s - last_s >= PROGRESS_PERIOD_S:
             last_s = now_s
-            progress(f"{what} {done} of {total}{left}")
+            progress(f"{prefix} {done} of {total}{left}")
 
     return report
 
 
-def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
+def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
     """Return the result that `chart FAMILY --json` prints."""
     return {
         "family": family.name,
@@ -130,19 +132,19 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
 
 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
-    """Draw error over time, logarithmic; a line is the Pareto front of one case.
+    """Draw error over time on logarithmic axes, with a line along the Pareto front of each case.
 
     A family with a `sweep_key` also gets diagrams of errors and extra metrics over that key, with a
     band of the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 
-    also = (
+    metrics = (
         []
         if result["sweep_key"] is None
         else sorted({k for p in result["points"] for k in p["extra_metrics"]})
     )
-    panels = 1 if result["sweep_key"] is None else 2 + len(also)
+    panels = 1 if result["sweep_key"] is None else 2 + len(metrics)
     with page_style():
         columns = min(panels, 2)
         rows = math.ceil(panels / columns)
@@ -151,21 +153,23 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
         for unused in others[panels - 1 :]:
             unused.remove()
         _draw_time(first, result)
-        for axes, name in zip(others, ["error", *also], strict=False):
+        for axes, name in zip(others, ["error", *metrics], strict=False):
             _draw_sweep(axes, result, name)
         save_svg(figure, path)
 
 
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
-    """Draw error over time; errors below 1e-4 of the tolerance (dashed) are rounding and drawn
-    there."""
+    """Draw error over time, with the tolerance as a dashed line.
+
+    Draws errors below 1e-4 of the tolerance, which are rounding errors, at that value.
+    """
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     min_error = 1e-4 * result["tolerance"]
     for index, method in enumerate(methods):
-        mine = [point for point in result["points"] if point["method"] == method]
+        own = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
             shown = [
-                point for point in mine if point["in_range"] == in_range and _has_reference(point)
+                point for point in own if point["in_range"] == in_range and _has_reference(point)
             ]
             if shown:
                 front = "" if method not in result["front"] else ", on the front"
@@ -175,7 +179,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
                     marker,
                     color=COLOURS[index % len(COLOURS)],
                     alpha=0.7,
-                    label=f"{method}{front if in_range else ' (out of its range)'}",
+                    label=f"{method}{front if in_range else ' (out of range)'}",
                 )
     for case in unique_cases(result["points"]):
         usable = [
@@ -193,7 +197,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
         ]
         if len(best) > 1:
             axes.step(*zip(*best, strict=True), where="post", color=INK, alpha=0.4, linewidth=0.8)
-    axes.axhline(result["tolerance"], linestyle="--", color=INK, label="the scene's tolerance")
+    axes.axhline(result["tolerance"], linestyle="--", color=INK, label="tolerance of the scene")
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("time per call, µs (median)")
@@ -205,9 +209,11 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 
 
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
-    """Draw a metric over the sweep key, a line for each method; markers out of range are hollow,
-    the reference's uncertainty is grey."""
-    along, points = result["sweep_key"], result["points"]
+    """Draw a metric over the sweep key, one line per method.
+
+    Markers out of range are hollow; the reference's uncertainty is grey.
+    """
+    key, points = result["sweep_key"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
         found: float | None = (
@@ -215,31 +221,31 @@ def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
         )
         return found
 
-    doubts = sorted(
+    uncertainties = sorted(
         {
-            p["case"][along]: p["reference_uncertainty"][name]
+            p["case"][key]: p["reference_uncertainty"][name]
             for p in points
             if name in p["reference_uncertainty"]
         }.items()
     )
-    if doubts:
-        at, doubt = zip(*doubts, strict=True)
-        low = [0.0 if name == "error" else -each for each in doubt]
+    if uncertainties:
+        x_values, limits = zip(*uncertainties, strict=True)
+        low = [0.0 if name == "error" else -each for each in limits]
         label = "uncertainty of the reference"
-        axes.fill_between(at, low, doubt, color=INK, alpha=0.12, linewidth=0, label=label)
+        axes.fill_between(x_values, low, limits, color=INK, alpha=0.12, linewidth=0, label=label)
     methods = list(dict.fromkeys(point["method"] for point in points))
     for index, method in enumerate(methods):
         shown = [
-            (point["case"][along], value(point), point["in_range"])
+            (point["case"][key], value(point), point["in_range"])
             for point in points
             if point["method"] == method and _is_finite(value(point))
         ]
         if not shown:
             continue
-        at, values, sure = zip(*sorted(shown), strict=True)
+        x_values, values, in_range = zip(*sorted(shown), strict=True)
         color = COLOURS[index % len(COLOURS)]
-        axes.plot(at, values, "-", color=color, alpha=0.6, label=method)
-        for x, y, inside in zip(at, values, sure, strict=True):
+        axes.plot(x_values, values, "-", color=color, alpha=0.6, label=method)
+        for x, y, inside in zip(x_values, values, in_range, strict=True):
             axes.plot(x, y, "o", color=color, markerfacecolor=color if inside else "none")
     if name == "error":
         axes.axhline(result["tolerance"], linestyle="--", color=INK)
@@ -249,7 +255,7 @@ def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     else:
         axes.axhline(0.0, color=INK, linewidth=0.8)
         axes.set_ylabel(name.replace("_", " "))
-    axes.set_xlabel(f"{along.replace('_', ' ')} (hollow: out of the method's range)")
+    axes.set_xlabel(f"{key.replace('_', ' ')} (hollow: out of range)")
     axes.grid(visible=True, alpha=0.2)
     axes.legend(fontsize=8)
 
@@ -259,12 +265,12 @@ def _is_finite(value: float | None) -> bool:
 
 
 def _has_reference(point: dict[str, Any]) -> bool:
-    """Return whether a reference gave the point's error."""
+    """Return whether the reference determined the point's error."""
     return _is_finite(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the distinct cases of points in their order."""
+    """Return the distinct cases of points, in order."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -273,22 +279,22 @@ def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
-    """Write figure and numbers of a chart; return both paths."""
+    """Write the figure and results of a chart to a folder; return both paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
-    draw_chart(result, picture)
+    image, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
+    draw_chart(result, image)
     write_file(numbers, json.dumps(replace_non_finite(result), indent=1) + "\n")
-    return picture, numbers
+    return image, numbers
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the charts of a folder, in the order of the table of families."""
-    kept = [folder / f"{name}.json" for name in FAMILIES]
-    return [_add_missing_keys(json.loads(path.read_text())) for path in kept if path.exists()]
+    """Read the charts of a folder, in the order of `FAMILIES`."""
+    paths = [folder / f"{name}.json" for name in FAMILIES]
+    return [_add_missing_keys(json.loads(path.read_text())) for path in paths if path.exists()]
 
 
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
-    """Add the keys that results of earlier versions lack."""
+    """Add the keys that results of earlier versions do not contain."""
     points = [
         {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
     ]
@@ -296,7 +302,7 @@ def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_overview(folder: Path) -> Path:
-    """Write one page of all charts in the folder; return its path."""
+    """Write an overview page of all charts in the folder; return its path."""
     path = folder / OVERVIEW
     write_file(path, "\n".join(_overview_lines(folder)) + "\n")
     return path
@@ -324,7 +330,7 @@ def _overview_lines(folder: Path) -> Iterator[str]:
         yield "|---|---|---|---|---|"
         yield from map(_overview_row, summarize_methods(result["points"]))
         yield ""
-        # benchmarks of the same methods leave theirs as FAMILY-WHAT
+        # Benchmarks of the same methods write their charts as FAMILY-NAME.
         for more in sorted(folder.glob(f"{name}-*.svg")):
             if more.stem not in FAMILIES:
                 yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
@@ -335,14 +341,14 @@ def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):
-        mine = [point for point in points if point["method"] == method]
-        inside = [point for point in mine if point["in_range"] and _has_reference(point)]
+        own = [point for point in points if point["method"] == method]
+        inside = [point for point in own if point["in_range"] and _has_reference(point)]
         rows.append(
             {
                 "method": method,
-                "median_s": max(point["median_s"] for point in inside or mine),
+                "median_s": max(point["median_s"] for point in inside or own),
                 "error": max((point["error"] for point in inside), default=None),
-                "cases": len(mine),
+                "cases": len(own),
                 "inside": len(inside),
                 "front": method in front,
             }
@@ -354,11 +360,11 @@ def _overview_row(row: dict[str, Any]) -> str:
     error = "–" if row["error"] is None else f"{row['error']:.3g}"
     cases = f"{row['inside']} of {row['cases']}"
     front = "yes" if row["front"] else ""
-    return f"| {row['method']} | {duration(row['median_s'])} | {error} | {cases} | {front} |"
+    return f"| {row['method']} | {format_duration(row['median_s'])} | {error} | {cases} | {front} |"
 
 
-def duration(seconds: float) -> str:
-    """Format a duration for people: 12 µs, 3.4 ms, 1.2 s."""
+def format_duration(seconds: float) -> str:
+    """Format a duration with a unit: 12 µs, 3.4 ms, 1.2 s."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"

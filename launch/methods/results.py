@@ -1,4 +1,4 @@
-"""Describe the machine that a result was measured on, and make results valid JSON."""
+"""Describe the machine of a measurement, and convert results to valid JSON."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 CPU_INFO = Path("/proc/cpuinfo")
 
 MAX_LOAD_PER_CORE = 0.5
-"""Load above which other processes make timings unreliable."""
+"""Maximum load per core at which timings are reliable."""
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Return a value with None for NaN and infinity, which JSON lacks."""
+    """Return a value with None for NaN and infinity, which JSON does not support."""
     if isinstance(value, dict):
         return {key: replace_non_finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -26,7 +26,7 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def machine_name() -> str:
-    """Return processor, cores and Python version in one line."""
+    """Return the processor, number of cores and Python version in one line."""
     name = platform.processor() or platform.machine()
     if CPU_INFO.exists():
         lines = [line for line in CPU_INFO.read_text().splitlines() if "model name" in line]
@@ -40,6 +40,6 @@ def describe_load() -> str | None:
     if load <= MAX_LOAD_PER_CORE * cores:
         return None
     return (
-        f"this machine is busy (load {load:.1f} on {cores} cores): the times are too long, and the "
-        "order of the methods by time may be wrong; measure again on an idle machine"
+        f"other processes load this computer ({load:.1f} on {cores} cores), so times are too long "
+        "and may rank methods wrongly; repeat the measurement on an idle computer"
     )

@@ -1,4 +1,4 @@
-"""Save figures as SVG that suits light and dark pages."""
+"""Save figures as SVG for light and dark pages."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from flexsheet.messages.files import write_file
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INK, INK_IN_THE_DARK = "#1f2328", "#e6edf3"
-"""Colours of axes and text, on white and on black."""
+INK, DARK_INK = "#1f2328", "#e6edf3"
+"""Colours of axes and text on white and on black."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""Colours for people with any colour vision (Okabe and Ito), on white and on black."""
+"""Colours that are distinct with colour vision deficiency, on white and black (Okabe and Ito)."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,
@@ -33,14 +33,14 @@ _STYLE: dict[Any, Any] = {
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
-    # Equal figures have equal bytes.
+    # A fixed salt makes equal figures equal in bytes.
     "svg.hashsalt": "flexsheet",
 }
 
 _DARK = f"""<style>
 @media (prefers-color-scheme: dark) {{
- [style*="stroke: {INK}"] {{ stroke: {INK_IN_THE_DARK} !important; }}
- [style*="fill: {INK}"] {{ fill: {INK_IN_THE_DARK} !important; }}
+ [style*="stroke: {INK}"] {{ stroke: {DARK_INK} !important; }}
+ [style*="fill: {INK}"] {{ fill: {DARK_INK} !important; }}
 }}
 </style>
 """
@@ -48,7 +48,7 @@ _DARK = f"""<style>
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Give figures made within the colours that `save_svg` can replace on dark pages."""
+    """Set a figure style with colours that `save_svg` can replace on dark pages."""
     import matplotlib as mpl
     from matplotlib.rcsetup import cycler
 
@@ -58,10 +58,10 @@ def page_style() -> Iterator[None]:
 
 
 def render_svg(figure: Figure) -> str:
-    """Return the figure as SVG with a transparent background and light ink on dark pages."""
-    drawn = StringIO()
-    figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
-    head, tag, rest = drawn.getvalue().partition("<defs>")
+    """Return the figure as SVG with a transparent background, and light ink on dark pages."""
+    text = StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    head, tag, rest = text.getvalue().partition("<defs>")
     return f"{head}{_DARK}{tag}{rest}"
 
 

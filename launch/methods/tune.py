@@ -1,8 +1,8 @@
 """Measure methods for a scene, choose the fastest sufficient ones, and write them into the scene.
 
-Each family is measured on this machine over the scene's working range.  A method is sufficient if
+Each family is measured on this machine over the scene's working range. A method is sufficient if
 its stated range contains the working range and its maximum error keeps a margin to the scene's
-tolerance.  Without a sufficient method, the nearest miss is chosen and reported.
+tolerance. Without a sufficient method, the nearest miss is chosen and reported.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from flexsheet.launch.methods.charts import duration, git_commit, load_family, measure_family
+from flexsheet.launch.methods.charts import format_duration, git_commit, load_family, measure_family
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
@@ -33,29 +33,31 @@ from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""Fraction of a tolerance that must remain, for errors outside the measurements."""
+"""Fraction of a tolerance reserved for errors outside the measurements."""
 TIE_RATIO = 1.1
-"""Methods up to this factor slower than the fastest count as equally fast; the most exact is
-chosen."""
+"""Maximum ratio to the fastest time at which a method counts as equally fast.
+
+Of equally fast methods the most accurate is chosen.
+"""
 
 Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
 Setting = str | dict[str, Any]
 
 
 class UnknownTunableError(FlexsheetError, KeyError):
-    """Raised for a family without a choice in scenes; the text lists the others."""
+    """Raised for a family that scenes cannot choose methods of."""
 
     code = "unknown-tunable"
-    remedy = "Choose one of the names in the text (docs/tune.md)."
+    remedy = "Use one of the names that the error lists (docs/tune.md)."
 
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """Describe a family among whose methods a scene can choose.
+    """Method family that a scene can choose from.
 
-    key: in a scene's `methods`.  families: as `module:NAME`, measured in order; later ones take
-    minutes to prepare and are measured only if no earlier method is sufficient.  settings: the
-    scene's value for each method, by the method's name in the chart.
+    key: in a scene's `methods`. families: as `module:NAME`, in the order of measurement. Later ones
+    take minutes to prepare and are measured only if no earlier method is sufficient. settings:
+    value in the scene for each method, by the method's name in the chart.
     """
 
     name: str
@@ -64,11 +66,11 @@ class Tunable:
     settings: Mapping[str, Setting]
 
 
-def _by_name(*names: str) -> dict[str, Setting]:
+def _make_settings(*names: str) -> dict[str, Setting]:
     return {name: name for name in names}
 
 
-def _soft_body(method: str, skin_spacing_m: float) -> Setting:
+def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
     return {"method": method, "skin_spacing_m": skin_spacing_m}
 
 
@@ -77,19 +79,21 @@ TUNABLES = (
         "marker",
         "marker",
         ("flexsheet.nodes.triangulator.benchmarks:MARKER",),
-        _by_name("moments", "weighted_centroid", "subpixel_fit"),
+        _make_settings("moments", "weighted_centroid", "subpixel_fit"),
     ),
     Tunable(
         "triangulation",
         "triangulation",
         ("flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",),
-        _by_name("dlt"),
+        _make_settings("dlt"),
     ),
     Tunable(
         "tracking",
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
+        _make_settings(
+            "none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"
+        ),
     ),
     Tunable(
         "sheet-force",
@@ -98,7 +102,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:SHEET_LAWS",
             "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
         ),
-        _by_name("linear", "scaled", "table"),
+        _make_settings("linear", "scaled", "table"),
     ),
     Tunable(
         "sheet-shape",
@@ -107,7 +111,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:QUICK_SHAPE",
             "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
         ),
-        _by_name("four_triangles", "reduced_order"),
+        _make_settings("four_triangles", "reduced_order"),
     ),
     Tunable(
         "correction",
@@ -116,7 +120,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION",
             "flexsheet.launch.methods.benchmarks:CORRECTION",
         ),
-        _by_name("none", "one_plane", "four_triangles", "two_pass"),
+        _make_settings("none", "one_plane", "four_triangles", "two_pass"),
     ),
     Tunable(
         "soft-body",
@@ -126,41 +130,39 @@ TUNABLES = (
             "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
         ),
         {
-            "linear, coarse": _soft_body("linear", 0.006),
-            "linear, medium": _soft_body("linear", 0.0045),
-            "linear, fine": _soft_body("linear", 0.003),
-            "nonlinear table, medium": _soft_body("nonlinear_table", 0.0045),
+            "linear, coarse": _make_soft_body("linear", 0.006),
+            "linear, medium": _make_soft_body("linear", 0.0045),
+            "linear, fine": _make_soft_body("linear", 0.003),
+            "nonlinear table, medium": _make_soft_body("nonlinear_table", 0.0045),
         },
     ),
 )
-"""In the order of tuning: the correction depends on the chosen sheet shape."""
+"""Families in the order of tuning, since the correction depends on the chosen sheet shape."""
 
-TWO_PASS_ONTO = {
+TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""Name of the two-pass correction in the chart, by the sheet's shape."""
+"""Names of the two-pass correction in the chart, by sheet shape."""
 
 
-def tunables_named(names: Sequence[str]) -> list[Tunable]:
-    """Return the named tunables in the order of `TUNABLES`, or all; raises UnknownTunableError."""
+def find_tunables(names: Sequence[str]) -> list[Tunable]:
+    """Return the tunables with these names, or all of them, in the order of `TUNABLES`."""
     known = [one.name for one in TUNABLES]
     for name in names:
         if name not in known:
-            raise UnknownTunableError(
-                f'no node takes a choice of "{name}"; {did_you_mean(name, known)}'
-            )
+            raise UnknownTunableError(f'unknown family "{name}"; {did_you_mean(name, known)}')
     return [one for one in TUNABLES if not names or one.name in names]
 
 
 @dataclass(frozen=True, slots=True)
 class MethodEvaluation:
-    """Hold the evaluation of one method over a scene's working range.
+    """Evaluation of one method over a scene's working range.
 
-    median_s: time of a call, median over the cases.  slowest_s: of the slowest case.  error: the
-    maximum within the method's range, at `worst_case`; infinite without one.  outside: cases out of
-    the method's range.  wrong: cases whose error exceeds the tolerance less its margin, or has no
-    reference.
+    median_s: median over the cases of the time per call. slowest_s: maximum over the cases. error:
+    maximum within the method's range, at `worst_case`; infinite without a reference. outside: cases
+    out of the method's range. wrong: cases with an error above the tolerance less its margin, or
+    without a reference.
     """
 
     method: str
@@ -184,14 +186,14 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Hold the chosen method of a family and the evaluations of all."""
+    """Chosen method of a family, with the evaluations of all methods."""
 
     family: str
     key: str
     unit: str
     tolerance: float
     chosen: MethodEvaluation
-    judged: tuple[MethodEvaluation, ...]
+    evaluations: tuple[MethodEvaluation, ...]
 
     @property
     def met(self) -> bool:
@@ -202,31 +204,34 @@ class Choice:
         """Return the remaining fraction of the tolerance; negative if it is exceeded."""
         return 1.0 - self.chosen.error / self.tolerance
 
-    def sentence(self) -> str:
+    def explain(self) -> str:
         """Return the reason for the choice in one sentence."""
         one, unit = self.chosen, self.unit
-        allowed = f"{_figure(self.tolerance)} {unit}"
-        took = duration(one.median_s)
+        allowed = f"{_format(self.tolerance)} {unit}"
+        took = format_duration(one.median_s)
         if not self.met:
-            near = f"the nearest is {one.method} ({took}): {one.missed} of {one.cases} cases missed"
-            return f"{self.family}: no method keeps {allowed}; {near}, {self._shortfall(one)}"
-        cheaper = [other for other in self.judged if other.median_s * TIE_RATIO < one.median_s]
-        rest = "nothing is cheaper"
+            near = f"best is {one.method} ({took}), outside in {one.missed} of {one.cases} cases"
+            fault = self._describe_fault(one)
+            return f"{self.family}: no method meets the tolerance {allowed}; {near}: {fault}"
+        cheaper = [other for other in self.evaluations if other.median_s * TIE_RATIO < one.median_s]
+        rest = "no method is faster"
         if cheaper:
             nearest = min(cheaper, key=_miss_key)
-            rest = f"{nearest.method} is cheaper ({duration(nearest.median_s)}), but "
-            rest += self._shortfall(nearest)
-        left = f"{one.method} ({took}) leaves {_figure(one.error)} of {allowed} allowed"
+            rest = f"{nearest.method} is faster ({format_duration(nearest.median_s)}), but "
+            rest += self._describe_fault(nearest)
+        left = f"{one.method} ({took}), error {_format(one.error)}, tolerance {allowed}"
         return f"{self.family}: {left}; {rest}"
 
-    def _shortfall(self, one: MethodEvaluation) -> str:
-        """Return why a method is not sufficient."""
+    def _describe_fault(self, one: MethodEvaluation) -> str:
+        """Return the reason why a method is not sufficient."""
         parts = []
         if one.wrong:
-            error = f"{_figure(one.error)} {self.unit} at {_case(one.worst_case)}"
-            parts.append(f"leaves {error}" if math.isfinite(one.error) else "has no reference")
+            error = f"{_format(one.error)} {self.unit} at {_format_case(one.worst_case)}"
+            parts.append(
+                f"its error is {error}" if math.isfinite(one.error) else "it has no reference"
+            )
         if one.outside:
-            parts.append(f"is out of its range at {_case(one.outside[0])}")
+            parts.append(f"it is out of range at {_format_case(one.outside[0])}")
         return " and ".join(parts)
 
     def report(self) -> dict[str, Any]:
@@ -241,18 +246,18 @@ class Choice:
             "met": self.met,
             "error": self.chosen.error,
             "spare_ratio": self.spare_ratio,
-            "sentence": self.sentence(),
-            "judged": [asdict(one) for one in self.judged],
+            "sentence": self.explain(),
+            "judged": [asdict(one) for one in self.evaluations],
         }
 
 
-def _figure(value: float) -> str:
+def _format(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _case(case: Mapping[str, Any]) -> str:
+def _format_case(case: Mapping[str, Any]) -> str:
     parts = (
-        f"{name} {_figure(value) if isinstance(value, float) else value}"
+        f"{name} {_format(value) if isinstance(value, float) else value}"
         for name, value in case.items()
         if name not in ("width_px", "height_px")
     )
@@ -266,44 +271,44 @@ def evaluate_methods(
     tolerance: float,
     margin: float = MARGIN,
 ) -> list[MethodEvaluation]:
-    """Evaluate each method of `settings` over the scene's own cases."""
-    allowed, found = (1.0 - margin) * tolerance, []
+    """Evaluate each method of `settings` over the cases within the scene."""
+    allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
-        mine = [point for point in points if point.method == method and point.in_scene]
-        if not mine:
+        own = [point for point in points if point.method == method and point.in_scene]
+        if not own:
             continue
-        inside = [point for point in mine if point.in_range]
-        sure = [point for point in inside if math.isfinite(point.error)]
-        worst = max(sure, key=lambda point: point.error, default=mine[0])
-        times = sorted(point.median_s for point in mine)
-        found.append(
+        inside = [point for point in own if point.in_range]
+        valid = [point for point in inside if math.isfinite(point.error)]
+        worst = max(valid, key=lambda point: point.error, default=own[0])
+        times = sorted(point.median_s for point in own)
+        evaluations.append(
             MethodEvaluation(
                 method=method,
                 setting=setting,
                 median_s=times[len(times) // 2],
                 slowest_s=times[-1],
-                error=worst.error if sure else math.inf,
+                error=worst.error if valid else math.inf,
                 worst_case=worst.case,
-                cases=len(mine),
-                outside=tuple(point.case for point in mine if not point.in_range),
+                cases=len(own),
+                outside=tuple(point.case for point in own if not point.in_range),
                 wrong=tuple(point.case for point in inside if not point.error <= allowed),
             )
         )
-    return found
+    return evaluations
 
 
-def choose(judged: Sequence[MethodEvaluation]) -> MethodEvaluation:
+def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
     """Return the fastest method that meets the tolerance everywhere, else the nearest miss."""
-    enough = [one for one in judged if one.meets]
-    if not enough:
-        return min(judged, key=_miss_key)
-    quickest = min(one.median_s for one in enough)
-    same = [one for one in enough if one.median_s <= TIE_RATIO * quickest]
-    return min(same, key=lambda one: (one.error, one.median_s))
+    sufficient = [one for one in evaluations if one.meets]
+    if not sufficient:
+        return min(evaluations, key=_miss_key)
+    fastest_s = min(one.median_s for one in sufficient)
+    equal = [one for one in sufficient if one.median_s <= TIE_RATIO * fastest_s]
+    return min(equal, key=lambda one: (one.error, one.median_s))
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key for methods that miss; cases out of range weigh most."""
+    """Return a sort key for insufficient methods; cases out of range come first."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -312,23 +317,24 @@ def tune(
     tunables: Sequence[Tunable],
     *,
     margin: float = MARGIN,
-    measured: Measure | None = None,
+    measure: Measure | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure and choose for each family in order; `measured` replaces the measurement in tests.
+    """Measure and choose for each family in order.
 
-    Raises the errors of a family that cannot handle the scene's shape, mesh or sheet.
+    measure: replaces the measurement in tests. Raises the errors of a family that does not support
+    the scene's shape, mesh or sheet.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
     for number, tunable in enumerate(tunables, start=1):
-        told = partial(_report, progress, f"{tunable.name} ({number} of {len(tunables)})")
+        report = partial(_report, progress, f"{tunable.name} ({number} of {len(tunables)})")
         settings = dict(tunable.settings)
         if tunable.name == "correction":
             settings.pop("two_pass")
-            settings[TWO_PASS_ONTO[shape]] = "two_pass"
+            settings[TWO_PASS_NAMES[shape]] = "two_pass"
         choice = _tune_family(
-            scene, tunable, settings, margin=margin, measured=measured, progress=told
+            scene, tunable, settings, margin=margin, measure=measure, progress=report
         )
         if tunable.name == "sheet-shape":
             shape = choice.chosen.method
@@ -346,13 +352,13 @@ def _tune_family(
     settings: Mapping[str, Setting],
     *,
     margin: float,
-    measured: Measure | None,
+    measure: Measure | None,
     progress: Callable[[str], None],
 ) -> Choice:
-    judged: list[MethodEvaluation] = []
-    for place in tunable.families:
-        family = load_family(place)
-        known = {one.method for one in judged}
+    evaluations: list[MethodEvaluation] = []
+    for path in tunable.families:
+        family = load_family(path)
+        known = {one.method for one in evaluations}
         left = {
             name: setting
             for name, setting in settings.items()
@@ -361,21 +367,25 @@ def _tune_family(
         if not left:
             continue
         progress(", ".join(left))
-        wanted = partial(_is_wanted, left)
-        if measured is not None:
-            points = measured(family, scene, wanted)
+        select = partial(_is_selected, left)
+        if measure is not None:
+            points = measure(family, scene, select)
         else:
             points = measure_family(
-                family, scene, repeats=REPEATS, progress=progress, wanted=wanted
+                family, scene, repeats=REPEATS, progress=progress, select=select
             )
-        judged += evaluate_methods(points, left, tolerance=family.tolerance(scene), margin=margin)
-        if any(one.meets for one in judged):
+        evaluations += evaluate_methods(
+            points, left, tolerance=family.tolerance(scene), margin=margin
+        )
+        if any(one.meets for one in evaluations):
             break
     tolerance = family.tolerance(scene)
-    return Choice(tunable.name, tunable.key, family.unit, tolerance, choose(judged), tuple(judged))
+    return Choice(
+        tunable.name, tunable.key, family.unit, tolerance, choose(evaluations), tuple(evaluations)
+    )
 
 
-def _is_wanted(methods: Mapping[str, Setting], trial: Trial) -> bool:
+def _is_selected(methods: Mapping[str, Setting], trial: Trial) -> bool:
     return trial.in_scene and trial.method in methods
 
 
@@ -387,22 +397,24 @@ def insert_choices(
 ) -> str:
     """Return a scene file's text with these choices in its `methods`.
 
-    All other text keeps its bytes, also the methods of other families.  A `methods` on one line is
-    expanded to several.
+    All other text is unchanged, including the methods of other families. A `methods` mapping on one
+    line is expanded to several lines.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
-    block = _block(text, lines)
+    block = _find_block(text, lines)
     chosen = {choice.key: choice for choice in choices}
     code = "" if commit is None else f"; code {commit[:10]}"
     head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}.{ending}"
     new = [head, block.header or f"{METHODS}:{ending}"]
     for key, own in block.parts:
         if key in chosen:
-            new.append(_line(chosen.pop(key), block.indent) + ending)
+            new.append(_make_line(chosen.pop(key), block.indent) + ending)
         else:
             new += [line if line.endswith("\n") else line + ending for line in own]
-    new += [_line(chosen[one.key], block.indent) + ending for one in TUNABLES if one.key in chosen]
+    new += [
+        _make_line(chosen[one.key], block.indent) + ending for one in TUNABLES if one.key in chosen
+    ]
     before, after = lines[: block.start], lines[block.end :]
     if before and not before[-1].endswith("\n"):
         before[-1] += ending
@@ -411,23 +423,26 @@ def insert_choices(
     return "".join([*before, *new, *after])
 
 
-def _line(choice: Choice, indent: str) -> str:
+def _make_line(choice: Choice, indent: str) -> str:
     setting = choice.chosen.setting
-    took, allowed = duration(choice.chosen.median_s), f"{_figure(choice.tolerance)} {choice.unit}"
-    comment = f"{took}, leaves {_figure(choice.chosen.error)} of {allowed}"
+    took, allowed = (
+        format_duration(choice.chosen.median_s),
+        f"{_format(choice.tolerance)} {choice.unit}",
+    )
+    comment = f"{took}, error {_format(choice.chosen.error)}, tolerance {allowed}"
     if not choice.met:
-        missed = f"{choice.chosen.missed} of {choice.chosen.cases} cases missed"
-        comment = f"NOT GOOD ENOUGH, the nearest miss: {comment}; {missed}"
-    return f"{indent}{choice.key}: {_flow(setting)}  # {comment}"
+        missed = f"outside in {choice.chosen.missed} of {choice.chosen.cases} cases"
+        comment = f"INSUFFICIENT: {comment}; {missed}"
+    return f"{indent}{choice.key}: {_format_flow(setting)}  # {comment}"
 
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Locate the `methods` in a scene file's lines.
+    """Position of `methods` in a scene file's lines.
 
-    start: first line, including the generated comment above.  end: line after the block; both are
-    the file's end without a block.  header: the line `methods:`, if it can stay.  parts: in order,
-    each family's key and lines, and comments with an empty key.
+    start: first line, including the generated comment above. end: line after the block; both are
+    the file's end without a block. header: the line `methods:`, if it can be reused. parts: each
+    family's key and lines in order; comments have an empty key.
     """
 
     start: int
@@ -437,7 +452,7 @@ class _Block:
     parts: tuple[tuple[str, list[str]], ...] = ()
 
 
-def _block(text: str, lines: Sequence[str]) -> _Block:
+def _find_block(text: str, lines: Sequence[str]) -> _Block:
     tree = YAML(typ="rt", pure=True).load(text)
     names = list(tree)
     if METHODS not in names:
@@ -453,24 +468,26 @@ def _block(text: str, lines: Sequence[str]) -> _Block:
     if not isinstance(inner, CommentedMap):
         return _Block(start, end, parts=(("", list(lines[first + 1 : end])),))
     if inner.fa.flow_style():
-        unfolded = ((name, [f"  {name}: {_flow(item)}"]) for name, item in inner.items())
+        unfolded = ((name, [f"  {name}: {_format_flow(item)}"]) for name, item in inner.items())
         return _Block(start, end, parts=tuple(unfolded))
-    at = {name: tuple(inner.lc.data[name][:2]) for name in inner}
-    starts = sorted(line for line, _ in at.values())
+    positions = {name: tuple(inner.lc.data[name][:2]) for name in inner}
+    starts = sorted(line for line, _ in positions.values())
     parts = [("", list(lines[first + 1 : starts[0]]))]
-    for name, (line, _) in sorted(at.items(), key=lambda item: item[1]):
+    for name, (line, _) in sorted(positions.items(), key=lambda item: item[1]):
         own = list(lines[line : min((one for one in starts if one > line), default=end)])
-        behind: list[str] = []
+        after: list[str] = []
         while len(own) > 1 and (not own[-1].strip() or own[-1].lstrip().startswith("#")):
-            behind.insert(0, own.pop())
-        parts += [(name, own), ("", behind)]
-    indent = " " * min(column for _, column in at.values())
+            after.insert(0, own.pop())
+        parts += [(name, own), ("", after)]
+    indent = " " * min(column for _, column in positions.values())
     return _Block(start, end, lines[first], indent, tuple(parts))
 
 
-def _flow(item: Any) -> str:
+def _format_flow(item: Any) -> str:
     if isinstance(item, Mapping):
-        return "{" + ", ".join(f"{name}: {_flow(value)}" for name, value in item.items()) + "}"
+        return (
+            "{" + ", ".join(f"{name}: {_format_flow(value)}" for name, value in item.items()) + "}"
+        )
     return "null" if item is None else str(item)
 
 
@@ -499,8 +516,8 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
         rest = lines[line][column:]
         old = next((one for one in (f'"{name}"', f"'{name}'", name) if rest.startswith(one)), None)
         if old is None:
-            what = f'names "{name}", which cannot be rewritten relative to {there}'
-            remedy = "give the absolute path, or --output a file in the scene's folder"
+            what = f'contains "{name}", which cannot be made relative to {there}'
+            remedy = "give the absolute path, or an --output file in the scene's folder"
             raise BadInputError([Problem(f"{source}:{line + 1}", key, what, remedy)])
         new = json.dumps(os.path.relpath(here / name, there), ensure_ascii=False)
         lines[line] = lines[line][:column] + new + rest[len(old) :]
@@ -508,7 +525,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """Check before the measurement that the target can be written; raises BadInputError."""
+    """Raise BadInputError if the target cannot be written; for a check before the measurement."""
     relocate_paths(_read(source), source, target)
     try:
         if target.is_dir():
@@ -531,7 +548,7 @@ def _write_problem(target: Path, error: OSError) -> BadInputError:
 
 
 def _read(source: Path) -> str:
-    return source.read_bytes().decode("utf-8")  # read_text would change how lines end
+    return source.read_bytes().decode("utf-8")  # read_text would change line endings
 
 
 def _draft_path(target: Path) -> Path:
@@ -541,8 +558,8 @@ def _draft_path(target: Path) -> Path:
 def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
     """Write the choices into a scene file or a copy of it, atomically.
 
-    A symbolic link stays; its target is written.  Raises BadInputError if the result would not be
-    the same scene, or the target cannot be written.
+    Preserves a symbolic link and writes its target. Raises BadInputError if the result would be
+    another scene, or the target cannot be written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
@@ -552,20 +569,20 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
         commit=git_commit(),
     )
     before = load_scene(source)
-    # The draft is in the target's folder, since a scene's paths are relative to its own.
-    place = target.resolve()
-    draft = _draft_path(place)
+    # Put the draft into the target's folder, since a scene's paths are relative to its own.
+    path = target.resolve()
+    draft = _draft_path(path)
     try:
         draft.write_bytes(text.encode())
         after = _load_draft(draft, source)
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
             problem = Problem(
-                str(source), (METHODS,), "would change with the choices", "edit it by hand"
+                str(source), (METHODS,), "would change with the choices", "edit the file manually"
             )
             raise BadInputError([problem])
-        shutil.copymode(place if place.exists() else source, draft)
-        draft.replace(place)
+        shutil.copymode(path if path.exists() else source, draft)
+        draft.replace(path)
     except OSError as error:
         raise _write_problem(target, error) from error
     finally:
@@ -573,11 +590,11 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
 
 
 def _load_draft(draft: Path, source: Path) -> Scene:
-    """Load the draft; name the source file in its problems."""
+    """Load the draft; attribute its problems to the source file."""
     try:
         return load_scene(draft)
     except BadInputError as error:
-        what = "with the choices put in, "
+        what = "with the choices inserted: "
         problems = [
             Problem(str(source), one.key, what + one.what, one.remedy) for one in error.problems
         ]

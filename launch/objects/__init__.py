@@ -1,1 +1,1 @@
-"""Read the meshes and textures of a scene's object."""
+"""Mesh and texture files of a scene's object."""

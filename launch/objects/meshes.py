@@ -1,10 +1,10 @@
 """Read, check and repair the mesh file of a scene.
 
-In a scene file an object may be given as
+A scene file may give an object as
 
-    geometry: {shape: mesh_file, file: liver.obj, metres_per_unit: 0.01}
+geometry: {shape: mesh_file, file: liver.obj, metres_per_unit: 0.01}
 
-with a path relative to the scene file.  The scene message contains the mesh itself.
+with a path relative to the scene file. The scene message contains the mesh itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from flexsheet.launch.objects.textures import put_image
+from flexsheet.launch.objects.textures import load_image
 from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Mesh, Positive, Scene
@@ -34,55 +34,57 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""Shapes of a scene file; a mesh is given as a file, not as arrays."""
+"""Shape names of scene files, in which a mesh is a file instead of arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
 """Plausible extents of an object; others are probably in another unit."""
 MAX_COORDINATE = 1e9
-"""Maximum coordinate in the file, in its unit; larger ones overflow in later computations."""
+"""Maximum coordinate in a mesh file, in its unit; larger ones overflow in later computations."""
 
 MAX_CUTTING_RATIO = 0.01
-"""Maximum number of intersecting triangle pairs over all triangles.  The smooth surface bridges
-fewer; more mean that the mesh is not one solid."""
+"""Maximum number of intersecting triangle pairs over the number of triangles.
+
+The smooth surface bridges fewer; a mesh with more is not one solid.
+"""
 
 
 class MeshFile(LimitedModel):
-    """Describe an object's geometry by a mesh file."""
+    """Geometry of an object as a mesh file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     shape: Literal["mesh_file"] = "mesh_file"
-    file: str = Field(description="STL or OBJ, relative to the scene file")
+    file: str = Field(description="STL or OBJ file, relative to the scene file")
     metres_per_unit: Annotated[
-        Positive, Field(description="the file's unit: 0.001 for millimetres, 0.01 for centimetres")
+        Positive, Field(description="unit of the file, m: 0.001 for millimetres")
     ]
     smoothing_m: Positive | None = Field(
-        default=None, description="null: the length that hides the facets"
+        default=None, description="smoothing length, m; null: hide the facets"
     )
 
 
 def make_scene(document: Document) -> Scene:
-    """Make the scene of a scene file, with the mesh that it names; raises BadInputError."""
-    name = _shape_name(document)
+    """Make the scene of a scene file, including its mesh. Raises BadInputError."""
+    name = _find_shape_name(document)
     if name is not None and name not in SHAPE_NAMES:
         what = f'unknown shape "{name}"'
         problem = document.problem((*GEOMETRY, "shape"), what, did_you_mean(name, SHAPE_NAMES))
         raise BadInputError([problem])
     if name == MESH_FILE:
-        asked = validate(MeshFile, document, at=GEOMETRY)
-        path = document.path.parent / asked.file
+        geometry = validate(MeshFile, document, at=GEOMETRY)
+        path = document.path.parent / geometry.file
         try:
-            mesh = read_mesh(path, asked.metres_per_unit, asked.smoothing_m)
+            mesh = read_mesh(path, geometry.metres_per_unit, geometry.smoothing_m)
         except MeshError as error:
-            problem = document.problem((*GEOMETRY, "file"), f'"{asked.file}": {error}')
+            problem = document.problem((*GEOMETRY, "file"), f'"{geometry.file}": {error}')
             raise BadInputError([problem]) from error
         document.values["object"]["geometry"] = dict(mesh)
-    put_image(document)
+    load_image(document)
     return validate(Scene, document)
 
 
-def _shape_name(document: Document) -> Any:
+def _find_shape_name(document: Document) -> Any:
     """Return the document's shape name, or None without one."""
     value: Any = document.values
     for key in (*GEOMETRY, "shape"):
@@ -91,25 +93,25 @@ def _shape_name(document: Document) -> Any:
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
-    """Read a closed mesh from a file, in metres; MeshError gives the reason if it is not one.
+    """Read a closed mesh from a file, in metres.
 
-    Repairs: merges vertices that are stored once per triangle; removes degenerate and repeated
-    triangles and unused vertices; unifies the winding and orients it outwards.  `Mesh.origin` lists
-    the repairs.  Holes and all else that `check_mesh` rejects raise MeshError.
+    Merges duplicate vertices, removes degenerate and duplicate triangles and unused vertices, and
+    orients the triangles outwards. `Mesh.origin` lists the repairs. Raises MeshError for holes and
+    other faults that `check_mesh` rejects.
     """
-    vertices, triangles, repairs = _repair(_read(path), metres_per_unit)
+    vertices, triangles, repairs = _repair(_load_trimesh(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
     if not MIN_EXTENT_M <= extent_m <= MAX_EXTENT_M:
         raise MeshError(
-            f"the object would be {extent_m:.3g} m wide; check metres_per_unit {metres_per_unit:g} "
+            f"the object is {extent_m:.3g} m wide; check metres_per_unit {metres_per_unit:g} "
             "(0.001 for millimetres, 0.01 for centimetres)"
         )
     check_mesh(vertices, triangles)
-    cutting = count_intersections(vertices, triangles)
-    if cutting > MAX_CUTTING_RATIO * len(triangles):
-        raise MeshError(f"the surface intersects itself in {cutting} pairs of triangles; repair it")
-    if cutting:
-        repairs.append(f"{cutting} intersecting pairs of triangles bridged")
+    crossings = count_intersections(vertices, triangles)
+    if crossings > MAX_CUTTING_RATIO * len(triangles):
+        raise MeshError(f"{crossings} pairs of triangles intersect; repair the mesh")
+    if crossings:
+        repairs.append(f"{crossings} intersecting pairs of triangles bridged")
     if smoothing_m is None:
         smoothing_m = default_smoothing_m(vertices, triangles)
     deviation_m = SmoothMeshShape(vertices, triangles, smoothing_m).deviation_m()
@@ -126,24 +128,26 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     )
 
 
-def _read(path: Path) -> Any:
-    """Read a file as a `trimesh.Trimesh` without changes; MeshError if it holds none."""
+def _load_trimesh(path: Path) -> Any:
+    """Read a file as an unchanged `trimesh.Trimesh`. Raises MeshError."""
     if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"is not a mesh file; convert it to {' or '.join(SUFFIXES)}")
+        raise MeshError(f"unsupported mesh format; convert the file to {' or '.join(SUFFIXES)}")
     try:
         size = path.stat().st_size
     except OSError as error:
         raise MeshError(f"cannot be read at {path}: {error.strerror}; check the path") from error
     if size > MAX_BYTES:
-        raise MeshError(f"has {size >> 20} MiB, at most {MAX_BYTES >> 20} are allowed; decimate it")
-    # Late, because only scenes with a mesh need it.
+        raise MeshError(
+            f"file size {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB; decimate the mesh"
+        )
+    # Import late, because only scenes with a mesh need it.
     import trimesh
 
     try:
         mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
-    # A file of any content makes it raise errors of many kinds.
+    # Invalid files raise errors of many types.
     except Exception as error:
-        raise MeshError(f"cannot be read as a mesh: {error}; export it again") from error
+        raise MeshError(f"invalid mesh file: {error}; export it again") from error
     faces = np.asarray(getattr(mesh, "faces", ()))
     if len(faces):
         _check_arrays(np.asarray(mesh.vertices), faces)
@@ -151,26 +155,26 @@ def _read(path: Path) -> Any:
 
 
 def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
-    """Raise MeshError for arrays that the library accepts though they are no mesh."""
+    """Raise MeshError for arrays that trimesh accepts although they are not a mesh."""
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
-        raise MeshError("its faces are not triangles of points in space; triangulate it")
+        raise MeshError("expected triangles of 3D points; triangulate the mesh")
     if not (np.abs(vertices) < MAX_COORDINATE).all():
-        raise MeshError(f"a vertex is not finite or exceeds {MAX_COORDINATE:g}; export it again")
+        raise MeshError(
+            f"a vertex coordinate is not finite or exceeds {MAX_COORDINATE:g}; export it again"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("a triangle refers to a missing vertex; export it again")
+        raise MeshError("a triangle contains the index of a missing vertex; export it again")
 
 
 def _repair(
     mesh: Any, metres_per_unit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
-    """Return vertices (v, 3) m, triangles (t, 3) and the repairs; MeshError for an empty mesh."""
+    """Return vertices (v, 3), m, triangles (t, 3) and the repairs. Raises MeshError if empty."""
     repairs = []
     if not len(getattr(mesh, "faces", ())):
-        raise MeshError("holds no triangles")
+        raise MeshError("does not contain triangles")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
-        raise MeshError(
-            f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are allowed; decimate the mesh"
-        )
+        raise MeshError(f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES}; decimate the mesh")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     for what, keep in (
         ("degenerate", ~find_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces))),
@@ -182,7 +186,7 @@ def _repair(
             mesh.update_faces(kept)
             repairs.append(f"{dropped} {what} triangles removed")
     if not len(mesh.faces):
-        raise MeshError("all its triangles are degenerate")
+        raise MeshError("all triangles are degenerate; export the mesh again")
     mesh.remove_unreferenced_vertices()
     vertices = np.array(mesh.vertices, dtype=np.float64) * metres_per_unit
     before = np.array(mesh.faces, dtype=np.int64)

@@ -19,7 +19,7 @@ from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
-    edge_row,
+    make_edge_row,
     make_motion,
     object_pose,
     sheet_errors,
@@ -175,7 +175,7 @@ class SheetErrors:
     def _add_edge(self, side: MotionBuffer, name: str, flange: Floats, source_ns: int) -> None:
         if self._scene is not None:
             poses = self._true_edge_poses if side is self.true else self._edge_poses
-            row = edge_row(flange, poses[name])
+            row = make_edge_row(flange, poses[name])
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
@@ -222,7 +222,7 @@ class SheetErrors:
                 found = sheet_errors(scene, finger, edges, times_ns, normal_offset_m, shape=shape)
                 self._add_errors(name, times_ns[touches], found[0][touches], found[1][touches])
                 if name == "true":
-                    local = apply(inverse(object_pose(scene)), finger.at(times_ns))
+                    local = apply(inverse(object_pose(scene)), finger.interpolate(times_ns))
                     self._add_followed(times_ns, *found, shape.closest(local).height_m)
         for edges_of in (*self.measured.edges, *self.true.edges):
             del edges_of[: -10 * BLOCK]
@@ -254,7 +254,7 @@ class SheetErrors:
     def _add_followed(
         self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats
     ) -> None:
-        following = make_motion(self._following, "twin/finger").at(times_ns)[:, 0] > 0.5
+        following = make_motion(self._following, "twin/finger").interpolate(times_ns)[:, 0] > 0.5
         for run in self.runs:
             inside = (times_ns >= run.zero_ns) & (times_ns <= run.done_ns)
             if inside.any():
@@ -265,7 +265,7 @@ class SheetErrors:
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = make_motion(self._contact, "sheet_target")
-        touches, normal_offset_m = contact.at(times_ns).T
+        touches, normal_offset_m = contact.interpolate(times_ns).T
         covered = contact.covers(times_ns)
         return (touches > 0.999) & covered, np.where(covered, normal_offset_m, 0.0)
 
