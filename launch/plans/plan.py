@@ -19,7 +19,6 @@ from flexsheet.launch.objects.meshes import make_scene
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
-    Problem,
     read_document,
     validate,
 )
@@ -78,19 +77,17 @@ def load_graph(
     for setting in settings:
         apply_setting(document, setting)
     spec = validate(LaunchFile, document)
-    problems: list[Problem] = []
-    check_hosts(spec.hosts, document, problems)
-    scene_document, scene = _load_scene(spec, document, problems)
-    entries = collect_entries(spec, document, problems)
+    check_hosts(spec.hosts, document)
+    scene_document, scene = _load_scene(spec, document)
+    entries = collect_entries(spec, document)
     for entry in entries:
-        resolve_entry(entry, document, problems)
-    writers = list_writers(spec, entries, document, problems, has_scene=scene is not None)
-    resolve_further_inputs(entries, writers, document, problems)
-    check_inputs(entries, writers, document, problems)
-    check_calibrations(entries, scene, document, problems)
-    check_device_hosts(entries, spec, document, problems)
-    if problems:
-        raise BadInputError(problems)
+        resolve_entry(entry, document)
+    writers = list_writers(spec, entries, document, has_scene=scene is not None)
+    resolve_further_inputs(entries, writers, document)
+    check_inputs(entries, writers, document)
+    check_calibrations(entries, scene, document)
+    check_device_hosts(entries, spec, document)
+    document.raise_problems()
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
     endpoints = make_endpoints(writers, addresses)
@@ -127,24 +124,20 @@ def load_graph(
     )
 
 
-def _load_scene(
-    spec: LaunchFile, document: Document, problems: list[Problem]
-) -> tuple[Document | None, Scene | None]:
+def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, Scene | None]:
     if spec.scene is None:
         return None, None
     path = document.path.parent / spec.scene
     if not path.is_file():
-        problems.append(
-            document.problem(
-                ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
-            )
+        document.report(
+            ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
         )
         return None, None
     try:
         scene_document = read_document(path)
         return scene_document, make_scene(scene_document)
     except BadInputError as error:
-        problems.extend(error.problems)
+        document.problems.extend(error.problems)
         return None, None
 
 

@@ -698,15 +698,8 @@ def _fill_run(value: Any, run: Run) -> Any:
 
 def _check_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
-        raise BadInputError(
-            [
-                Problem(
-                    "--host",
-                    (),
-                    f'unknown host "{host}"',
-                    f"choose one of: {', '.join(plan.hosts)}",
-                )
-            ]
+        raise BadInputError.single(
+            "--host", (), f'unknown host "{host}"', f"choose one of: {', '.join(plan.hosts)}"
         )
     for name, address in plan.hosts.items():
         if not is_loopback(address) and not plan.keys:

@@ -168,4 +168,4 @@ def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
         what = f'topic "{topic}" '
         what += f"is written by {owners}" if owners else "is not part of the graph"
         remedy = f'list it in "external_topics"; open now: {may}'
-    return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])
+    return documents.BadInputError.single(plan.launch_file, key, what, remedy)
