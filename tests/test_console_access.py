@@ -21,7 +21,7 @@ from flexsheet.nodes.console.access_control import (
     COOKIE,
     AccessControl,
     ConsoleError,
-    page_logger,
+    make_page_logger,
     read_token,
     start_server,
 )
@@ -140,12 +140,12 @@ class LogLines(logging.Handler):
 def page_server() -> Iterator[tuple[int, LogLines]]:
     """The port of a checked_servers page, and what its server logs."""
     lines = LogLines()
-    for logger in (page_logger(), logging.getLogger("websockets.server")):
+    for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.addHandler(lines)
     server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "test")
     yield server.get_port(), lines
     server.stop()
-    for logger in (page_logger(), logging.getLogger("websockets.server")):
+    for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.removeHandler(lines)
 
 

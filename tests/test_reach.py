@@ -18,7 +18,7 @@ from flexsheet.launch.health.layout import (
     Layout,
     check_layout,
     draw_layout,
-    layout_result,
+    make_layout_result,
     make_samples,
     move_base,
     sample_contacts,
@@ -287,7 +287,7 @@ def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.reachable
     assert demo.remedies == ()
     assert demo.blocked_paths == ()
-    result = layout_result(demo)
+    result = make_layout_result(demo)
     assert result["share"] == 1.0
     assert result["share_at_working_speed"] == 1.0
     # Its edges are 0.12 m long each way: quick strokes round so small an object turn them too fast.
@@ -313,7 +313,7 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
     assert not barred.reachable
     assert barred.right.reachable.all()
     assert not barred.left.reachable.all()
-    binding = {one["limit"] for one in layout_result(barred)["arms"]["left"]["binding"]}
+    binding = {one["limit"] for one in make_layout_result(barred)["arms"]["left"]["binding"]}
     assert {"reach", "J3 range"} <= binding
     moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
     assert len(moved) == 1
@@ -327,7 +327,7 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
 
 def test_the_first_place_that_binds_is_the_nearest_to_the_front(barred: Layout) -> None:
     samples, binding = barred.samples, barred.left.binding
-    for one in layout_result(barred)["arms"]["left"]["binding"]:
+    for one in make_layout_result(barred)["arms"]["left"]["binding"]:
         same = binding == LIMITS.index(one["limit"])
         assert abs(one["first_tilt_rad"]) == pytest.approx(
             float(np.abs(samples.tilt_rad[same]).min()), abs=1e-5

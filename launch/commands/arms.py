@@ -92,13 +92,13 @@ def stop(
 
     Exit code 0 if a launcher or a bridge has confirmed the stop, or both arms report it.
     """
-    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
 
     if sent_early:
         attempts = sent_early.pop()
     else:
-        attempts = stop_arms([run] if run else [one.directory for one in live_runs()], reason)
+        attempts = stop_arms([run] if run else [one.directory for one in list_live_runs()], reason)
     raise typer.Exit(run_interruptible(_confirm_stop(run, reason, attempts, as_json)))
 
 

@@ -99,7 +99,7 @@ def check_scene(
     The check covers every contact within the scene's tilt and depth, at the minimum and maximum
     stretch.  It also reports how fast a finger may move for the arms to follow.
     """
-    from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
+    from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
     if output is not None and not output.resolve().parent.is_dir():
@@ -109,7 +109,7 @@ def check_scene(
     scene = load_scene(scene_file)
     with progress_words() as progress:
         layout = check_layout(scene, progress=progress)
-    result = layout_result(layout)
+    result = make_layout_result(layout)
     if output is not None:
         try:
             draw_layout(layout, output)

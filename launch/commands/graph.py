@@ -39,7 +39,7 @@ class NoGraphError(CommandError):
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
     """Return the graph and the run in `directory`, or of the newest run that is alive."""
     from flexsheet.launch.plans.plan_model import ResolvedGraph
-    from flexsheet.launch.running.runs import Run, live_runs
+    from flexsheet.launch.running.runs import Run, list_live_runs
 
     if directory is not None:
         run = Run(directory.resolve().name, directory.resolve())
@@ -49,7 +49,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
                 BAD_INPUT,
             )
     else:
-        ready = [run for run in live_runs() if run.plan_file.is_file()]
+        ready = [run for run in list_live_runs() if run.plan_file.is_file()]
         if not ready:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]

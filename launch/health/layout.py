@@ -417,7 +417,7 @@ def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
     return None
 
 
-def layout_result(layout: Layout) -> dict[str, Any]:
+def make_layout_result(layout: Layout) -> dict[str, Any]:
     """Return the result of `doctor scene --json`."""
     return {
         "scene": layout.scene.name,

@@ -109,8 +109,8 @@ class ResolvedNode(StrictModel):
     device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
     calibrations: dict[str, str] = Field(default={}, description="file by parameter")
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
-    liveness_s: float | None = Field(default=None, description="older bags have none")
-    nice: int = Field(default=0, description="older bags have none")
+    liveness_s: float | None = Field(default=None, description="None in older bags")
+    nice: int = Field(default=0, description="0 in older bags")
 
     @property
     def arm_side(self) -> str | None:

@@ -108,7 +108,7 @@ class HostAgent:
         self._file_outdated = False
         self._status_error = ""
         nodes = plan.nodes_on(host)
-        self._devices, self._folder = list_device_files(nodes), recording_folder(nodes)
+        self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
@@ -212,7 +212,7 @@ class HostAgent:
         all_clear = asyncio.Event()
 
         def on_state(state: ArmState, _: Header) -> None:
-            if not shows_estop(state):
+            if not has_estop(state):
                 stopped.discard(f"arm_{state.side}")
             if not stopped:
                 all_clear.set()
@@ -331,7 +331,7 @@ class HostAgent:
         )
 
 
-def shows_estop(state: ArmState) -> bool:
+def has_estop(state: ArmState) -> bool:
     """Return whether an arm's bridge has an engaged e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
@@ -365,7 +365,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
     return sorted({file for node in nodes for file in node.device_files})
 
 
-def recording_folder(nodes: list[ResolvedNode]) -> Path:
+def find_recording_folder(nodes: list[ResolvedNode]) -> Path:
     """Return the folder of the recorder's bag; the working folder if it does not exist."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:

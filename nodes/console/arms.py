@@ -57,7 +57,7 @@ CLAMP_SIZE_M = (0.012, 1.04, 0.012)
 """Size of the bar that clamps the sheet: across, along the edge (over its length), through."""
 
 
-def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
+def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
     """Compute world_from_link (7, 4, 4) of the base and the six links; the last is the flange."""
     poses = [world_from_base]
     for (offset_m, axis), angle_rad in zip(JOINTS, joints_rad.tolist(), strict=True):

@@ -62,7 +62,9 @@ class FingerIntent:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.depth_m) and self.depth_m >= 0.0):
-            raise ValueError(f"depth: {self.depth_m} m is not a finite number of at least 0")
+            raise ValueError(
+                f"depth: expected a finite number of at least 0 m, found {self.depth_m}"
+            )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
         """Return the position (3,) of the fingertip on an object."""

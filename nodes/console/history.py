@@ -25,7 +25,7 @@ class History:
 
     def add(self, now_s: float, source: MessageSource) -> None:
         """Add a sample; samples older than the window are dropped."""
-        self._samples.append((now_s, latencies_ms(source)))
+        self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
@@ -71,7 +71,7 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     return (times, *widened)
 
 
-def latencies_ms(source: MessageSource) -> tuple[float, ...]:
+def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
     """Return the time (ms) from the exposure to the publication of the latest message of each step.
 
     NaN without a message. For the arms: the time at which the command of that exposure was written.

@@ -56,7 +56,7 @@ def draw_charts(session: Session) -> dict[str, Chart]:
         "latency": latencies,
         "path": paths,
         "errors": sheet_errors,
-        "joints": joint_speeds,
+        "joints": draw_joint_speeds,
         "force": forces,
     }
     found = {}
@@ -312,7 +312,7 @@ def sheet_errors(session: Session) -> Chart | None:
     )
 
 
-def joint_speeds(session: Session) -> Chart | None:
+def draw_joint_speeds(session: Session) -> Chart | None:
     """Draw each joint's maximum speed in percent of its limit."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
