@@ -546,12 +546,7 @@ class _Grid:
         columns = np.rint((tilt + most) / (2.0 * most) * (TILTS - 1)).astype(np.intp)
         rows = np.rint(depth / deepest * (DEPTHS - 1)).astype(np.intp)
         wide, high = np.degrees(most) / (TILTS - 1), 0.5e3 * deepest / (DEPTHS - 1)
-        extent = (
-            -np.degrees(most) - wide,
-            np.degrees(most) + wide,
-            -high,
-            1e3 * deepest + high,
-        )
+        extent = (-np.degrees(most) - wide, np.degrees(most) + wide, -high, 1e3 * deepest + high)
         frame = {"origin": "lower", "aspect": "auto", "extent": extent}
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 

@@ -75,9 +75,7 @@ OPENGL = SystemPackages(
 TABLE = (
     OPENGL,
     SystemPackages(
-        "browser tests",
-        ("chromium",),
-        lambda: find_missing_files(programs=["chromium"]),
+        "browser tests", ("chromium",), lambda: find_missing_files(programs=["chromium"])
     ),
     SystemPackages(
         "window tests",
@@ -87,9 +85,7 @@ TABLE = (
         ),
     ),
     SystemPackages(
-        "network namespace tests",
-        ("iproute2",),
-        lambda: find_missing_files(programs=["ip"]),
+        "network namespace tests", ("iproute2",), lambda: find_missing_files(programs=["ip"])
     ),
     SystemPackages(
         "tests of systemd units",

@@ -5,12 +5,7 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from flexsheet.launch.plans.documents import (
-    Document,
-    Key,
-    read_document,
-    validate,
-)
+from flexsheet.launch.plans.documents import Document, Key, read_document, validate
 from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile
 from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN
 from flexsheet.messages.security import is_key

@@ -8,12 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 from ruamel.yaml.error import YAMLError
 
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    did_you_mean,
-    parse_value,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, did_you_mean, parse_value
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import role_of

@@ -16,12 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from flexsheet.launch.objects.meshes import make_scene
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    read_document,
-    validate,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, read_document, validate
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -56,11 +51,7 @@ from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
 def load_graph(
-    path: Path,
-    *,
-    settings: Sequence[str] = (),
-    record: Path | None = None,
-    console: bool = False,
+    path: Path, *, settings: Sequence[str] = (), record: Path | None = None, console: bool = False
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 

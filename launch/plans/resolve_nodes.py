@@ -8,13 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    Key,
-    did_you_mean,
-    validate,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
 from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
@@ -24,14 +18,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.nodes import NODES, UnknownNodeError, node_class
-from flexsheet.nodes.node import (
-    Node,
-    NodeParameters,
-    Port,
-    further_port,
-    parameters_of,
-    ports_of,
-)
+from flexsheet.nodes.node import Node, NodeParameters, Port, further_port, parameters_of, ports_of
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")

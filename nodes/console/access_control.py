@@ -34,10 +34,7 @@ from flexsheet.nodes.console.html_head import inject_assets
 MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
-FRAMING_HEADERS = {
-    "X-Frame-Options": "DENY",
-    "Content-Security-Policy": "frame-ancestors 'none'",
-}
+FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
 """Headers of every response."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")

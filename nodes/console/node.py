@@ -40,8 +40,7 @@ class ConsoleParameters(NodeParameters):
         default=8080, description="TCP port of the page; 0: any free port"
     )
     token_file: Path | None = Field(
-        default=None,
-        description="file with the token of the viewers; required unless on loopback",
+        default=None, description="file with the token of the viewers; required unless on loopback"
     )
     rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")

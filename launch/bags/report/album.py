@@ -65,10 +65,7 @@ class Album:
 
 
 def _shot(
-    seconds: float,
-    title: str,
-    pictures: Sequence[tuple[str, NDArray[np.uint8]]],
-    marked: str = "",
+    seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]], marked: str = ""
 ) -> Shot:
     return Shot(seconds, title, tuple((name, jpeg(one)) for name, one in pictures), marked)
 

@@ -221,11 +221,7 @@ def _spread_ms(spread: Spread) -> dict[str, float | int | None]:
     found = {"p50": spread.quantile_s(0.5), "p99": spread.quantile_s(0.99)}
     longest = spread.longest_s if spread.count else None
     scaled = {key: None if value is None else 1e3 * value for key, value in found.items()}
-    return {
-        **scaled,
-        "max": None if longest is None else 1e3 * longest,
-        "count": spread.count,
-    }
+    return {**scaled, "max": None if longest is None else 1e3 * longest, "count": spread.count}
 
 
 def _most(range_: Range, scale: float) -> float | None:
