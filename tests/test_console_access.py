@@ -83,7 +83,7 @@ def test_beyond_loopback_there_is_no_page_without_a_token(tmp_path: Path) -> Non
         AccessControl("192.0.2.1", None)
     with pytest.raises(ValueError, match="token_file"):
         ConsoleParameters(address="192.0.2.1")
-    with pytest.raises(ValueError, match="no IP address"):
+    with pytest.raises(ValueError, match="not an IP address"):
         ConsoleParameters(address="everywhere")
     assert ConsoleParameters(address="0.0.0.0", token_file=tmp_path / "t").address == "0.0.0.0"
     file = tmp_path / "token"

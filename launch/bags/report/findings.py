@@ -120,7 +120,8 @@ def _check_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for kind, what in (("estop", "E-stop"), ("fault", "Arm fault"), ("arm", "Arm not operating")):
         if kind in counts:
             event = next(one for one in first if one["kind"] == kind)
-            text = f"{what}, {_times(counts[kind])}; first at {event['seconds']:.2f} s: {event['text']}."
+            start = f"first at {event['seconds']:.2f} s: {event['text']}"
+            text = f"{what}, {_times(counts[kind])}; {start}."
             yield SessionFinding("bad", text, "timeline")
     scene = numbers["scene"] or {}
     for side, arm in numbers["arms"].items():
