@@ -302,8 +302,8 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert demo.samples.depth_m.max() == SCENE.working_range.push_depth_m
     # Along the whole object, and rolled up and down the sheet.
     assert np.ptp(demo.samples.contact_world_m[:, 0]) == pytest.approx(0.12, abs=1e-6)
-    contact = demo.samples.contact_world_m - demo.samples.places.world_from_sheet[:, :3, 3]
-    along = np.einsum("ni,ni->n", contact, demo.samples.places.world_from_sheet[:, :3, 1])
+    contact = demo.samples.contact_world_m - demo.samples.poses.world_from_sheet[:, :3, 3]
+    along = np.einsum("ni,ni->n", contact, demo.samples.poses.world_from_sheet[:, :3, 1])
     rolled = most * cylinder_of(SCENE).radius_m
     assert along.max() > rolled
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9

@@ -102,7 +102,7 @@ def test_what_is_kept_does_not_grow_with_what_came() -> None:
     spread = np.diff([shot.seconds for shot in shots if not shot.marked])
     assert spread.max() <= 2 * spread.min(), "all over the session"
     assert album.seen == 100
-    assert len(events.held) == 6
+    assert len(events.stored) == 6
     assert events.counts == {"gap": 100, "estop": 1}
 
 

@@ -158,12 +158,14 @@ def reset(
 
 def _describe_reset(plan: ResolvedGraph) -> str:
     """Return what the arms of a plan do after a reset, by their bridges' `arming`."""
+    from flexsheet.launch.plans.plan_model import ArmingMode
+
     arming = {
-        str(node.arm_side): node.parameters.get("arming")
+        str(node.arm_side): node.arming
         for node in plan.nodes.values()
         if node.role is NodeRole.ARM_BRIDGE
     }
-    waiting = [side for side, kind in arming.items() if kind != "auto"]
+    waiting = [side for side, mode in arming.items() if mode is not ArmingMode.AUTO]
     free = [side for side in arming if side not in waiting]
     sentences = ["reset"]
     if waiting:

@@ -155,8 +155,8 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     with the largest positions on the sheet are used, limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
-    place = scene.object.world_from_object
-    world_from_object = transform_from_rpy(place.position_m, place.rpy_rad)
+    pose = scene.object.world_from_object
+    world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
     home = world_from_object[:3, :3].T
     most = np.array([0.5 * scene.sheet.width_m - CLAMP_MARGIN_M, scene.sheet.usable_half_height_m])
     found = _find_touchable_points(scene, world_from_object, shape.closest)

@@ -5,6 +5,7 @@ The module is separate from the resolver (`launch.plans.plan`), so that tools st
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
@@ -38,6 +39,13 @@ ROLES_OF_TYPES = {
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
 """Names of calibration parameters, for plans in older bags that list no calibrations."""
+
+
+class ArmingMode(StrEnum):
+    """Values of the parameter `arming` of arm bridges."""
+
+    MANUAL = "manual"
+    AUTO = "auto"
 
 
 class StrictModel(LimitedModel):
@@ -117,6 +125,12 @@ class ResolvedNode(StrictModel):
         """Return the side of the arm whose state the node publishes, or None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
+
+    @property
+    def arming(self) -> ArmingMode | None:
+        """Return who arms the node's arm; None for a node without that parameter."""
+        value = self.parameters.get("arming")
+        return ArmingMode(value) if value in tuple(ArmingMode) else None
 
     @model_validator(mode="before")
     @classmethod

@@ -19,7 +19,7 @@ import psutil
 import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
-from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode, tools_on
+from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.messages.base import Header, Message
@@ -344,7 +344,7 @@ def list_arms(plan: ResolvedGraph) -> list[str]:
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
     """Return whether a user has to arm an arm of the graph."""
-    return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
+    return any(node.arming is ArmingMode.MANUAL for node in plan.nodes.values())
 
 
 def python_version() -> str:

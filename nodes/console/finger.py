@@ -114,7 +114,7 @@ class FingerController:
         position = Ray(tuple(map(float, origin)), tuple(map(float, direction)))  # type: ignore[arg-type]  # three each
         self._request(position=position, lifted=False)
 
-    def place(self, x_m: float, y_m: float) -> None:
+    def move_to(self, x_m: float, y_m: float) -> None:
         """Move to (x, y) as viewed from the front; stay lifted or pushing."""
         self._request(position=Ray.from_front(x_m, y_m))
 

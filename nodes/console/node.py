@@ -56,7 +56,7 @@ class ConsoleParameters(NodeParameters):
     )
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
     state_file: Path = Field(
-        default=Path("@run/console-kept.json"),
+        default=Path("@run/console-state.json"),
         description="file with the state for a restart of the console",
     )
 

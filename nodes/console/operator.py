@@ -100,7 +100,7 @@ class Operator:
         self._on_new_scene()
         self._handlers: dict[str, Callable[..., None]] = {
             "touch": self._touch,
-            "place": partial(self._command_finger, controller.finger.place),
+            "place": partial(self._command_finger, controller.finger.move_to),
             "push": partial(self._command_finger, controller.finger.push),
             "lift": partial(self._command_finger, controller.finger.lift_or_lower),
             "stop": controller.stop,

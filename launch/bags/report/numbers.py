@@ -89,7 +89,7 @@ def compute_numbers(session: Session) -> dict[str, Any]:
             "counts": session.events.counts,
             "first": [
                 {"seconds": seconds, "kind": kind, "text": text}
-                for seconds, kind, text in sorted(session.events.held)
+                for seconds, kind, text in sorted(session.events.stored)
             ],
         },
         "pictures": {
@@ -131,9 +131,9 @@ def _graph(session: Session) -> dict[str, Any] | None:
 
 def _topics(session: Session) -> dict[str, Any]:
     found = {}
-    held = {one.name: one for one in session.info.topics}
-    for name in sorted({*held, *session.ports}):
-        info, flow, port = held.get(name), session.flows.get(name), session.ports.get(name)
+    recorded = {one.name: one for one in session.info.topics}
+    for name in sorted({*recorded, *session.ports}):
+        info, flow, port = recorded.get(name), session.flows.get(name), session.ports.get(name)
         topic = TOPICS.get(name)
         expected = None if topic is None or topic.many_writers else topic.rate_hz
         skipped, lost, refused = (None, None, None) if port is None else port.totals()
