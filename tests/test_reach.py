@@ -363,7 +363,7 @@ def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> 
     content["object"]["geometry"] = geometry
     scene = Scene.model_validate(content)
     found = check_layout(scene)
-    assert len(found.samples.places) > 20
+    assert len(found.samples.poses) > 20
     assert found.reachable is reachable
 
 
