@@ -90,7 +90,7 @@ def check_python() -> Finding:
 def check_libraries() -> Finding:
     """Check that every requirement of the distribution is installed."""
     try:
-        wanted = requires("flexsheet") or []
+        requirements = requires("flexsheet") or []
     except PackageNotFoundError:
         return Finding(
             "libraries", "warning", "the package flexsheet is not installed", "make setup"
@@ -98,7 +98,7 @@ def check_libraries() -> Finding:
     missing = []
     names = [
         match[0]
-        for line in wanted
+        for line in requirements
         if "extra ==" not in line and (match := re.match(r"[A-Za-z0-9._-]+", line))
     ]
     for name in names:

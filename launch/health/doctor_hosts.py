@@ -560,20 +560,20 @@ def check_before_start(
 def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     """Check that the TCP ports of this host are free."""
     address = plan.hosts[here]
-    wanted = [
+    ports = [
         int(writer.tcp.rpartition(":")[2])
         for writers in plan.writers.values()
         for writer in writers
         if writer.tcp is not None and writer.host == here
     ]
     is_own = is_loopback(address) or address in list_own_addresses()
-    used = [port for port in wanted if is_own and not is_free(address, port)]
+    used = [port for port in ports if is_own and not is_free(address, port)]
     used += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
         what = f"in use: {', '.join(map(str, sorted(used)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
-    return HostFinding(here, "ports", "ok", f"{len(wanted)} are free")
+    return HostFinding(here, "ports", "ok", f"{len(ports)} are free")
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:

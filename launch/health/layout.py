@@ -192,12 +192,12 @@ def _find_touchable_points(
     most = scene.working_range.tilt_rad
     low, high = (np.array(v) for v in (scene.finger.volume_min_m, scene.finger.volume_max_m))
     fractions = np.linspace(0.0, 1.0, 3)
-    beside = [
+    offsets = [
         np.array([x, y, 0.0])
         for x in low[0] + fractions * (high[0] - low[0])
         for y in low[1] + fractions * (high[1] - low[1])
     ]
-    middle = world_from_object[:3, 3]
+    centre = world_from_object[:3, 3]
     queries = []
     for up, side in product(np.linspace(-most, most, TILTS), np.linspace(-most, most, SIDE_TILTS)):
         lean = float(np.hypot(up, side))
@@ -205,7 +205,7 @@ def _find_touchable_points(
             continue
         aside = np.array([side, up]) / lean if lean > 0.0 else np.zeros(2)
         away = np.array([*(np.sin(lean) * aside), np.cos(lean)])
-        queries += [middle + VIEW_DISTANCE_M * away + offset for offset in beside]
+        queries += [centre + VIEW_DISTANCE_M * away + offset for offset in offsets]
     found = closest(apply(inverse(world_from_object), np.array(queries)))
     front = world_from_object[:3, :3].T[:, 2]
     leans = np.arccos(np.clip(found.normal @ front, -1.0, 1.0))
@@ -214,10 +214,10 @@ def _find_touchable_points(
         near = (
             np.linalg.norm(found.point[chosen] - found.point[index], axis=1) < DUPLICATE_DISTANCE_M
         )
-        alike = (
+        similar = (
             np.linalg.norm(found.normal[chosen] - found.normal[index], axis=1) < DUPLICATE_NORMAL
         )
-        if not (near & alike).any():
+        if not (near & similar).any():
             chosen.append(int(index))
     return [
         Nearest(

@@ -137,8 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Check the system packages.")
     parser.add_argument("--tests", action="store_true", help="check packages for tests, too")
     tests = parser.parse_args(arguments).tests
-    wanted = [one for one in TABLE if tests or not one.tests_only]
-    missing = [one for one in wanted if one.problem() is not None]
+    required = [one for one in TABLE if tests or not one.tests_only]
+    missing = [one for one in required if one.problem() is not None]
     if missing and can_install():
         missing = install(missing)
     if missing:

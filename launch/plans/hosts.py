@@ -18,7 +18,7 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
             ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
         )
     _check_keys(hosts, document)
-    seen: dict[str, str] = {}
+    host_by_address: dict[str, str] = {}
     for name, host in hosts.items():
         key: Key = ("hosts", name, "address")
         try:
@@ -34,7 +34,7 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
                 f'"{host.address}" is not the address of one host',
                 "give the host's own address",
             )
-        other = seen.setdefault(host.address, name)
+        other = host_by_address.setdefault(host.address, name)
         if other != name:
             document.report(
                 key,
@@ -45,7 +45,7 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
 
 def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
     """Check that each host has a separate valid key, if any host has a key."""
-    seen: dict[str, str] = {}
+    host_by_key: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")
         if host.key is None:
@@ -62,9 +62,11 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
                 f'"{host.key}" is not a public key',
                 f"give the 40 characters that `flexsheet keys show {name}` prints",
             )
-        elif seen.setdefault(host.key, name) != name:
+        elif host_by_key.setdefault(host.key, name) != name:
             document.report(
-                where, f'is also the key of host "{seen[host.key]}"', "give each host its own key"
+                where,
+                f'is also the key of host "{host_by_key[host.key]}"',
+                "give each host its own key",
             )
 
 

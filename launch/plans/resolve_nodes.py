@@ -261,11 +261,11 @@ def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
     if isinstance(value, Path):
         return _absolute(value, base)
     if isinstance(value, BaseModel):
-        given = {
+        explicit = {
             name: _with_absolute_paths(getattr(value, name), dumped[name], base)
             for name in value.model_fields_set
         }
-        return {**dumped, **given}
+        return {**dumped, **explicit}
     if isinstance(value, tuple | list):
         return [
             _with_absolute_paths(one, plain, base) for one, plain in zip(value, dumped, strict=True)

@@ -28,9 +28,9 @@ KEYS_VARIABLE = "FLEXSHEET_KEYS"
 
 def directory() -> Path:
     """Return the folder of this user's secret keys."""
-    given = os.environ.get(KEYS_VARIABLE)
-    if given:
-        return Path(given)
+    configured = os.environ.get(KEYS_VARIABLE)
+    if configured:
+        return Path(configured)
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "flexsheet" / "keys"
 
 

@@ -119,12 +119,12 @@ class AccessControl:
             return _page(http.HTTPStatus.FORBIDDEN, "pages of other sites may not use the console")
         if self._token is None:
             return None
-        given = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
-        if hmac.compare_digest(given.encode(), self._token.encode()):
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
+        if hmac.compare_digest(token.encode(), self._token.encode()):
             # The cookie keeps the token out of the address line and of bookmarks.
             to_page = {
                 "Location": "/",
-                "Set-Cookie": f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/",
+                "Set-Cookie": f"{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/",
             }
             return _page(http.HTTPStatus.SEE_OTHER, "welcome", to_page)
         if hmac.compare_digest(_cookie(request).encode(), self._token.encode()):

@@ -33,7 +33,7 @@ class Piece:
 
     link: int
     size_m: tuple[float, float, float]
-    middle_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]
     dark: bool = False
 
 
@@ -67,7 +67,7 @@ def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
 
 
 def rounded_box(
-    size_m: tuple[float, float, float], middle_m: tuple[float, float, float], bevel: float = 0.18
+    size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Make a box with bevelled edges: vertices (24, 3), counter-clockwise triangles (44, 3).
 
@@ -79,7 +79,7 @@ def rounded_box(
     vertices = np.concatenate(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
-    return vertices + np.array(middle_m), _orient_outwards(vertices, _box_triangles())
+    return vertices + np.array(centre_m), _orient_outwards(vertices, _box_triangles())
 
 
 def _box_triangles() -> NDArray[np.int32]:

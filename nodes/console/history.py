@@ -53,7 +53,7 @@ class History:
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Return the columns so that a line is drawn for every value.
 
-    A value without a neighbour is repeated at the sample beside it. A single sample is repeated
+    A value without a neighbour is repeated at the sample indices it. A single sample is repeated
     half a second earlier.
     """
     times, *series = columns
@@ -63,10 +63,10 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     widened = []
     for values in series:
         valid = np.isfinite(values)
-        lonely = valid & ~np.r_[False, valid[:-1]] & ~np.r_[valid[1:], False]
-        beside = np.flatnonzero(lonely)
+        isolated = valid & ~np.r_[False, valid[:-1]] & ~np.r_[valid[1:], False]
+        indices = np.flatnonzero(isolated)
         filled = values.copy()
-        filled[np.where(beside > 0, beside - 1, 1)] = values[beside]
+        filled[np.where(indices > 0, indices - 1, 1)] = values[indices]
         widened.append(filled)
     return (times, *widened)
 

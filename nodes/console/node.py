@@ -105,16 +105,16 @@ class Console(Node):
         return [topic.name for topic in written if topic.name in TOPICS_READ]
 
     async def setup(self) -> None:
-        given = self.parameters
-        token = None if given.token_file is None else read_token(given.token_file)
-        access = AccessControl(given.address, token)
+        settings = self.parameters
+        token = None if settings.token_file is None else read_token(settings.token_file)
+        access = AccessControl(settings.address, token)
         self._loop = asyncio.get_running_loop()
         self._latest = LatestMessages(self._refused)
-        self._server = start_server(given.address, given.page_port, access, "flexsheet")
-        self.url = f"http://{given.address}:{self._server.get_port()}/"
-        finger = FingerController(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        files = ConsoleFiles(given.plan, given.scenes, given.bags, given.state_file)
-        facts = GraphFacts.from_plan(given.plan, self.name)
+        self._server = start_server(settings.address, settings.page_port, access, "flexsheet")
+        self.url = f"http://{settings.address}:{self._server.get_port()}/"
+        finger = FingerController(self._publish, speed_m_per_s=settings.finger_speed_m_per_s)
+        files = ConsoleFiles(settings.plan, settings.scenes, settings.bags, settings.state_file)
+        facts = GraphFacts.from_plan(settings.plan, self.name)
         controller = ConsoleController(self._publish, files, finger, self.log.warning, facts)
         self.operator = Operator(
             self._server,
@@ -122,7 +122,7 @@ class Console(Node):
             controller,
             self._request,
             name=self.name,
-            with_finger=given.control_finger,
+            with_finger=settings.control_finger,
             with_eye=further_port("twin/eye") in self.inputs,
         )
         controller.begin()

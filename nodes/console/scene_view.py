@@ -204,7 +204,7 @@ class SceneView:
             for link in range(7)
         ]
         for i, piece in enumerate(PIECES):
-            vertices, triangles = rounded_box(piece.size_m, piece.middle_m)
+            vertices, triangles = rounded_box(piece.size_m, piece.centre_m)
             self._scene.add_mesh_simple(
                 f"/{side}/{piece.link}/{i}",
                 _f32(vertices),
@@ -293,11 +293,11 @@ class SceneView:
         """Add labels above the bodies."""
         camera, projector = scene.camera, scene.projector.world_from_projector
         baseline_m = -float(camera.right_from_left[0, 3])
-        middle = apply(
+        centre = apply(
             transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
         )
         positions = {
-            "stereo camera": middle + NAME_ABOVE_M,
+            "stereo camera": centre + NAME_ABOVE_M,
             "projector": np.asarray(projector.position_m) + NAME_ABOVE_M,
             "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
             "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
@@ -394,8 +394,8 @@ def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
             [0.0, np.sin(FINGER_TILT_RAD), np.cos(FINGER_TILT_RAD)],
         ]
     )
-    middle = np.array([0.0, 0.0, radius_m])
-    vertices = (vertices - middle) @ lean.T + middle
+    centre = np.array([0.0, 0.0, radius_m])
+    vertices = (vertices - centre) @ lean.T + centre
     triangles = []
     for ring in range(rings):
         for i in range(around):

@@ -110,9 +110,9 @@ def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
     triangles around the vertex whose direction is nearest to the ray.
     """
     direction = towards - origin
-    seen = points - origin
-    seen = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-12)
-    nearest = np.argmax(direction @ seen.T, axis=1)
+    directions = points - origin
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    nearest = np.argmax(direction @ directions.T, axis=1)
     triangles = make_sheet_triangles()[_around(nearest)]
     a, b, c = (points[triangles[..., i]] for i in range(3))
     first, second, along = b - a, c - a, direction[:, None, :]

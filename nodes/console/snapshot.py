@@ -91,13 +91,13 @@ def _skin(source: MessageSource) -> Floats | None:
 def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
     """Return indices (9,) of skin vertices for rays: a grid on the side that faces the user."""
     low, high = rest.min(axis=0), rest.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
     chosen = []
     for up in RAY_POSITIONS:
         for across in RAY_POSITIONS:
-            position = middle[:2] + half[:2] * np.array([0.7 * across, up])
+            position = centre[:2] + half[:2] * np.array([0.7 * across, up])
             off = np.linalg.norm(rest[:, :2] - position, axis=1)
-            chosen.append(int(np.argmin(off - 0.3 * (rest[:, 2] - middle[2]))))
+            chosen.append(int(np.argmin(off - 0.3 * (rest[:, 2] - centre[2]))))
     return np.array(chosen)
 
 

@@ -30,13 +30,13 @@ class Shot:
 class Album:
     """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
-    bookmarks: (seconds, label), in order. seen: number of shots. left_out: number of shots at
+    bookmarks: (seconds, label), in order. count: number of shots. left_out: number of shots at
     bookmarks beyond the first `MAX_BOOKMARK_SHOTS`.
     """
 
     limit: int
     bookmarks: Sequence[tuple[float, str]] = ()
-    seen: int = 0
+    count: int = 0
     left_out: int = 0
     _every: int = 1
     _regular: list[Shot] = field(default_factory=list)
@@ -52,12 +52,12 @@ class Album:
             self.left_out += 1
         elif passed:
             self._at_bookmarks.append(_shot(seconds, title, pictures, "; ".join(passed)))
-        elif self.seen % self._every == 0:
+        elif self.count % self._every == 0:
             self._regular.append(_shot(seconds, title, pictures))
             if len(self._regular) > self.limit:
                 del self._regular[1::2]
                 self._every *= 2
-        self.seen += 1
+        self.count += 1
 
     def shots(self) -> list[Shot]:
         """Return the stored shots in the order of time."""

@@ -86,10 +86,10 @@ def mark_isolated(axes: Axes) -> None:
     """Add markers to values without neighbours, which a line does not show."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
-        beside = np.zeros_like(known)
-        beside[1:] |= known[:-1]
-        beside[:-1] |= known[1:]
-        isolated = np.flatnonzero(known & ~beside).tolist()
+        has_neighbour = np.zeros_like(known)
+        has_neighbour[1:] |= known[:-1]
+        has_neighbour[:-1] |= known[1:]
+        isolated = np.flatnonzero(known & ~has_neighbour).tolist()
         if isolated and line.get_marker() == "None":
             line.set_marker(".")
             line.set_markevery(isolated)

@@ -93,9 +93,9 @@ def compute_numbers(session: Session) -> dict[str, Any]:
             ],
         },
         "pictures": {
-            "stereo": session.stereo.seen,
-            "eye": session.eye.seen,
-            "frame": session.drawn.seen,
+            "stereo": session.stereo.count,
+            "eye": session.eye.count,
+            "frame": session.drawn.count,
         },
     }
 
