@@ -391,7 +391,7 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
             "devices",
             "failed",
             f"missing: {', '.join(missing)}",
-            "check that it is plugged in, and its number: v4l2-ctl --list-devices",
+            "check its cable and its number: v4l2-ctl --list-devices",
         )
     elif devices:
         yield HostFinding(host, "devices", "ok", ", ".join(devices))
@@ -539,7 +539,7 @@ def check_before_start(
     devices = list_device_files(nodes)
     missing = [one for one in devices if not os.path.exists(one)]
     if missing:
-        remedy = "check that it is plugged in, and its number: v4l2-ctl --list-devices"
+        remedy = "check its cable and its number: v4l2-ctl --list-devices"
         what = f"missing: {', '.join(missing)}"
         yield HostFinding(here, "devices", "failed", what, remedy)
     elif devices:
