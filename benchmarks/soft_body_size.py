@@ -30,7 +30,7 @@ from flexsheet.launch.methods.charts import ROOT
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.launch.running.code_state import git_state
+from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
@@ -338,7 +338,7 @@ def measure_all() -> dict[str, Any]:
                 say(by_contact[-1])
     return {
         "machine": machine_name(),
-        "code": json.loads(git_state(ROOT)),
+        "code": json.loads(read_git_state(ROOT)),
         "tables": "of made-up numbers and of the right size, at some of the places",
         BY_SIZE: [asdict(point) for point in by_size],
         BY_CONTACT: [asdict(point) for point in by_contact],

@@ -75,7 +75,7 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
     assert launcher.stderr is not None
     try:
         assert any("are ready" in line for line in launcher.stderr)
-        yield Graph(launcher, runs.live_runs()[0], hangs)
+        yield Graph(launcher, runs.list_live_runs()[0], hangs)
     finally:
         hangs.unlink(missing_ok=True)
         launcher.send_signal(signal.SIGCONT)

@@ -407,7 +407,7 @@ def test_a_bag_plays_into_a_graph(
 ) -> None:
     launched = Launched(write(tmp_path, LISTENING), "--record", tmp_path / "b.mcap")
     said = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger")
-    newest = runs.live_runs()[0]
+    newest = runs.list_live_runs()[0]
     refused = flexsheet("bag", "play", recorded, "--topic", "stereo", "--run", newest.directory)
     assert launched.stop() == 0
     assert said.code == 0, said.err

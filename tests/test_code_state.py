@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.running.code_state import git_state
+from flexsheet.launch.running.code_state import read_git_state
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def write(repository: Path, name: str, text: str = "# as it was\n") -> None:
 
 
 def test_the_commit_is_named_and_unchanged(repository: Path) -> None:
-    state = json.loads(git_state(repository))
+    state = json.loads(read_git_state(repository))
     assert len(state["commit"]) == 40
     assert state["changed"] is False
 
@@ -41,13 +41,13 @@ def test_the_commit_is_named_and_unchanged(repository: Path) -> None:
 )  # fmt: skip
 def test_new_files_that_no_run_executes_are_no_change(repository: Path, name: str) -> None:
     write(repository, name)
-    assert json.loads(git_state(repository))["changed"] is False
+    assert json.loads(read_git_state(repository))["changed"] is False
 
 
 @pytest.mark.parametrize("name", ["nodes/own/node.py", "messages/own.py", "nodes/own/ a b.glsl"])
 def test_a_new_source_file_is_a_change(repository: Path, name: str) -> None:
     write(repository, name)
-    assert json.loads(git_state(repository))["changed"] is True
+    assert json.loads(read_git_state(repository))["changed"] is True
 
 
 @pytest.mark.parametrize(
@@ -58,16 +58,16 @@ def test_an_edited_file_is_a_change_where_runs_use_it(
     repository: Path, name: str, changed: bool
 ) -> None:
     write(repository, name, "# another text\n")
-    assert json.loads(git_state(repository))["changed"] is changed
+    assert json.loads(read_git_state(repository))["changed"] is changed
 
 
 def test_a_removed_and_a_renamed_source_file_are_changes(repository: Path) -> None:
     (repository / "nodes/twin/node.py").rename(repository / "nodes/twin/moved.py")
     subprocess.run(["git", "-C", str(repository), "add", "-A"], check=True)
-    assert json.loads(git_state(repository))["changed"] is True
+    assert json.loads(read_git_state(repository))["changed"] is True
 
 
 def test_outside_of_git_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     monkeypatch.setenv("FLEXSHEET_COMMIT", "abc")
-    assert json.loads(git_state(tmp_path)) == {"commit": "abc", "changed": None}
+    assert json.loads(read_git_state(tmp_path)) == {"commit": "abc", "changed": None}

@@ -21,7 +21,7 @@ from flexsheet.nodes.console.access_control import (
     COOKIE,
     AccessControl,
     ConsoleError,
-    page_logger,
+    make_page_logger,
     read_token,
     start_server,
 )
@@ -83,7 +83,7 @@ def test_beyond_loopback_there_is_no_page_without_a_token(tmp_path: Path) -> Non
         AccessControl("192.0.2.1", None)
     with pytest.raises(ValueError, match="token_file"):
         ConsoleParameters(address="192.0.2.1")
-    with pytest.raises(ValueError, match="no IP address"):
+    with pytest.raises(ValueError, match="not an IP address"):
         ConsoleParameters(address="everywhere")
     assert ConsoleParameters(address="0.0.0.0", token_file=tmp_path / "t").address == "0.0.0.0"
     file = tmp_path / "token"
@@ -140,12 +140,12 @@ class LogLines(logging.Handler):
 def page_server() -> Iterator[tuple[int, LogLines]]:
     """The port of a checked_servers page, and what its server logs."""
     lines = LogLines()
-    for logger in (page_logger(), logging.getLogger("websockets.server")):
+    for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.addHandler(lines)
     server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "test")
     yield server.get_port(), lines
     server.stop()
-    for logger in (page_logger(), logging.getLogger("websockets.server")):
+    for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.removeHandler(lines)
 
 

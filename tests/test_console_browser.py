@@ -82,7 +82,7 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
     broken = status(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
     statuses = {MARKUP: (broken, 0.0)}
-    tables = panels.topics_table(statuses) + panels.nodes_table(statuses)
+    tables = panels.make_topics_table(statuses) + panels.make_nodes_table(statuses)
     page.graph.show(tables, History().columns())
     # Shown last: what it says is there only once all else is.
     page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP, replay=MARKUP))

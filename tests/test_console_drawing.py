@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arm_bridge import kinematics
-from flexsheet.nodes.console.arms import PIECES, link_poses, rounded_box
+from flexsheet.nodes.console.arms import PIECES, compute_link_poses, rounded_box
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.scene_view import (
     LINES_LIFT_M,
     SHEET_LIFT_M,
-    finger_mesh,
     lift_sheet,
-    line_segments,
+    make_finger_mesh,
+    make_line_segments,
 )
 from flexsheet.nodes.console.sheet import (
     COLUMNS,
     ROWS,
+    compute_sheet_points,
     film,
-    hit_by_ray,
-    sheet_points,
-    sheet_triangles,
+    intersect_sheet,
+    make_sheet_triangles,
 )
-from flexsheet.nodes.console.snapshot import compute_snapshot, ray_vertices, rays
+from flexsheet.nodes.console.snapshot import compute_snapshot, rays, select_ray_vertices
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import Shelf, cylinder
@@ -50,7 +50,9 @@ def edges(width_m: float = WIDTH_M) -> tuple[Floats, Floats]:
 
 
 def sheet(fingertip: Floats | None = None) -> Floats:
-    points = sheet_points(*edges(), height_m=HEIGHT_M, fingertip=fingertip, finger_radius_m=0.007)
+    points = compute_sheet_points(
+        *edges(), height_m=HEIGHT_M, fingertip=fingertip, finger_radius_m=0.007
+    )
     assert points is not None
     return points
 
@@ -58,7 +60,7 @@ def sheet(fingertip: Floats | None = None) -> Floats:
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
 def test_the_drawn_flange_is_where_the_kinematics_have_it(joints: list[float]) -> None:
     base = transform(rotation_from_vector(np.array([0.3, -0.2, 0.5])), (0.1, -0.4, 0.2))
-    poses = link_poses(base, np.array(joints))
+    poses = compute_link_poses(base, np.array(joints))
     assert poses.shape == (7, 4, 4)
     np.testing.assert_allclose(poses[-1], base @ kinematics.forward(joints), atol=1e-12)
 
@@ -69,7 +71,7 @@ def test_boxes_are_closed_and_wound_outwards(piece: Any) -> None:
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     volume = float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
     assert 0.8 * np.prod(piece.size_m) < volume < np.prod(piece.size_m)
-    tip, faces = finger_mesh(0.007)
+    tip, faces = make_finger_mesh(0.007)
     a, b, c = (tip[faces[:, i]] for i in range(3))
     assert float(np.einsum("ij,ij->", a, np.cross(b, c))) > 0.0
 
@@ -92,28 +94,31 @@ def test_the_film_is_free_at_top_and_bottom() -> None:
 
 
 def test_a_sheet_that_is_not_there_or_not_pushed() -> None:
-    assert sheet_points(*edges(0.01), height_m=1.0, fingertip=None, finger_radius_m=1.0) is None
+    assert (
+        compute_sheet_points(*edges(0.01), height_m=1.0, fingertip=None, finger_radius_m=1.0)
+        is None
+    )
     nan = np.full((4, 4), np.nan)
-    assert sheet_points(nan, nan, height_m=1.0, fingertip=None, finger_radius_m=1.0) is None
+    assert compute_sheet_points(nan, nan, height_m=1.0, fingertip=None, finger_radius_m=1.0) is None
     assert np.ptp(sheet()[:, 2]) == 0.0
     assert np.ptp(sheet(np.array([0.0, 0.0, 0.01]))[:, 2]) == 0.0, "a finger before the sheet"
     dented = sheet(np.array([0.02, 0.01, -0.03]))
     assert dented[:, 2].min() == pytest.approx(-0.03, abs=1e-3)
-    assert line_segments(dented).shape == (2 * 9 * (ROWS - 1), 2, 3)
+    assert make_line_segments(dented).shape == (2 * 9 * (ROWS - 1), 2, 3)
 
 
 @given(st.floats(-0.11, 0.11), st.floats(-0.11, 0.11))
 def test_rays_meet_the_flat_sheet_where_the_plane_is(x: float, y: float) -> None:
     eye = np.array([0.03, 0.05, 0.4])
     towards = np.array([[x, y, 0.0]]) + 0.3 * (np.array([[x, y, 0.0]]) - eye)
-    np.testing.assert_allclose(hit_by_ray(sheet(), eye, towards), [[x, y, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(intersect_sheet(sheet(), eye, towards), [[x, y, 0.0]], atol=1e-9)
 
 
 @pytest.mark.parametrize("tilt_rad", [-1.0, 0.0, 1.0])
 def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -> None:
     """In one plane with a flat object, the sheet and the object were drawn in patches."""
     turned = transform(rotation_from_vector(np.array([tilt_rad, 0.0, 0.0])), (0.0, 0.0, 0.0))
-    points = sheet_points(
+    points = compute_sheet_points(
         *(turned @ edge for edge in edges()),
         height_m=HEIGHT_M,
         fingertip=None,
@@ -141,15 +146,15 @@ def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
     assert np.bincount(source).tolist() == [3] * 8, "a vertex for each of the three faces"
     np.testing.assert_array_equal(source[triangles], box)
     points = sheet(np.array([0.02, 0.01, -0.01]))
-    source, triangles = split_creases(points, sheet_triangles())
+    source, triangles = split_creases(points, make_sheet_triangles())
     assert sorted(source.tolist()) == list(range(len(points)))
-    np.testing.assert_array_equal(source[triangles], sheet_triangles())
+    np.testing.assert_array_equal(source[triangles], make_sheet_triangles())
 
 
 def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
     eye = scene.eyes.centre_world_m
     points = np.array([[0.0, 0.0, -0.1], [5.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    hits = hit_by_ray(sheet(), eye, points)
+    hits = intersect_sheet(sheet(), eye, points)
     assert np.isfinite(hits).all(axis=1).tolist() == [True, False, False]
     to_eye, from_projector = rays(scene, sheet(), points)
     assert to_eye.shape == from_projector.shape == (1, 2, 3)
@@ -173,4 +178,4 @@ def test_a_picture_of_what_is_known(scene: Scene) -> None:
     assert both.sheet.shape == (ROWS * COLUMNS, 3)
     assert both.finger_valid
     grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)
-    assert len(set(ray_vertices(grid).tolist())) == 9
+    assert len(set(select_ray_vertices(grid).tolist())) == 9

@@ -63,7 +63,7 @@ def test_tables_say_in_words_what_is_wrong() -> None:
         "left": (status("left", state="degraded", errors=2, last_error="<b>bang</b>"), 0.0),
         "right": (status("right", outputs=(port("frame", rate_hz=0.0),)), 9.0),
     }
-    topics, nodes = panels.topics_table(statuses), panels.nodes_table(statuses)
+    topics, nodes = panels.make_topics_table(statuses), panels.make_nodes_table(statuses)
     assert "1 refused" in topics
     assert ">12<" in topics, "the age, ms"
     assert ">7<" in topics
@@ -73,9 +73,9 @@ def test_tables_say_in_words_what_is_wrong() -> None:
     assert "silent for 9 s" in nodes
     assert ">25<" in nodes, "the share of a core, %"
     quiet = {"camera": (status("camera", outputs=(port("stereo", rate_hz=0.0),)), 0.5)}
-    assert "silent" in panels.topics_table(quiet)
+    assert "silent" in panels.make_topics_table(quiet)
     slow = {"camera": (status("camera", outputs=(port("stereo", rate_hz=3.0),)), 0.5)}
-    assert "slow" in panels.topics_table(slow)
+    assert "slow" in panels.make_topics_table(slow)
 
 
 def rendered(**state: Any) -> str:
@@ -178,8 +178,8 @@ def test_names_with_markup_are_shown_as_text() -> None:
         rendered(scene=evil, replay=evil, estop_reason=evil),
         rendered(arms=arms_in(mode="fault", faults=(evil,), reason=evil)),
         rendered(arms=blocked, overload=evil, solver_note=evil),
-        panels.nodes_table({evil: (status(evil, note=evil, errors=1, last_error=evil), 0.0)}),
-        panels.topics_table({evil: (status(evil, outputs=(port("stereo"),)), 0.0)}),
+        panels.make_nodes_table({evil: (status(evil, note=evil, errors=1, last_error=evil), 0.0)}),
+        panels.make_topics_table({evil: (status(evil, outputs=(port("stereo"),)), 0.0)}),
         panels.problem(evil),
         panels.recorder(evil, (evil,)),
     ):
@@ -255,7 +255,7 @@ def test_latencies_are_from_the_exposure_on() -> None:
     assert np.isnan(last["frame drawn"])
     told = history.latest_and_max()
     assert told["finger found"] == pytest.approx((3.0, 3.0))
-    legend = panels.latency_table(told)
+    legend = panels.make_latency_table(told)
     assert ">8<" in legend
     assert "–" in legend, "nothing was drawn"
 

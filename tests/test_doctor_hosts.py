@@ -366,7 +366,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
 def test_own_keys_and_address_are_looked_at_before_the_start(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
+    monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.find_opengl_problem", lambda: "no EGL")
     assert "does not exist; create a key" in (find_key_problem(three, "main") or "")
     public, secret = make_key_pair()
     write_secret(secret_file("main"), secret)
@@ -386,10 +386,12 @@ def test_which_host_this_is(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     two = plan_of(folder)
-    monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
+    monkeypatch.setattr(
+        "flexsheet.launch.health.doctor_hosts.list_own_addresses", lambda: {f"{NET}.2"}
+    )
     assert find_host(two, None, None) == "left"
     monkeypatch.setattr(
-        "flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
+        "flexsheet.launch.health.doctor_hosts.list_own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
     )
     assert find_host(two, None, None) == MAIN
     assert find_host(two, None, "left") == "left"

@@ -21,9 +21,9 @@ from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
 from flexsheet.launch.running.host import (
     REASON_LENGTH,
     HostAgent,
+    has_estop,
     has_manual_arming,
     list_arms,
-    shows_estop,
 )
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
@@ -262,6 +262,6 @@ def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
 
 
 def test_an_arm_shows_an_estop_by_its_typed_field_whatever_its_faults_say() -> None:
-    assert shows_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
-    assert shows_estop(arm_state("left", mode="estop"))
-    assert not shows_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))
+    assert has_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
+    assert has_estop(arm_state("left", mode="estop"))
+    assert not has_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flexsheet.launch.bags.player import shift_stamps
-from flexsheet.launch.bags.replay import field_differences, replay, verify
+from flexsheet.launch.bags.replay import compute_field_differences, replay, verify
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header, Message, Stamp, find_stamp_fields
@@ -97,7 +97,7 @@ def test_what_is_no_number_differs_from_what_is_one(live: float, again: float, s
         for value in (live, again)
     )
     expected = {} if size == 0.0 else {"path_time_s": size, "position_world_m": size}
-    assert field_differences(one, other) == expected
+    assert compute_field_differences(one, other) == expected
 
 
 def test_differences_are_found_field_by_field() -> None:
@@ -105,9 +105,9 @@ def test_differences_are_found_field_by_field() -> None:
     other = one.model_copy(
         update={"position_world_m": np.array([0.0, 0.0, 2e-3]), "path_label": "x"}
     )
-    assert field_differences(one, other) == {"position_world_m": 2e-3, "path_label": 1.0}
-    assert field_differences(one, one) == {}
-    assert field_differences(one, finger(4)) == {"path_time_s": 3.0}
+    assert compute_field_differences(one, other) == {"position_world_m": 2e-3, "path_label": 1.0}
+    assert compute_field_differences(one, one) == {}
+    assert compute_field_differences(one, finger(4)) == {"path_time_s": 3.0}
 
 
 def test_instants_in_a_message_move_with_its_stamps() -> None:

@@ -83,7 +83,7 @@ def sockets_in(folder: Path) -> list[Path]:
 
 
 def assert_nothing_left(folder: Path) -> None:
-    for run in runs.all_runs():
+    for run in runs.list_runs():
         assert processes_of(run.id) == []
         assert not run.is_alive()
     assert sockets_in(folder) == []
@@ -128,7 +128,7 @@ async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Pa
         await graph.wait_ready(DEADLINE_S)
         assert graph.pids.keys() == {"beacon", "listener"}
         assert all(os.getsid(pid) == pid for pid in graph.pids.values())
-        assert [run.id for run in runs.live_runs()] == [graph.run.id]
+        assert [run.id for run in runs.list_live_runs()] == [graph.run.id]
         assert len(sockets_in(runs_root)) == 7
     assert graph.exit_codes == {"beacon": 0, "listener": 0}
     assert_nothing_left(runs_root)
@@ -509,7 +509,7 @@ def test_a_killed_launcher_leaves_no_node_behind(
     }
     process = start_command(started, "launch", str(write(tmp_path, nodes)))
     wait_for_words(process, "are ready")
-    (run,) = runs.live_runs()
+    (run,) = runs.list_live_runs()
     assert len(processes_of(run.id)) == 4
     process.kill()
     process.communicate(timeout=DEADLINE_S)
@@ -550,7 +550,7 @@ def test_old_runs_are_tidied_up(runs_root: Path) -> None:
     for i in range(runs.MAX_FINISHED_RUNS + 3):
         (runs_root / f"1.{i}.1").mkdir(parents=True)
     runs.sweep()
-    assert len(runs.all_runs()) == runs.MAX_FINISHED_RUNS
+    assert len(runs.list_runs()) == runs.MAX_FINISHED_RUNS
 
 
 def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:

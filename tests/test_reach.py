@@ -18,7 +18,7 @@ from flexsheet.launch.health.layout import (
     Layout,
     check_layout,
     draw_layout,
-    layout_result,
+    make_layout_result,
     make_samples,
     move_base,
     sample_contacts,
@@ -287,7 +287,7 @@ def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.reachable
     assert demo.remedies == ()
     assert demo.blocked_paths == ()
-    result = layout_result(demo)
+    result = make_layout_result(demo)
     assert result["share"] == 1.0
     assert result["share_at_working_speed"] == 1.0
     # Its edges are 0.12 m long each way: quick strokes round so small an object turn them too fast.
@@ -302,8 +302,8 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert demo.samples.depth_m.max() == SCENE.working_range.push_depth_m
     # Along the whole object, and rolled up and down the sheet.
     assert np.ptp(demo.samples.contact_world_m[:, 0]) == pytest.approx(0.12, abs=1e-6)
-    contact = demo.samples.contact_world_m - demo.samples.places.world_from_sheet[:, :3, 3]
-    along = np.einsum("ni,ni->n", contact, demo.samples.places.world_from_sheet[:, :3, 1])
+    contact = demo.samples.contact_world_m - demo.samples.poses.world_from_sheet[:, :3, 3]
+    along = np.einsum("ni,ni->n", contact, demo.samples.poses.world_from_sheet[:, :3, 1])
     rolled = most * require_cylinder(SCENE).radius_m
     assert along.max() > rolled
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
@@ -313,7 +313,7 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
     assert not barred.reachable
     assert barred.right.reachable.all()
     assert not barred.left.reachable.all()
-    binding = {one["limit"] for one in layout_result(barred)["arms"]["left"]["binding"]}
+    binding = {one["limit"] for one in make_layout_result(barred)["arms"]["left"]["binding"]}
     assert {"reach", "J3 range"} <= binding
     moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
     assert len(moved) == 1
@@ -327,7 +327,7 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
 
 def test_the_first_place_that_binds_is_the_nearest_to_the_front(barred: Layout) -> None:
     samples, binding = barred.samples, barred.left.binding
-    for one in layout_result(barred)["arms"]["left"]["binding"]:
+    for one in make_layout_result(barred)["arms"]["left"]["binding"]:
         same = binding == LIMITS.index(one["limit"])
         assert abs(one["first_tilt_rad"]) == pytest.approx(
             float(np.abs(samples.tilt_rad[same]).min()), abs=1e-5
@@ -363,7 +363,7 @@ def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> 
     content["object"]["geometry"] = geometry
     scene = Scene.model_validate(content)
     found = check_layout(scene)
-    assert len(found.samples.places) > 20
+    assert len(found.samples.poses) > 20
     assert found.reachable is reachable
 
 

@@ -101,8 +101,8 @@ def test_what_is_kept_does_not_grow_with_what_came() -> None:
     assert 3 <= len(shots) <= 6
     spread = np.diff([shot.seconds for shot in shots if not shot.marked])
     assert spread.max() <= 2 * spread.min(), "all over the session"
-    assert album.seen == 100
-    assert len(events.held) == 6
+    assert album.count == 100
+    assert len(events.stored) == 6
     assert events.counts == {"gap": 100, "estop": 1}
 
 
@@ -112,7 +112,7 @@ def test_of_many_moments_the_first_are_shown_and_the_rest_counted() -> None:
         album.add(float(i), "", (("left", np.zeros((2, 2), np.uint8)),))
     assert len(album.shots()) == MAX_BOOKMARK_SHOTS
     assert album.left_out == 500 - MAX_BOOKMARK_SHOTS
-    assert album.seen == 500
+    assert album.count == 500
 
 
 def test_states_last_until_another_and_gaps_stay_white() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
-from flexsheet.launch.running.host import list_arms, recording_folder
+from flexsheet.launch.running.host import find_recording_folder, list_arms
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes import NODES, NodeRole, node_class
 from flexsheet.nodes.node import Node, NodeParameters, Output, find_role
@@ -66,7 +66,7 @@ def test_a_recorder_of_another_class_is_one(tmp_path: Path) -> None:
     bag = tmp_path / "a.mcap"
     recorder = {"type": f"{__name__}:OwnRecorder", "parameters": {"bag": str(bag)}}
     plan = plan_with(tmp_path, own, recorder=recorder)
-    assert recording_folder(plan.nodes_on(None)) == tmp_path
+    assert find_recording_folder(plan.nodes_on(None)) == tmp_path
 
 
 def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None:

@@ -94,6 +94,6 @@ def test_without_root_one_line_names_the_packages(
 
 
 def test_what_is_there_is_found_and_what_is_not_is_named() -> None:
-    assert system.missing_files(programs=["sh"], libraries=["libc.so.6"]) is None
-    found = system.missing_files(programs=["no-such-program"], libraries=["libnone.so.9"])
+    assert system.find_missing_files(programs=["sh"], libraries=["libc.so.6"]) is None
+    found = system.find_missing_files(programs=["no-such-program"], libraries=["libnone.so.9"])
     assert found == "no no-such-program, no libnone.so.9"

@@ -47,6 +47,14 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.models.rigid import transform_from_rpy
 
+try:
+    import foxglove
+    from foxglove import messages as fg
+except ImportError:
+    HAS_FOXGLOVE = False
+else:
+    HAS_FOXGLOVE = True
+
 PLOTTED = 64
 """Maximum size of an array that is exported as numbers."""
 
@@ -54,7 +62,7 @@ SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
 FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
 LOST_COLOUR = (0.60, 0.60, 0.60, 0.5)
-SHEET_HEIGHT_M, FINGER_RADIUS_M = 0.24, 0.007
+FINGER_RADIUS_M = 0.007
 
 NamedImage = tuple[str, NDArray[np.uint8]]
 Output = tuple[str, Any]
@@ -93,7 +101,10 @@ def export(
     topics: names; default: all. A topic whose type has changed since the recording cannot be read,
     and is named in the result. Raises ExportError and BagError.
     """
-    foxglove = _import_foxglove()
+    if not HAS_FOXGLOVE:
+        raise ExportError(
+            "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
+        )
     if output.exists():
         raise ExportError(f"{output}: exists already; name a new file")
     reader = BagReader(bag)
@@ -118,8 +129,8 @@ def export(
                 _check_free_space(output)
                 at_ns = log_time_ns + (offset_ns or 0)
                 views = state.views(topic, message, at_ns)
-                for name, value in (*list_numbers(topic, message), *views):
-                    channel = channels.get(name) or _channel(foxglove, name, value, context)
+                for name, value in ((topic, _plain(message)), *views):
+                    channel = channels.get(name) or _channel(name, value, context)
                     channels[name] = channel
                     channel.log(value, log_time=at_ns)
                     result.messages[name] = result.messages.get(name, 0) + 1
@@ -143,11 +154,6 @@ def _check_free_space(output: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def list_numbers(topic: str, message: Message) -> Iterator[Output]:
-    """Yield the message as JSON, without its large arrays."""
-    yield topic, _plain(message)
-
-
 @dataclass(slots=True)
 class ViewState:
     """Latest scene, skin and flanges, which the drawing of later messages needs."""
@@ -158,8 +164,6 @@ class ViewState:
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
         """Yield images and 3D data of a message: (channel, message of foxglove)."""
-        from foxglove import messages as fg
-
         stamp = fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
         match message:
             case Scene():
@@ -190,8 +194,6 @@ class ViewState:
             yield name, _raw_image(name, image, stamp)
 
     def _finger(self, message: Fingertip, stamp: Any) -> Any:
-        from foxglove import messages as fg
-
         radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
         colour = _colour(FINGER_COLOUR if message.valid else LOST_COLOUR)
         ball = fg.SpherePrimitive(
@@ -239,16 +241,6 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
             yield f"{topic}/expected", message.expected
 
 
-def _import_foxglove() -> Any:
-    try:
-        import foxglove
-    except ImportError as error:
-        raise ExportError(
-            "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
-        ) from error
-    return foxglove
-
-
 def _wall_clock_offset_ns(reader: BagReader) -> int | None:
     """Return the offset from the recorder's clock to 1970, ns; None if it is unknown."""
     recording = reader.metadata.get("recording", {})
@@ -259,7 +251,7 @@ def _wall_clock_offset_ns(reader: BagReader) -> int | None:
         return None
 
 
-def _channel(foxglove: Any, name: str, value: Any, context: Any) -> Any:
+def _channel(name: str, value: Any, context: Any) -> Any:
     if isinstance(value, dict):
         shape = json.dumps(_make_schema(value)).encode()
         schema = foxglove.Schema(name=f"flexsheet.{name}", encoding="jsonschema", data=shape)
@@ -310,8 +302,6 @@ def _mesh(
     stamp: Any,
     colour: tuple[float, float, float, float] = SKIN_COLOUR,
 ) -> Any:
-    from foxglove import messages as fg
-
     surface = fg.TriangleListPrimitive(
         pose=_pose(np.eye(4)),
         points=[_point(vertex) for vertex in vertices],
@@ -323,8 +313,6 @@ def _mesh(
 
 
 def _frames(world_from: dict[str, NDArray[np.float64]], stamp: Any) -> Any:
-    from foxglove import messages as fg
-
     transforms = []
     for name, matrix in world_from.items():
         transforms.append(
@@ -340,8 +328,6 @@ def _frames(world_from: dict[str, NDArray[np.float64]], stamp: Any) -> Any:
 
 
 def _raw_image(name: str, image: NDArray[np.uint8], stamp: Any) -> Any:
-    from foxglove import messages as fg
-
     height, width = image.shape[:2]
     channels = 1 if image.ndim == 2 else image.shape[2]
     return fg.RawImage(
@@ -362,31 +348,21 @@ def _translation(position: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pose(matrix: NDArray[np.float64]) -> Any:
-    from foxglove import messages as fg
-
     return fg.Pose(position=_vector(matrix[:3, 3]), orientation=_rotation(matrix))
 
 
 def _vector(vector: NDArray[np.float64]) -> Any:
-    from foxglove import messages as fg
-
     return fg.Vector3(x=vector[0], y=vector[1], z=vector[2])
 
 
 def _rotation(matrix: NDArray[np.float64]) -> Any:
-    from foxglove import messages as fg
-
     x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
     return fg.Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _point(position: NDArray[Any]) -> Any:
-    from foxglove import messages as fg
-
     return fg.Point3(x=float(position[0]), y=float(position[1]), z=float(position[2]))
 
 
 def _colour(rgba: tuple[float, float, float, float]) -> Any:
-    from foxglove import messages as fg
-
     return fg.Color(r=rgba[0], g=rgba[1], b=rgba[2], a=rgba[3])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run
-from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter, topics_for_tools
+from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter, list_tool_topics
 from flexsheet.messages.bag import BagError, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock
@@ -44,7 +44,7 @@ def select_topics(
 
     Raises BagError if a wanted topic cannot be played.
     """
-    writable = topics_for_tools(plan)
+    writable = list_tool_topics(plan)
     left_out = {}
     chosen = []
     for name in recorded:

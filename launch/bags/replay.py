@@ -450,20 +450,22 @@ def compare(
         if live is None:
             continue
         comparison.compared += 1
-        differences = field_differences(live, message)
+        differences = compute_field_differences(live, message)
         comparison.beyond_tolerance += any(size > tolerance for size in differences.values())
         for name, size in differences.items():
             comparison.worst[name] = max(size, comparison.worst.get(name, 0.0))
     return comparisons
 
 
-def field_differences(one: BaseModel, other: BaseModel, prefix: str = "") -> dict[str, float]:
-    """Return the differences by field; see `Comparison.worst`."""
+def compute_field_differences(
+    one: BaseModel, other: BaseModel, prefix: str = ""
+) -> dict[str, float]:
+    """Compute the differences by field; see `Comparison.worst`."""
     found: dict[str, float] = {}
     for name in type(one).model_fields:
         a, b = getattr(one, name), getattr(other, name)
         if isinstance(a, BaseModel) and isinstance(b, BaseModel):
-            found |= field_differences(a, b, f"{prefix}{name}.")
+            found |= compute_field_differences(a, b, f"{prefix}{name}.")
             continue
         size = _difference(a, b)
         if size > 0:
@@ -503,4 +505,4 @@ def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: Resol
             f"record it with: flexsheet bag record BAG {options}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):
-        raise BagError(f"{bag}: contains no input of {node.name}; there is nothing to replay")
+        raise BagError(f"{bag}: contains no input of {node.name}; replay another node")

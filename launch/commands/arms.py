@@ -92,13 +92,13 @@ def stop(
 
     Exit code 0 if a launcher or a bridge has confirmed the stop, or both arms report it.
     """
-    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
 
     if sent_early:
         attempts = sent_early.pop()
     else:
-        attempts = stop_arms([run] if run else [one.directory for one in live_runs()], reason)
+        attempts = stop_arms([run] if run else [one.directory for one in list_live_runs()], reason)
     raise typer.Exit(run_interruptible(_confirm_stop(run, reason, attempts, as_json)))
 
 
@@ -158,12 +158,14 @@ def reset(
 
 def _describe_reset(plan: ResolvedGraph) -> str:
     """Return a text about what the arms do after a reset, from their bridges' `arming`."""
+    from flexsheet.launch.plans.plan_model import ArmingMode
+
     arming = {
-        str(node.arm_side): node.parameters.get("arming")
+        str(node.arm_side): node.arming
         for node in plan.nodes.values()
         if node.role is NodeRole.ARM_BRIDGE
     }
-    waiting = [side for side, kind in arming.items() if kind != "auto"]
+    waiting = [side for side, mode in arming.items() if mode is not ArmingMode.AUTO]
     free = [side for side in arming if side not in waiting]
     sentences = ["reset"]
     if waiting:

@@ -53,9 +53,9 @@ def gestures(incomplete: str) -> list[str]:
 
 def runs(incomplete: str) -> list[str]:
     """Complete the directories of running graphs."""
-    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import list_live_runs
 
-    return _filter((str(run.directory) for run in live_runs()), incomplete)
+    return _filter((str(run.directory) for run in list_live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:

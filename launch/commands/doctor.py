@@ -105,7 +105,7 @@ def check_scene(
     Checks every contact within the scene's tilt and depth, at minimum and maximum stretch, and
     prints the maximum finger speed that the arms can follow.
     """
-    from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
+    from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
     if output is not None:
@@ -113,7 +113,7 @@ def check_scene(
     scene = load_scene(scene_file)
     with progress_words() as progress:
         layout = check_layout(scene, progress=progress)
-    result = layout_result(layout)
+    result = make_layout_result(layout)
     if output is not None:
         try:
             draw_layout(layout, output)

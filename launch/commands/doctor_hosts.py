@@ -86,10 +86,10 @@ def hosts(
 
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     """Return the findings about all hosts of the running graph; an empty list for a single host."""
-    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.tools import tools_host
 
-    if not any(run.plan_file.is_file() for run in live_runs()):
+    if not any(run.plan_file.is_file() for run in list_live_runs()):
         return []
     plan, run = running_graph(None)
     if len(plan.hosts) == 1:
@@ -114,7 +114,7 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
     """Return the name of this computer in the graph. Raises CommandError if it is ambiguous."""
-    from flexsheet.launch.health.doctor_hosts import own_addresses
+    from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN
     from flexsheet.launch.running.tools import tools_host
@@ -128,7 +128,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
         return requested
     if run is not None:
         return tools_host(run)
-    own = own_addresses()
+    own = list_own_addresses()
     found = [name for name, address in plan.hosts.items() if address in own]
     if MAIN in found or len(found) == 1:
         return MAIN if MAIN in found else found[0]

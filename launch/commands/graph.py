@@ -51,7 +51,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
     Raises CommandError for a directory without a plan, NoGraphError if no graph is running.
     """
     from flexsheet.launch.plans.plan_model import ResolvedGraph
-    from flexsheet.launch.running.runs import Run, live_runs
+    from flexsheet.launch.running.runs import Run, list_live_runs
 
     if directory is not None:
         run = Run(directory.resolve().name, directory.resolve())
@@ -61,7 +61,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
                 BAD_INPUT,
             )
     else:
-        ready = [run for run in live_runs() if run.plan_file.is_file()]
+        ready = [run for run in list_live_runs() if run.plan_file.is_file()]
         if not ready:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]

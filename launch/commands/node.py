@@ -31,11 +31,11 @@ app = typer.Typer(
 )
 def list_nodes(as_json: JsonOption = False) -> None:
     """List the node types for launch files, and the nodes of the running graph."""
-    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.nodes import NODES
 
     running: dict[str, list[str]] = {}
-    if live_runs():
+    if list_live_runs():
         plan, _ = running_graph(None)
         for node in plan.nodes.values():
             running.setdefault(node.type, []).append(node.name)

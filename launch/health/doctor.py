@@ -13,11 +13,11 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from flexsheet.launch.health.system import OPENGL, opengl_problem
+from flexsheet.launch.health.system import OPENGL, find_opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
-from flexsheet.launch.running.runs import find_orphans, is_free, live_runs, root
+from flexsheet.launch.running.runs import find_orphans, is_free, list_live_runs, root
 from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
@@ -90,7 +90,7 @@ def check_python() -> Finding:
 def check_libraries() -> Finding:
     """Check that every requirement of the distribution is installed."""
     try:
-        wanted = requires("flexsheet") or []
+        requirements = requires("flexsheet") or []
     except PackageNotFoundError:
         return Finding(
             "libraries", "warning", "the package flexsheet is not installed", "make setup"
@@ -98,7 +98,7 @@ def check_libraries() -> Finding:
     missing = []
     names = [
         match[0]
-        for line in wanted
+        for line in requirements
         if "extra ==" not in line and (match := re.match(r"[A-Za-z0-9._-]+", line))
     ]
     for name in names:
@@ -124,7 +124,7 @@ def check_opencv() -> Finding:
 
 def check_opengl() -> Finding:
     """Check that a headless OpenGL context can be created."""
-    problem = opengl_problem()
+    problem = find_opengl_problem()
     if problem is None:
         return Finding("opengl", "ok", "a headless context can be created (EGL)")
     return Finding("opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
@@ -178,7 +178,7 @@ def check_sockets() -> Finding:
             f"{directory} belongs to another user",
             "set FLEXSHEET_RUNS to another folder",
         )
-    return Finding("sockets", "ok", f"{directory}, {len(live_runs())} graphs are running")
+    return Finding("sockets", "ok", f"{directory}, {len(list_live_runs())} graphs are running")
 
 
 def check_leftovers() -> Finding:

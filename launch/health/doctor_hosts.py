@@ -17,14 +17,14 @@ import psutil
 
 from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries
 from flexsheet.launch.health.probe import HostProbe, Reachability
-from flexsheet.launch.health.system import OPENGL, opengl_problem
+from flexsheet.launch.health.system import OPENGL, find_opengl_problem
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
 from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT
 from flexsheet.launch.running.host import (
+    find_recording_folder,
     list_device_files,
     python_version,
-    recording_folder,
     software,
 )
 from flexsheet.launch.running.keys import secret_file
@@ -103,7 +103,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.KEY_REJECTED: (
         "keys",
-        "it rejects the key of {here}: its launch file has none or another for {here}",
+        "it rejects the key of {here}: its launch file has no key or another key for {here}",
         "copy {file} from here to {host}; its launcher reloads it automatically",
     ),
     Reachability.UNENCRYPTED: (
@@ -391,7 +391,7 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
             "devices",
             "failed",
             f"missing: {', '.join(missing)}",
-            "check that it is plugged in, and its number: v4l2-ctl --list-devices",
+            "check its cable and its number: v4l2-ctl --list-devices",
         )
     elif devices:
         yield HostFinding(host, "devices", "ok", ", ".join(devices))
@@ -508,14 +508,14 @@ def check_before_start(
 ) -> Iterator[HostFinding]:
     """Check this computer as a host of the graph before the graph is started."""
     address, nodes = plan.hosts[here], plan.nodes_on(here)
-    if is_loopback(address) or address in own_addresses():
+    if is_loopback(address) or address in list_own_addresses():
         yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
     else:
         yield HostFinding(
             here,
             "address",
             "failed",
-            f"{address} is not an address of this computer: {', '.join(sorted(own_addresses()))}",
+            f"{address} is not one of this computer's: {', '.join(sorted(list_own_addresses()))}",
             "name the right host with --host, or correct the launch file on all hosts",
         )
     if key_problem is not None:
@@ -539,13 +539,13 @@ def check_before_start(
     devices = list_device_files(nodes)
     missing = [one for one in devices if not os.path.exists(one)]
     if missing:
-        remedy = "check that it is plugged in, and its number: v4l2-ctl --list-devices"
+        remedy = "check its cable and its number: v4l2-ctl --list-devices"
         what = f"missing: {', '.join(missing)}"
         yield HostFinding(here, "devices", "failed", what, remedy)
     elif devices:
         yield HostFinding(here, "devices", "ok", ", ".join(devices))
     if any(node.role is NodeRole.RENDERER for node in nodes):
-        problem = opengl_problem()
+        problem = find_opengl_problem()
         if problem is None:
             yield HostFinding(here, "opengl", "ok", "a headless context can be created (EGL)")
         else:
@@ -553,27 +553,27 @@ def check_before_start(
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
             yield _check_controller(here, node)
-    folder = recording_folder(nodes)
+    folder = find_recording_folder(nodes)
     yield _check_disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
 
 
 def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     """Check that the TCP ports of this host are free."""
     address = plan.hosts[here]
-    wanted = [
+    ports = [
         int(writer.tcp.rpartition(":")[2])
         for writers in plan.writers.values()
         for writer in writers
         if writer.tcp is not None and writer.host == here
     ]
-    is_own = is_loopback(address) or address in own_addresses()
-    used = [port for port in wanted if is_own and not is_free(address, port)]
+    is_own = is_loopback(address) or address in list_own_addresses()
+    used = [port for port in ports if is_own and not is_free(address, port)]
     used += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
         what = f"in use: {', '.join(map(str, sorted(used)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
-    return HostFinding(here, "ports", "ok", f"{len(wanted)} are free")
+    return HostFinding(here, "ports", "ok", f"{len(ports)} are free")
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
@@ -595,7 +595,7 @@ def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
     return HostFinding(here, check, "ok", f"{address}:{port} accepts connections")
 
 
-def own_addresses() -> set[str]:
+def list_own_addresses() -> set[str]:
     """Return the IP addresses of this computer."""
     families = (socket.AF_INET, socket.AF_INET6)
     return {

@@ -155,8 +155,8 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     with the largest positions on the sheet are used, limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
-    place = scene.object.world_from_object
-    world_from_object = transform_from_rpy(place.position_m, place.rpy_rad)
+    pose = scene.object.world_from_object
+    world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
     home = world_from_object[:3, :3].T
     most = np.array([0.5 * scene.sheet.width_m - CLAMP_MARGIN_M, scene.sheet.usable_half_height_m])
     found = _find_touchable_points(scene, world_from_object, shape.closest)
@@ -192,12 +192,12 @@ def _find_touchable_points(
     most = scene.working_range.tilt_rad
     low, high = (np.array(v) for v in (scene.finger.volume_min_m, scene.finger.volume_max_m))
     fractions = np.linspace(0.0, 1.0, 3)
-    beside = [
+    offsets = [
         np.array([x, y, 0.0])
         for x in low[0] + fractions * (high[0] - low[0])
         for y in low[1] + fractions * (high[1] - low[1])
     ]
-    middle = world_from_object[:3, 3]
+    centre = world_from_object[:3, 3]
     queries = []
     for up, side in product(np.linspace(-most, most, TILTS), np.linspace(-most, most, SIDE_TILTS)):
         lean = float(np.hypot(up, side))
@@ -205,7 +205,7 @@ def _find_touchable_points(
             continue
         aside = np.array([side, up]) / lean if lean > 0.0 else np.zeros(2)
         away = np.array([*(np.sin(lean) * aside), np.cos(lean)])
-        queries += [middle + VIEW_DISTANCE_M * away + offset for offset in beside]
+        queries += [centre + VIEW_DISTANCE_M * away + offset for offset in offsets]
     found = closest(apply(inverse(world_from_object), np.array(queries)))
     front = world_from_object[:3, :3].T[:, 2]
     leans = np.arccos(np.clip(found.normal @ front, -1.0, 1.0))
@@ -214,10 +214,10 @@ def _find_touchable_points(
         near = (
             np.linalg.norm(found.point[chosen] - found.point[index], axis=1) < DUPLICATE_DISTANCE_M
         )
-        alike = (
+        similar = (
             np.linalg.norm(found.normal[chosen] - found.normal[index], axis=1) < DUPLICATE_NORMAL
         )
-        if not (near & alike).any():
+        if not (near & similar).any():
             chosen.append(int(index))
     return [
         Nearest(
@@ -417,7 +417,7 @@ def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
     return None
 
 
-def layout_result(layout: Layout) -> dict[str, Any]:
+def make_layout_result(layout: Layout) -> dict[str, Any]:
     """Return the result of `doctor scene --json`."""
     return {
         "scene": layout.scene.name,
@@ -546,12 +546,7 @@ class _Grid:
         columns = np.rint((tilt + most) / (2.0 * most) * (TILTS - 1)).astype(np.intp)
         rows = np.rint(depth / deepest * (DEPTHS - 1)).astype(np.intp)
         wide, high = np.degrees(most) / (TILTS - 1), 0.5e3 * deepest / (DEPTHS - 1)
-        extent = (
-            -np.degrees(most) - wide,
-            np.degrees(most) + wide,
-            -high,
-            1e3 * deepest + high,
-        )
+        extent = (-np.degrees(most) - wide, np.degrees(most) + wide, -high, 1e3 * deepest + high)
         frame = {"origin": "lower", "aspect": "auto", "extent": extent}
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 

@@ -39,7 +39,7 @@ class SystemPackages:
         return f"sudo apt-get install -y {' '.join(self.packages)}"
 
 
-def opengl_problem() -> str | None:
+def find_opengl_problem() -> str | None:
     """Return why no headless OpenGL context can be created; None if one can.
 
     Another process tries it, because a driver that failed once fails again in its process.
@@ -54,7 +54,9 @@ def opengl_problem() -> str | None:
     return lines[-1] if lines else f"exit code {result.returncode}"
 
 
-def missing_files(*, programs: Sequence[str] = (), libraries: Sequence[str] = ()) -> str | None:
+def find_missing_files(
+    *, programs: Sequence[str] = (), libraries: Sequence[str] = ()
+) -> str | None:
     """Return which programs and shared libraries are missing; None if none is."""
     path = os.pathsep.join([os.environ.get("PATH", os.defpath), *SYSTEM_PATHS])
     missing = [name for name in programs if shutil.which(name, path=path) is None]
@@ -67,32 +69,28 @@ def missing_files(*, programs: Sequence[str] = (), libraries: Sequence[str] = ()
 
 
 OPENGL = SystemPackages(
-    "headless OpenGL", ("libegl1", "libgl1-mesa-dri"), opengl_problem, tests_only=False
+    "headless OpenGL", ("libegl1", "libgl1-mesa-dri"), find_opengl_problem, tests_only=False
 )
 
 TABLE = (
     OPENGL,
     SystemPackages(
-        "browser tests",
-        ("chromium",),
-        lambda: missing_files(programs=["chromium"]),
+        "browser tests", ("chromium",), lambda: find_missing_files(programs=["chromium"])
     ),
     SystemPackages(
         "window tests",
         ("xvfb", "libgl1", "libglx-mesa0", "libxrandr2"),
-        lambda: missing_files(
+        lambda: find_missing_files(
             programs=["Xvfb"], libraries=["libGL.so.1", "libGLX_mesa.so.0", "libXrandr.so.2"]
         ),
     ),
     SystemPackages(
-        "network namespace tests",
-        ("iproute2",),
-        lambda: missing_files(programs=["ip"]),
+        "network namespace tests", ("iproute2",), lambda: find_missing_files(programs=["ip"])
     ),
     SystemPackages(
         "tests of systemd units",
         ("systemd",),
-        lambda: missing_files(programs=["systemd-analyze"]),
+        lambda: find_missing_files(programs=["systemd-analyze"]),
     ),
 )
 """System packages by purpose."""
@@ -139,8 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Check the system packages.")
     parser.add_argument("--tests", action="store_true", help="check packages for tests, too")
     tests = parser.parse_args(arguments).tests
-    wanted = [one for one in TABLE if tests or not one.tests_only]
-    missing = [one for one in wanted if one.problem() is not None]
+    required = [one for one in TABLE if tests or not one.tests_only]
+    missing = [one for one in required if one.problem() is not None]
     if missing and can_install():
         missing = install(missing)
     if missing:

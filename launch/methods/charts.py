@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
-from flexsheet.launch.running.code_state import git_state
+from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
@@ -72,7 +72,7 @@ def load_family(path: str) -> Family:
 
 def git_commit() -> str | None:
     """Return the commit of this code, or None if unknown."""
-    commit: str | None = json.loads(git_state(ROOT))["commit"]
+    commit: str | None = json.loads(read_git_state(ROOT))["commit"]
     return commit
 
 
@@ -125,7 +125,7 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
         "sweep_key": family.sweep_key,
         "machine": machine_name(),
         "load": os.getloadavg()[0],
-        "code": json.loads(git_state(ROOT)),
+        "code": json.loads(read_git_state(ROOT)),
         "points": [asdict(point) for point in points],
         "front": pareto_front(points),
     }

@@ -20,7 +20,7 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.apparatus import Apparatus, identify_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import role_of
+from flexsheet.nodes.node import find_role
 from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
 from flexsheet.nodes.twin.truth import SimulatorParameters, check_truth
 
@@ -109,42 +109,35 @@ def give_apparatus(
     entries: list[NodeEntry],
     apparatus: Apparatus | None,
     document: Document,
-    problems: list[Problem],
 ) -> None:
     """Set the apparatus as a parameter of all simulator nodes, and of no other node."""
     simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
     for entry in simulators:
         if "apparatus" in entry.spec.parameters:
-            problems.append(
-                document.problem(
-                    (*entry.key, "parameters", "apparatus"),
-                    "is given in the launch file",
-                    "remove it, and use the option --apparatus: all nodes need the same",
-                )
+            document.report(
+                (*entry.key, "parameters", "apparatus"),
+                "is given in the launch file",
+                "remove it, and use the option --apparatus: all nodes need the same",
             )
         elif apparatus is not None and entry.parameters is not None:
             entry.parameters = entry.parameters.model_copy(update={"apparatus": apparatus})
     if apparatus is not None and not simulators:
-        problems.append(
+        document.problems.append(
             Problem("--apparatus", (), "the graph has no simulator node", "start a simulated graph")
         )
 
 
-def refuse_apparatus_readers(
-    entries: list[NodeEntry], document: Document, problems: list[Problem]
-) -> None:
+def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> None:
     """Check that only simulator nodes and the recorder read the apparatus."""
     for entry in entries:
-        if entry.type is None or role_of(entry.type) is NodeRole.RECORDER:
+        if entry.type is None or find_role(entry.type) is NodeRole.RECORDER:
             continue
         if isinstance(entry.parameters, SimulatorParameters):
             continue
         for port, topic in entry.topics("input"):
             if topic.name == TOPIC:
-                problems.append(
-                    document.problem(
-                        (*entry.key, "topics", port),
-                        f'"{entry.name}" would read the truth of the simulator',
-                        "disconnect the port: only the simulator and experiments may know it",
-                    )
+                document.report(
+                    (*entry.key, "topics", port),
+                    f'"{entry.name}" would read the truth of the simulator',
+                    "disconnect the port: only the simulator and experiments may know it",
                 )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -104,6 +104,11 @@ class BadInputError(FlexsheetError, ValueError):
         super().__init__("\n".join(str(problem) for problem in problems))
         self.problems = tuple(problems)
 
+    @classmethod
+    def single(cls, where: str, key: Key, what: str, remedy: str = "") -> Self:
+        """Make an error with one problem."""
+        return cls([Problem(where, key, what, remedy)])
+
 
 @dataclass(slots=True)
 class Document:
@@ -114,6 +119,7 @@ class Document:
     text: str
     lines: dict[Key, int]
     overrides: dict[Key, str] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
 
     def where(self, key: Key) -> str:
         """Return file and line of `key` or its nearest parent, or the option that overrides it."""
@@ -129,6 +135,19 @@ class Document:
         """Make a problem of a key of this document."""
         return Problem(self.where(key), key, what, remedy)
 
+    def report(self, key: Key, what: str, remedy: str = "") -> None:
+        """Add a problem, which `raise_problems` raises together with the others."""
+        self.problems.append(self.problem(key, what, remedy))
+
+    def error(self, key: Key, what: str, remedy: str = "") -> BadInputError:
+        """Make an error with one problem of this document."""
+        return BadInputError([self.problem(key, what, remedy)])
+
+    def raise_problems(self) -> None:
+        """Raise BadInputError if problems were reported."""
+        if self.problems:
+            raise BadInputError(self.problems)
+
     def set(self, key: Key, value: Any, origin: str) -> None:
         """Set the value at `key` and create missing mappings; errors name `origin`."""
         target: dict[Any, Any] = self.values
@@ -136,7 +155,7 @@ class Document:
             if target.get(part) is None:
                 target[part] = {}
             if not isinstance(target[part], dict):
-                raise BadInputError([Problem(origin, key, f'"{part}" is not a mapping')])
+                raise BadInputError.single(origin, key, f'"{part}" is not a mapping')
             target = target[part]
         target[key[-1]] = value
         self.overrides[key] = origin
@@ -214,33 +233,33 @@ def read_document(path: Path) -> Document:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         reason = error.strerror or str(error)
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {reason}", "check the path")]
+        raise BadInputError.single(
+            str(path), (), f"cannot be read: {reason}", "check the path"
         ) from error
     except UnicodeDecodeError as error:
-        raise BadInputError([Problem(str(path), (), f"is not UTF-8 text: {error}")]) from error
+        raise BadInputError.single(str(path), (), f"is not UTF-8 text: {error}") from error
     if len(text) > MAX_TEXT_LENGTH:
         what = f"has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
-        raise BadInputError([Problem(str(path), (), what)])
+        raise BadInputError.single(str(path), (), what)
     try:
         tree = _parse_tree(text)
         values = plain(tree)
     except DuplicateKeyError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
         what = (error.problem or "duplicate key").split("\n")[0]
-        raise BadInputError(
-            [Problem(f"{path}:{line}", (), what, "remove or rename one of the two")]
+        raise BadInputError.single(
+            f"{path}:{line}", (), what, "remove or rename one of the two"
         ) from error
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise BadInputError([Problem(where, (), f"not YAML: {error.problem}")]) from error
+        raise BadInputError.single(where, (), f"not YAML: {error.problem}") from error
     except YAMLError as error:
-        raise BadInputError([Problem(str(path), (), f"not YAML: {error}")]) from error
+        raise BadInputError.single(str(path), (), f"not YAML: {error}") from error
     if not isinstance(tree, CommentedMap):
         kind = _name_type(values)
-        raise BadInputError(
-            [Problem(str(path), (), f"is {kind}", "write a mapping of keys and values")]
+        raise BadInputError.single(
+            str(path), (), f"is {kind}", "write a mapping of keys and values"
         )
     return Document(path, values, text, dict(_lines(tree, ())))
 

@@ -5,89 +5,68 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    Key,
-    Problem,
-    read_document,
-    validate,
-)
+from flexsheet.launch.plans.documents import Document, Key, read_document, validate
 from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile
 from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN
 from flexsheet.messages.security import is_key
 
 
-def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
+def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
     """Check that addresses and keys are valid and unique."""
     if MAIN not in hosts:
-        problems.append(
-            document.problem(
-                ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
-            )
+        document.report(
+            ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
         )
-    _check_keys(hosts, document, problems)
-    seen: dict[str, str] = {}
+    _check_keys(hosts, document)
+    host_by_address: dict[str, str] = {}
     for name, host in hosts.items():
         key: Key = ("hosts", name, "address")
         try:
             address = ipaddress.ip_address(host.address)
         except ValueError:
-            problems.append(
-                document.problem(
-                    key, f'"{host.address}" is not an IP address', 'write it as "192.0.2.10"'
-                )
+            document.report(
+                key, f'"{host.address}" is not an IP address', 'write it as "192.0.2.10"'
             )
             continue
         if address.is_unspecified or address.is_multicast:
-            problems.append(
-                document.problem(
-                    key,
-                    f'"{host.address}" is not the address of one host',
-                    "give the host's own address",
-                )
+            document.report(
+                key,
+                f'"{host.address}" is not the address of one host',
+                "give the host's own address",
             )
-        other = seen.setdefault(host.address, name)
+        other = host_by_address.setdefault(host.address, name)
         if other != name:
-            problems.append(
-                document.problem(
-                    key,
-                    f'"{host.address}" is also the address of host "{other}"',
-                    "merge the two hosts",
-                )
+            document.report(
+                key,
+                f'"{host.address}" is also the address of host "{other}"',
+                "merge the two hosts",
             )
 
 
-def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
+def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
     """Check that each host has a separate valid key, if any host has a key."""
-    seen: dict[str, str] = {}
+    host_by_key: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")
         if host.key is None:
             if any(other.key is not None for other in hosts.values()):
-                problems.append(
-                    document.problem(
-                        ("hosts", name),
-                        "has no key, but other hosts do",
-                        f"create one on that host (flexsheet keys new {name}), then: "
-                        f"flexsheet keys install FILE {name} KEY",
-                    )
+                document.report(
+                    ("hosts", name),
+                    "has no key, but other hosts do",
+                    f"create one on that host (flexsheet keys new {name}), then: "
+                    f"flexsheet keys install FILE {name} KEY",
                 )
         elif not is_key(host.key):
-            problems.append(
-                document.problem(
-                    where,
-                    f'"{host.key}" is not a public key',
-                    f"give the 40 characters that `flexsheet keys show {name}` prints",
-                )
+            document.report(
+                where,
+                f'"{host.key}" is not a public key',
+                f"give the 40 characters that `flexsheet keys show {name}` prints",
             )
-        elif seen.setdefault(host.key, name) != name:
-            problems.append(
-                document.problem(
-                    where,
-                    f'is also the key of host "{seen[host.key]}"',
-                    "give each host its own key",
-                )
+        elif host_by_key.setdefault(host.key, name) != name:
+            document.report(
+                where,
+                f'is also the key of host "{host_by_key[host.key]}"',
+                "give each host its own key",
             )
 
 
@@ -98,10 +77,8 @@ def load_keys(path: Path) -> dict[str, str]:
     """
     document = read_document(path)
     spec = validate(LaunchFile, document)
-    problems: list[Problem] = []
-    check_hosts(spec.hosts, document, problems)
-    if problems:
-        raise BadInputError(problems)
+    check_hosts(spec.hosts, document)
+    document.raise_problems()
     return {name: host.key for name, host in spec.hosts.items() if host.key is not None}
 
 

@@ -8,13 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 from ruamel.yaml.error import YAMLError
 
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    Problem,
-    did_you_mean,
-    parse_value,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, did_you_mean, parse_value
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
@@ -108,12 +102,8 @@ def apply_setting(document: Document, setting: str) -> None:
     target, equals, text = setting.partition("=")
     node, dot, parameter = target.partition(".")
     if not (equals and dot and node and parameter):
-        raise BadInputError(
-            [
-                Problem(
-                    origin, (), "node, parameter or value is missing", "write node.parameter=value"
-                )
-            ]
+        raise BadInputError.single(
+            origin, (), "node, parameter or value is missing", "write node.parameter=value"
         )
     names = document.values.get("nodes")
     known = list(names) if isinstance(names, dict) else []
@@ -122,33 +112,27 @@ def apply_setting(document: Document, setting: str) -> None:
         value = parse_value(text)
     except YAMLError as error:
         reason = str(error).splitlines()[0]
-        raise BadInputError(
-            [Problem(origin, (), f'"{text}" is not a value in YAML: {reason}', "quote the value")]
+        raise BadInputError.single(
+            origin, (), f'"{text}" is not a value in YAML: {reason}', "quote the value"
         ) from error
     if node in known:
         if not isinstance(document.values["nodes"][node], dict):
-            raise BadInputError(
-                [
-                    document.problem(
-                        ("nodes", node), "is not a mapping", "write the node's keys below it"
-                    )
-                ]
+            raise document.error(
+                ("nodes", node), "is not a mapping", "write the node's keys below it"
             )
         document.set(("nodes", node, "parameters", *inner), value, origin)
     elif node == "recorder" and "record" in document.values:
         document.set(("record", *inner), value, origin)
     else:
-        raise BadInputError(
-            [Problem(origin, (), f'unknown node "{node}"', did_you_mean(node, known))]
-        )
+        raise BadInputError.single(origin, (), f'unknown node "{node}"', did_you_mean(node, known))
 
 
 def apply_record(document: Document, bag: Path) -> None:
     """Apply the option --record: set the bag of the recorder; add a recorder if necessary."""
     origin = f"--record {bag}"
     if bag.exists():
-        raise BadInputError(
-            [Problem(origin, (), "exists already", "name a new file; bags are never overwritten")]
+        raise BadInputError.single(
+            origin, (), "exists already", "name a new file; bags are never overwritten"
         )
     names = document.values.get("nodes")
     for name, spec in names.items() if isinstance(names, dict) else ():

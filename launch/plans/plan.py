@@ -21,13 +21,7 @@ from flexsheet.launch.plans.apparatus import (
     load_apparatus,
     refuse_apparatus_readers,
 )
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    Problem,
-    read_document,
-    validate,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, read_document, validate
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -63,11 +57,7 @@ from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
 def load_graph(
-    path: Path,
-    *,
-    settings: Sequence[str] = (),
-    record: Path | None = None,
-    console: bool = False,
+    path: Path, *, settings: Sequence[str] = (), record: Path | None = None, console: bool = False
     apparatus: str | None = None,
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
@@ -86,29 +76,22 @@ def load_graph(
     for setting in settings:
         apply_setting(document, setting)
     spec = validate(LaunchFile, document)
-    problems: list[Problem] = []
-    check_hosts(spec.hosts, document, problems)
-    scene_document, scene = _load_scene(spec, document, problems)
-    entries = collect_entries(spec, document, problems)
+    check_hosts(spec.hosts, document)
+    scene_document, scene = _load_scene(spec, document)
+    entries = collect_entries(spec, document)
     for entry in entries:
-        resolve_entry(entry, document, problems)
-    truth = _load_apparatus(apparatus, scene, problems)
-    give_apparatus(entries, truth, document, problems)
+        resolve_entry(entry, document)
+    truth = _load_apparatus(apparatus, scene, document.problems)
+    give_apparatus(entries, truth, document)
     writers = list_writers(
-        spec,
-        entries,
-        document,
-        problems,
-        has_scene=scene is not None,
-        has_apparatus=truth is not None,
+        spec, entries, document, has_scene=scene is not None, has_apparatus=truth is not None
     )
-    resolve_further_inputs(entries, writers, document, problems)
-    check_inputs(entries, writers, document, problems)
-    refuse_apparatus_readers(entries, document, problems)
-    check_calibrations(entries, scene, document, problems)
-    check_device_hosts(entries, spec, document, problems)
-    if problems:
-        raise BadInputError(problems)
+    resolve_further_inputs(entries, writers, document)
+    check_inputs(entries, writers, document)
+    refuse_apparatus_readers(entries, document)
+    check_calibrations(entries, scene, document)
+    check_device_hosts(entries, spec, document)
+    document.raise_problems()
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
     endpoints = make_endpoints(writers, addresses)
@@ -146,24 +129,20 @@ def load_graph(
     )
 
 
-def _load_scene(
-    spec: LaunchFile, document: Document, problems: list[Problem]
-) -> tuple[Document | None, Scene | None]:
+def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, Scene | None]:
     if spec.scene is None:
         return None, None
     path = document.path.parent / spec.scene
     if not path.is_file():
-        problems.append(
-            document.problem(
-                ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
-            )
+        document.report(
+            ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
         )
         return None, None
     try:
         scene_document = read_document(path)
         return scene_document, make_scene(scene_document)
     except BadInputError as error:
-        problems.extend(error.problems)
+        document.problems.extend(error.problems)
         return None, None
 
 

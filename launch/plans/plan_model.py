@@ -5,6 +5,7 @@ The module is separate from the resolver (`launch.plans.plan`), so that tools st
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, model_validator
@@ -39,6 +40,13 @@ ROLES_OF_TYPES = {
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
 """Names of calibration parameters, for plans in older bags that list no calibrations."""
+
+
+class ArmingMode(StrEnum):
+    """Values of the parameter `arming` of arm bridges."""
+
+    MANUAL = "manual"
+    AUTO = "auto"
 
 
 class StrictModel(LimitedModel):
@@ -110,14 +118,20 @@ class ResolvedNode(StrictModel):
     device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
     calibrations: dict[str, str] = Field(default={}, description="file by parameter")
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
-    liveness_s: float | None = Field(default=None, description="older bags have none")
-    nice: int = Field(default=0, description="older bags have none")
+    liveness_s: float | None = Field(default=None, description="None in older bags")
+    nice: int = Field(default=0, description="0 in older bags")
 
     @property
     def arm_side(self) -> str | None:
         """Return the side of the arm whose state the node publishes, or None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
+
+    @property
+    def arming(self) -> ArmingMode | None:
+        """Return who arms the node's arm; None for a node without that parameter."""
+        value = self.parameters.get("arming")
+        return ArmingMode(value) if value in tuple(ArmingMode) else None
 
     @model_validator(mode="before")
     @classmethod

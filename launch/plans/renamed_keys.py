@@ -10,10 +10,7 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
         "largest_lag_rad": "max_tracking_error_rad",
     },
     "console": {"drives_finger": "control_finger", "kept": "state_file"},
-    "fem_solver": {
-        "largest_depth_m": "max_depth_m",
-        "lead_s": "prediction_horizon_s",
-    },
+    "fem_solver": {"largest_depth_m": "max_depth_m", "lead_s": "prediction_horizon_s"},
     "planner": {
         "arrival_s": "actuation_delay_s",
         "largest_spin_rad": "max_spin_rad",
@@ -40,10 +37,7 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
         "mark_noise_px": "marker_noise_px",
         "mark_radius_m": "marker_radius_m",
     },
-    "twin_eye": {
-        "again_after_s": "min_interval_s",
-        "most_waiting": "max_queue",
-    },
+    "twin_eye": {"again_after_s": "min_interval_s", "most_waiting": "max_queue"},
 }
 """Old to new parameter names, by node type."""
 

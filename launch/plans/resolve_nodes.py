@@ -8,14 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from flexsheet.launch.plans.documents import (
-    BadInputError,
-    Document,
-    Key,
-    Problem,
-    did_you_mean,
-    validate,
-)
+from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
 from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
@@ -72,38 +65,30 @@ class NodeEntry:
         )
 
 
-def collect_entries(
-    spec: LaunchFile, document: Document, problems: list[Problem]
-) -> list[NodeEntry]:
+def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
     """Return the entries of all nodes, with the recorder and the clock nodes."""
     entries = []
     for name, node_spec in spec.nodes.items():
         entries.append(NodeEntry(name, node_spec, ("nodes", name)))
         taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS, *RUN_FILES)
         if name in taken or name.partition("_")[0] == LAUNCHER:
-            problems.append(
-                document.problem(
-                    ("nodes", name), f'the name "{name}" is reserved', "choose another name"
-                )
+            document.report(
+                ("nodes", name), f'the name "{name}" is reserved', "choose another name"
             )
         if node_spec.host not in spec.hosts:
-            problems.append(
-                document.problem(
-                    ("nodes", name, "host"),
-                    f'unknown host "{node_spec.host}"',
-                    did_you_mean(node_spec.host, list(spec.hosts)),
-                )
+            document.report(
+                ("nodes", name, "host"),
+                f'unknown host "{node_spec.host}"',
+                did_you_mean(node_spec.host, list(spec.hosts)),
             )
     if not entries:
-        problems.append(document.problem(("nodes",), "the graph has no node", "add a node"))
+        document.report(("nodes",), "the graph has no node", "add a node")
     if spec.record is not None:
         if "recorder" in spec.nodes:
-            problems.append(
-                document.problem(
-                    ("record",),
-                    'the graph has a node "recorder" already',
-                    'remove either "record" or the node',
-                )
+            document.report(
+                ("record",),
+                'the graph has a node "recorder" already',
+                'remove either "record" or the node',
             )
         else:
             recorder = NodeSpec(type="recorder", parameters=spec.record, nice=RECORDER_NICE)
@@ -123,41 +108,33 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
     return NodeEntry(clock_node(host), node_spec, ("clocks",))
 
 
-def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem]) -> None:
+def resolve_entry(entry: NodeEntry, document: Document) -> None:
     """Find the node's class, connect its ports to topics, and check its parameters."""
     key = entry.key
     type_name = entry.spec.type
     try:
         class_ = node_class(type_name)
     except UnknownNodeError:
-        problems.append(
-            document.problem(
-                (*key, "type"),
-                f'unknown node type "{type_name}"',
-                did_you_mean(type_name, list(NODES)),
-            )
+        document.report(
+            (*key, "type"), f'unknown node type "{type_name}"', did_you_mean(type_name, list(NODES))
         )
         return
     except (ImportError, AttributeError, SyntaxError) as error:
-        problems.append(
-            document.problem(
-                (*key, "type"),
-                f'"{type_name}" cannot be imported: {error}',
-                "check the Python path and flexsheet doctor",
-            )
+        document.report(
+            (*key, "type"),
+            f'"{type_name}" cannot be imported: {error}',
+            "check the Python path and flexsheet doctor",
         )
         return
     if not (isinstance(class_, type) and issubclass(class_, Node)):
-        problems.append(
-            document.problem(
-                (*key, "type"),
-                f'"{type_name}" is not a node class',
-                "name a class that derives from Node",
-            )
+        document.report(
+            (*key, "type"),
+            f'"{type_name}" is not a node class',
+            "name a class that derives from Node",
         )
         return
     entry.type = class_
-    _connect_ports(entry, class_, document, problems)
+    _connect_ports(entry, class_, document)
 
     parameters_key = key if key in _PARAMETER_SECTIONS else (*key, "parameters")
     try:
@@ -167,7 +144,7 @@ def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem])
         try:
             validate(find_parameters_type(class_), document, at=parameters_key)
         except BadInputError as error:
-            problems.extend(error.problems)
+            document.problems.extend(error.problems)
 
 
 def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
@@ -178,18 +155,14 @@ def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
     target.setdefault(key[-1], value)
 
 
-def _connect_ports(
-    entry: NodeEntry, class_: type[Node], document: Document, problems: list[Problem]
-) -> None:
+def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> None:
     ports = find_ports(class_)
     for name in entry.spec.topics:
         if name not in ports:
-            problems.append(
-                document.problem(
-                    (*entry.key, "topics", name),
-                    f'"{entry.spec.type}" has no port "{name}"',
-                    did_you_mean(name, list(ports)),
-                )
+            document.report(
+                (*entry.key, "topics", name),
+                f'"{entry.spec.type}" has no port "{name}"',
+                did_you_mean(name, list(ports)),
             )
     for port in ports.values():
         topic_name = entry.spec.topics.get(port.name, port.name.replace("__", "/"))
@@ -201,36 +174,28 @@ def _connect_ports(
         key = (*entry.key, "topics", port.name)
         topic = TOPICS.get(topic_name)
         if topic is None and port.name in entry.spec.topics:
-            problems.append(
-                document.problem(
-                    key, f'unknown topic "{topic_name}"', did_you_mean(topic_name, list(TOPICS))
-                )
+            document.report(
+                key, f'unknown topic "{topic_name}"', did_you_mean(topic_name, list(TOPICS))
             )
         elif topic is None:
             names = " or ".join(one.name for one in fitting)
-            problems.append(
-                document.problem(
-                    key,
-                    f'port "{port.name}" is not connected',
-                    f'name its topic in "topics": {names or "no topic has this type"}',
-                )
+            document.report(
+                key,
+                f'port "{port.name}" is not connected',
+                f'name its topic in "topics": {names or "no topic has this type"}',
             )
         elif topic.message is not port.message:
-            problems.append(
-                document.problem(
-                    key,
-                    f'topic "{topic.name}" carries {topic.message.__name__}, '
-                    f'port "{port.name}" needs {port.message.__name__}',
-                    "connect a topic of that type",
-                )
+            document.report(
+                key,
+                f'topic "{topic.name}" carries {topic.message.__name__}, '
+                f'port "{port.name}" needs {port.message.__name__}',
+                "connect a topic of that type",
             )
         else:
             entry.ports.append((port, topic))
 
 
-def check_device_hosts(
-    entries: list[NodeEntry], spec: LaunchFile, document: Document, problems: list[Problem]
-) -> None:
+def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Document) -> None:
     """Check that no device is on another host: device protocols are not encrypted."""
     for entry in entries:
         if entry.parameters is None:
@@ -238,19 +203,15 @@ def check_device_hosts(
         marked = find_marked(entry.parameters, ParameterMark.DEVICE_HOST)
         for (key, address), (name, host) in product(marked.items(), spec.hosts.items()):
             if host.address == address and name != entry.spec.host and not is_loopback(address):
-                problems.append(
-                    document.problem(
-                        (*entry.key, "parameters", *key),
-                        f'{address} is host "{name}": its data would cross the network '
-                        "without encryption",
-                        f"run {entry.name} there (host: {name})",
-                    )
+                document.report(
+                    (*entry.key, "parameters", *key),
+                    f'{address} is host "{name}": its data would cross the network '
+                    "without encryption",
+                    f"run {entry.name} there (host: {name})",
                 )
 
 
-def check_calibrations(
-    entries: list[NodeEntry], scene: Scene | None, document: Document, problems: list[Problem]
-) -> None:
+def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
     """Read the calibration files that parameters name, and compare them with the scene."""
 
     def check_camera(path: Path) -> None:
@@ -276,9 +237,9 @@ def check_calibrations(
             try:
                 check(path)
             except CalibrationFileError as error:
-                problems.append(document.problem(key, str(error)))
+                document.report(key, str(error))
             except CalibrationMismatchError as error:
-                problems.append(document.problem(key, f"{path}: {error}"))
+                document.report(key, f"{path}: {error}")
 
 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
@@ -307,11 +268,11 @@ def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
     if isinstance(value, Path):
         return _absolute(value, base)
     if isinstance(value, BaseModel):
-        given = {
+        explicit = {
             name: _with_absolute_paths(getattr(value, name), dumped[name], base)
             for name in value.model_fields_set
         }
-        return {**dumped, **given}
+        return {**dumped, **explicit}
     if isinstance(value, tuple | list):
         return [
             _with_absolute_paths(one, plain, base) for one, plain in zip(value, dumped, strict=True)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from itertools import product
 
-from flexsheet.launch.plans.documents import Document, Problem, did_you_mean
+from flexsheet.launch.plans.documents import Document, did_you_mean
 from flexsheet.launch.plans.hosts import launcher_on
 from flexsheet.launch.plans.launch_file import LaunchFile
 from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
@@ -24,12 +24,7 @@ FIRST_PORT, PORT_COUNT = 20_000, 10_000
 
 
 def list_writers(
-    spec: LaunchFile,
-    entries: list[NodeEntry],
-    document: Document,
-    problems: list[Problem],
-    *,
-    has_scene: bool,
+    spec: LaunchFile, entries: list[NodeEntry], document: Document, *, has_scene: bool
     has_apparatus: bool,
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of every topic, in the order of the file."""
@@ -43,31 +38,23 @@ def list_writers(
         for port_name, topic in entry.topics("output"):
             others = [name for name, _ in writers.get(topic.name, [])]
             if others and (not topic.many_writers or entry.name in others):
-                problems.append(
-                    document.problem(
-                        (*entry.key, "topics", port_name),
-                        f'topic "{topic.name}" is written by "{others[0]}" already',
-                        "connect one of the two ports to another topic, or to null",
-                    )
+                document.report(
+                    (*entry.key, "topics", port_name),
+                    f'topic "{topic.name}" is written by "{others[0]}" already',
+                    "connect one of the two ports to another topic, or to null",
                 )
             else:
                 writers.setdefault(topic.name, []).append((entry.name, entry.spec.host))
     for i, name in enumerate(spec.external_topics):
         if name not in TOPICS:
-            problems.append(
-                document.problem(
-                    ("external_topics", i),
-                    f'unknown topic "{name}"',
-                    did_you_mean(name, list(TOPICS)),
-                )
+            document.report(
+                ("external_topics", i), f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
             )
         elif name in writers and not TOPICS[name].many_writers:
-            problems.append(
-                document.problem(
-                    ("external_topics", i),
-                    f'topic "{name}" is written by "{writers[name][0][0]}" already',
-                    "remove it from external_topics, or remove the node",
-                )
+            document.report(
+                ("external_topics", i),
+                f'topic "{name}" is written by "{writers[name][0][0]}" already',
+                "remove it from external_topics, or remove the node",
             )
         elif not TOPICS[name].many_writers:
             writers[name] = [(TOOLS, MAIN)]
@@ -83,10 +70,7 @@ def list_writers(
 
 
 def resolve_further_inputs(
-    entries: list[NodeEntry],
-    writers: dict[str, list[tuple[str, str]]],
-    document: Document,
-    problems: list[Problem],
+    entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
     """Add the inputs of nodes whose topics depend on their parameters (recorder, console)."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
@@ -97,18 +81,13 @@ def resolve_further_inputs(
             if name in TOPICS:
                 entry.further_inputs.append(TOPICS[name])
             else:
-                problems.append(
-                    document.problem(
-                        entry.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
-                    )
+                document.report(
+                    entry.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
                 )
 
 
 def check_inputs(
-    entries: list[NodeEntry],
-    writers: dict[str, list[tuple[str, str]]],
-    document: Document,
-    problems: list[Problem],
+    entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
     """Check that every input has a writer."""
     for entry in entries:
@@ -120,12 +99,10 @@ def check_inputs(
                     else 'add a node that writes it, list it in "external_topics" if a tool '
                     f"writes it, or disconnect the port with topics: {{{port_name}: null}}"
                 )
-                problems.append(
-                    document.problem(
-                        (*entry.key, "topics", port_name),
-                        f'no node writes topic "{topic.name}"',
-                        remedy,
-                    )
+                document.report(
+                    (*entry.key, "topics", port_name),
+                    f'no node writes topic "{topic.name}"',
+                    remedy,
                 )
 
 

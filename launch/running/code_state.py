@@ -19,7 +19,7 @@ A new launch file, scene or mesh affects a run only if a launch file names it.""
 UNTRACKED = "??"
 
 
-def git_state(directory: Path) -> str:
+def read_git_state(directory: Path) -> str:
     """Return the commit of the code and whether its sources were changed since, as JSON.
 
     directory: root of the repository. commit: outside of git the value of COMMIT_VARIABLE, else

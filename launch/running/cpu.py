@@ -90,7 +90,7 @@ class CpuWatch:
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
-            return None  # the process has ended, or the kernel lacks these counters
+            return None  # the process has ended, or the kernel has no such counters
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:

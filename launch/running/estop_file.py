@@ -20,9 +20,9 @@ STATE_VARIABLE = "FLEXSHEET_STATE"
 
 def directory() -> Path:
     """Return the directory of persistent state of this user's launchers."""
-    given = os.environ.get(STATE_VARIABLE)
-    if given:
-        return Path(given)
+    configured = os.environ.get(STATE_VARIABLE)
+    if configured:
+        return Path(configured)
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "flexsheet"
 
 

@@ -19,7 +19,7 @@ import psutil
 import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
-from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode, tools_on
+from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.messages.base import Header, Message
@@ -108,7 +108,7 @@ class HostAgent:
         self._file_outdated = False
         self._status_error = ""
         nodes = plan.nodes_on(host)
-        self._devices, self._folder = list_device_files(nodes), recording_folder(nodes)
+        self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
@@ -212,7 +212,7 @@ class HostAgent:
         all_clear = asyncio.Event()
 
         def on_state(state: ArmState, _: Header) -> None:
-            if not shows_estop(state):
+            if not has_estop(state):
                 stopped.discard(f"arm_{state.side}")
             if not stopped:
                 all_clear.set()
@@ -331,7 +331,7 @@ class HostAgent:
         )
 
 
-def shows_estop(state: ArmState) -> bool:
+def has_estop(state: ArmState) -> bool:
     """Return whether an arm's bridge has an engaged e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
@@ -344,7 +344,7 @@ def list_arms(plan: ResolvedGraph) -> list[str]:
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
     """Return whether a user has to arm an arm of the graph."""
-    return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
+    return any(node.arming is ArmingMode.MANUAL for node in plan.nodes.values())
 
 
 def python_version() -> str:
@@ -365,7 +365,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
     return sorted({file for node in nodes for file in node.device_files})
 
 
-def recording_folder(nodes: list[ResolvedNode]) -> Path:
+def find_recording_folder(nodes: list[ResolvedNode]) -> Path:
     """Return the folder of the recorder's bag; the working folder if it does not exist."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:

@@ -28,9 +28,9 @@ KEYS_VARIABLE = "FLEXSHEET_KEYS"
 
 def directory() -> Path:
     """Return the folder of this user's secret keys."""
-    given = os.environ.get(KEYS_VARIABLE)
-    if given:
-        return Path(given)
+    configured = os.environ.get(KEYS_VARIABLE)
+    if configured:
+        return Path(configured)
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "flexsheet" / "keys"
 
 
@@ -86,19 +86,13 @@ def install(launch_file: Path, host: str, key: str) -> None:
     hosts = document.values.get("hosts")
     if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):
         names = list(hosts) if isinstance(hosts, dict) else []
-        raise BadInputError(
-            [document.problem(("hosts",), f'there is no host "{host}"', did_you_mean(host, names))]
-        )
+        raise document.error(("hosts",), f'there is no host "{host}"', did_you_mean(host, names))
     if not is_key(key):
-        raise BadInputError(
-            [
-                Problem(
-                    "KEY",
-                    (),
-                    f'"{key}" is not a public key',
-                    f"give the 40 characters that `flexsheet keys show {host}` prints on that host",
-                )
-            ]
+        raise BadInputError.single(
+            "KEY",
+            (),
+            f'"{key}" is not a public key',
+            f"give the 40 characters that `flexsheet keys show {host}` prints on that host",
         )
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True

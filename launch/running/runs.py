@@ -135,7 +135,7 @@ def create_run() -> Run:
     return run
 
 
-def all_runs() -> list[Run]:
+def list_runs() -> list[Run]:
     """Return all runs that have a directory, newest first."""
     if not root().is_dir():
         return []
@@ -147,9 +147,9 @@ def all_runs() -> list[Run]:
     return sorted(runs, key=lambda run: run.directory.stat().st_ctime_ns, reverse=True)
 
 
-def live_runs() -> list[Run]:
+def list_live_runs() -> list[Run]:
     """Return the runs whose launcher is alive, newest first."""
-    return [run for run in all_runs() if run.is_alive()]
+    return [run for run in list_runs() if run.is_alive()]
 
 
 def launcher_is_alive(run_id: str) -> bool:
@@ -188,7 +188,7 @@ def sweep() -> list[int]:
     _, alive = psutil.wait_procs(found, timeout=ORPHAN_GRACE_S)
     _signal(alive, signal.SIGKILL)
     psutil.wait_procs(alive, timeout=ORPHAN_GRACE_S)
-    dead = [run for run in all_runs() if not run.is_alive() and _is_of_our_namespace(run)]
+    dead = [run for run in list_runs() if not run.is_alive() and _is_of_our_namespace(run)]
     for i, run in enumerate(dead):
         if i < MAX_FINISHED_RUNS:
             run.end()

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from flexsheet.launch.running.runs import live_runs
+from flexsheet.launch.running.runs import list_live_runs
 from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, read_peer
 
 CONTINUE_AFTER_S = 0.06
@@ -94,7 +94,7 @@ def send_early(arguments: Sequence[str]) -> None:
             return
         options[name] = value if given else rest.pop(0)
     run = options["--run"]
-    directories = [Path(run)] if run else [one.directory for one in live_runs()]
+    directories = [Path(run)] if run else [one.directory for one in list_live_runs()]
     sent_early.append(stop_arms(directories, options["--reason"]))
 
 

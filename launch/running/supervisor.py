@@ -36,7 +36,7 @@ from flexsheet.launch.plans.plan_model import (
     ResolvedPort,
 )
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
-from flexsheet.launch.running.code_state import git_state
+from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import KeyWatch, make_rings
 from flexsheet.launch.running.priority import describe_nice_problem, min_nice_step
@@ -586,12 +586,12 @@ class RunningGraph:
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
-        write_file(directory / "git.json", git_state(SOFTWARE))
+        write_file(directory / "git.json", read_git_state(SOFTWARE))
         if self._host is not None:
             write_file(directory / HOST_FILE, self._host)
         if any(port.topic == "scene" for node in self.nodes for port in node.outputs):
             self._write_scenes(directory / "scenes")
-        # Last and atomically: tools look for this file to find a graph.
+        # The plan is written last and atomically, because tools find a graph by this file.
         text = self.plan.model_dump_json(indent=1)
         write_file(self.run.plan_file, text)
 
@@ -699,15 +699,8 @@ def _fill_run(value: Any, run: Run) -> Any:
 
 def _check_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
-        raise BadInputError(
-            [
-                Problem(
-                    "--host",
-                    (),
-                    f'unknown host "{host}"',
-                    f"choose one of: {', '.join(plan.hosts)}",
-                )
-            ]
+        raise BadInputError.single(
+            "--host", (), f'unknown host "{host}"', f"choose one of: {', '.join(plan.hosts)}"
         )
     for name, address in plan.hosts.items():
         if not is_loopback(address) and not plan.keys:

@@ -43,7 +43,7 @@ def tools_host(run: Run) -> str:
     return run.host or MAIN
 
 
-def topics_for_tools(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
+def list_tool_topics(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
     """Return the topics that a tool on a host may write in this graph."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
@@ -72,7 +72,7 @@ def make_subscriber(
         on_problem=on_problem,
         raw=raw,
         keys=load_tool_keys(plan, run),
-        # The states of nodes and hosts with another plan are read, too, to report them.
+        # Status messages of other plans are accepted, so that the tool can report them.
         plan=None if definition.message in (Status, HostStatus) else plan.hash,
     )
 
@@ -157,8 +157,8 @@ def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
     """Make the error for a topic that tools on a host may not write."""
     from flexsheet.launch.plans import documents
 
-    may = ", ".join(topics_for_tools(plan, host))
-    if topic in topics_for_tools(plan):
+    may = ", ".join(list_tool_topics(plan, host))
+    if topic in list_tool_topics(plan):
         key: tuple[str, ...] = ("hosts", host)
         what = f'topic "{topic}" cannot be written by tools on host "{host}"'
         remedy = f'run the tool on host "{MAIN}" ({plan.hosts[MAIN]}); open here: {may}'
@@ -168,4 +168,4 @@ def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
         what = f'topic "{topic}" '
         what += f"is written by {owners}" if owners else "is not part of the graph"
         remedy = f'list it in "external_topics"; open now: {may}'
-    return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])
+    return documents.BadInputError.single(plan.launch_file, key, what, remedy)

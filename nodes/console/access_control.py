@@ -34,10 +34,7 @@ from flexsheet.nodes.console.html_head import inject_assets
 MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
-FRAMING_HEADERS = {
-    "X-Frame-Options": "DENY",
-    "Content-Security-Policy": "frame-ancestors 'none'",
-}
+FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
 """Headers of every response."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
@@ -99,7 +96,7 @@ class AccessControl:
         try:
             return self._refusal(request)
         except (ValueError, MultipleValuesError):
-            return bad_request()
+            return make_bad_request()
 
     def _refusal(self, request: Request) -> Response | None:
         """Check a request as `refusal` does.
@@ -108,7 +105,7 @@ class AccessControl:
         """
         repeated = [name for name in SINGLE_HEADERS if len(request.headers.get_all(name)) > 1]
         if repeated or "Host" not in request.headers:
-            return bad_request()
+            return make_bad_request()
         host = request.headers["Host"]
         if request.headers.get("Sec-Fetch-Dest") in FRAME_DESTINATIONS:
             return _page(http.HTTPStatus.FORBIDDEN, "no page may show the console in a frame")
@@ -122,12 +119,12 @@ class AccessControl:
             return _page(http.HTTPStatus.FORBIDDEN, "pages of other sites may not use the console")
         if self._token is None:
             return None
-        given = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
-        if hmac.compare_digest(given.encode(), self._token.encode()):
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
+        if hmac.compare_digest(token.encode(), self._token.encode()):
             # The cookie keeps the token out of the address line and of bookmarks.
             to_page = {
                 "Location": "/",
-                "Set-Cookie": f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/",
+                "Set-Cookie": f"{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/",
             }
             return _page(http.HTTPStatus.SEE_OTHER, "welcome", to_page)
         if hmac.compare_digest(_cookie(request).encode(), self._token.encode()):
@@ -156,7 +153,7 @@ def _cookie(request: Request) -> str:
     return "" if cookie is None else cookie.value
 
 
-def bad_request() -> Response:
+def make_bad_request() -> Response:
     """Return the response to a malformed request."""
     return _page(http.HTTPStatus.BAD_REQUEST, MALFORMED)
 
@@ -185,7 +182,7 @@ def forbid_framing(response: Response) -> Response:
     return response
 
 
-def page_logger() -> logging.Logger:
+def make_page_logger() -> logging.Logger:
     """Return the logger of the page server.
 
     It logs one line, not a traceback, for bytes that a client sent.
@@ -219,7 +216,7 @@ class PageConnection(ServerConnection):
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
-            self.transport.write(forbid_framing(bad_request()).serialize())
+            self.transport.write(forbid_framing(make_bad_request()).serialize())
         super().send_data()
 
     async def handshake(self, *arguments: Any, **rest: Any) -> None:
@@ -268,7 +265,7 @@ def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
             try:
                 response = viser_handler(connection, request)
             except (OSError, ValueError):  # a path that is invalid in the file system
-                response = bad_request()
+                response = make_bad_request()
         return None if response is None else forbid_framing(inject_assets(response))
 
     def serve_checked(*arguments: Any, process_request: PageRequest, **rest: Any) -> Any:
@@ -277,7 +274,7 @@ def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
             *arguments,
             process_request=partial(respond, process_request),
             create_connection=PageConnection,
-            logger=page_logger(),
+            logger=make_page_logger(),
             **rest,
         )
 

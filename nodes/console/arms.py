@@ -33,7 +33,7 @@ class Piece:
 
     link: int
     size_m: tuple[float, float, float]
-    middle_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]
     dark: bool = False
 
 
@@ -57,7 +57,7 @@ CLAMP_SIZE_M = (0.012, 1.04, 0.012)
 """Size of the bar that clamps the sheet: across, along the edge (over its length), through."""
 
 
-def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
+def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
     """Compute world_from_link (7, 4, 4) of the base and the six links; the last is the flange."""
     poses = [world_from_base]
     for (offset_m, axis), angle_rad in zip(JOINTS, joints_rad.tolist(), strict=True):
@@ -67,7 +67,7 @@ def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
 
 
 def rounded_box(
-    size_m: tuple[float, float, float], middle_m: tuple[float, float, float], bevel: float = 0.18
+    size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Make a box with bevelled edges: vertices (24, 3), counter-clockwise triangles (44, 3).
 
@@ -79,7 +79,7 @@ def rounded_box(
     vertices = np.concatenate(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
-    return vertices + np.array(middle_m), _orient_outwards(vertices, _box_triangles())
+    return vertices + np.array(centre_m), _orient_outwards(vertices, _box_triangles())
 
 
 def _box_triangles() -> NDArray[np.int32]:

@@ -80,7 +80,7 @@ class SceneController:
         sliders: values of the previous console; None if nobody has moved them.
         """
         self._publish, self._folder = publish, folder
-        self.names = scenes.scene_names(folder)
+        self.names = scenes.list_scene_names(folder)
         self.base, self.moved = first, sliders is not None
         self.sliders = sliders or Sliders.from_scene(first)
         self.scene = self._edit_scene() if self.moved else first

@@ -62,7 +62,9 @@ class FingerIntent:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.depth_m) and self.depth_m >= 0.0):
-            raise ValueError(f"depth: {self.depth_m} m is not a finite number of at least 0")
+            raise ValueError(
+                f"depth: expected a finite number of at least 0 m, found {self.depth_m}"
+            )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
         """Return the position (3,) of the fingertip on an object."""
@@ -112,7 +114,7 @@ class FingerController:
         position = Ray(tuple(map(float, origin)), tuple(map(float, direction)))  # type: ignore[arg-type]  # three each
         self._request(position=position, lifted=False)
 
-    def place(self, x_m: float, y_m: float) -> None:
+    def move_to(self, x_m: float, y_m: float) -> None:
         """Move to (x, y) as viewed from the front; stay lifted or pushing."""
         self._request(position=Ray.from_front(x_m, y_m))
 

@@ -25,7 +25,7 @@ class History:
 
     def add(self, now_s: float, source: MessageSource) -> None:
         """Add a sample; samples older than the window are dropped."""
-        self._samples.append((now_s, latencies_ms(source)))
+        self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
@@ -53,7 +53,7 @@ class History:
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Return the columns so that a line is drawn for every value.
 
-    A value without a neighbour is repeated at the sample beside it. A single sample is repeated
+    A value without a neighbour is repeated at the sample indices it. A single sample is repeated
     half a second earlier.
     """
     times, *series = columns
@@ -63,15 +63,15 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     widened = []
     for values in series:
         valid = np.isfinite(values)
-        lonely = valid & ~np.r_[False, valid[:-1]] & ~np.r_[valid[1:], False]
-        beside = np.flatnonzero(lonely)
+        isolated = valid & ~np.r_[False, valid[:-1]] & ~np.r_[valid[1:], False]
+        indices = np.flatnonzero(isolated)
         filled = values.copy()
-        filled[np.where(beside > 0, beside - 1, 1)] = values[beside]
+        filled[np.where(indices > 0, indices - 1, 1)] = values[indices]
         widened.append(filled)
     return (times, *widened)
 
 
-def latencies_ms(source: MessageSource) -> tuple[float, ...]:
+def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
     """Return the time (ms) from the exposure to the publication of the latest message of each step.
 
     NaN without a message. For the arms: the time at which the command of that exposure was written.

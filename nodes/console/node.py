@@ -40,8 +40,7 @@ class ConsoleParameters(NodeParameters):
         default=8080, description="TCP port of the page; 0: any free port"
     )
     token_file: Path | None = Field(
-        default=None,
-        description="file with the token of the viewers; required unless on loopback",
+        default=None, description="file with the token of the viewers; required unless on loopback"
     )
     rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")
@@ -57,7 +56,7 @@ class ConsoleParameters(NodeParameters):
     )
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
     state_file: Path = Field(
-        default=Path("@run/console-kept.json"),
+        default=Path("@run/console-state.json"),
         description="file with the state for a restart of the console",
     )
 
@@ -106,16 +105,16 @@ class Console(Node):
         return [topic.name for topic in written if topic.name in TOPICS_READ]
 
     async def setup(self) -> None:
-        given = self.parameters
-        token = None if given.token_file is None else read_token(given.token_file)
-        access = AccessControl(given.address, token)
+        settings = self.parameters
+        token = None if settings.token_file is None else read_token(settings.token_file)
+        access = AccessControl(settings.address, token)
         self._loop = asyncio.get_running_loop()
         self._latest = LatestMessages(self._refused)
-        self._server = start_server(given.address, given.page_port, access, "flexsheet")
-        self.url = f"http://{given.address}:{self._server.get_port()}/"
-        finger = FingerController(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        files = ConsoleFiles(given.plan, given.scenes, given.bags, given.state_file)
-        facts = GraphFacts.from_plan(given.plan, self.name)
+        self._server = start_server(settings.address, settings.page_port, access, "flexsheet")
+        self.url = f"http://{settings.address}:{self._server.get_port()}/"
+        finger = FingerController(self._publish, speed_m_per_s=settings.finger_speed_m_per_s)
+        files = ConsoleFiles(settings.plan, settings.scenes, settings.bags, settings.state_file)
+        facts = GraphFacts.from_plan(settings.plan, self.name)
         controller = ConsoleController(self._publish, files, finger, self.log.warning, facts)
         self.operator = Operator(
             self._server,
@@ -123,7 +122,7 @@ class Console(Node):
             controller,
             self._request,
             name=self.name,
-            with_finger=given.control_finger,
+            with_finger=settings.control_finger,
             with_eye=further_port("twin/eye") in self.inputs,
         )
         controller.begin()

@@ -100,7 +100,7 @@ class Operator:
         self._on_new_scene()
         self._handlers: dict[str, Callable[..., None]] = {
             "touch": self._touch,
-            "place": partial(self._command_finger, controller.finger.place),
+            "place": partial(self._command_finger, controller.finger.move_to),
             "push": partial(self._command_finger, controller.finger.push),
             "lift": partial(self._command_finger, controller.finger.lift_or_lower),
             "stop": controller.stop,
@@ -152,7 +152,7 @@ class Operator:
         elif isinstance(message, TwinEye) and self.controller.eye_view.on_image(message, now_s):
             self._image_s = now_s
             for name, image in (("seen", message.seen), ("expected", message.expected)):
-                self._page.eye.show_image(name, reduce_image(image))
+                self._page.eye.show_image(name, downsample_image(image))
 
     def advance(self, now_s: float, has_viewers: bool) -> None:
         """Advance finger, sliders and replay; draw them if there are viewers."""
@@ -209,17 +209,17 @@ class Operator:
         if entry is None or entry[0] is self._shown_frame or not entry[0].pixels:
             return
         self._shown_frame = entry[0]
-        self._page.eye.show_image("frame", reduce_image(entry[0].pixels[0]))
+        self._page.eye.show_image("frame", downsample_image(entry[0].pixels[0]))
 
     def refresh_tables(self, now_s: float) -> None:
         """Update tables, charts and banner."""
         ages = {name: (status, now_s - at_s) for name, (status, at_s) in self._statuses.items()}
         self._history.add(now_s, self._live)
-        latencies = panels.latency_table(self._history.latest_and_max())
+        latencies = panels.make_latency_table(self._history.latest_and_max())
         tables = (
             latencies
-            + panels.topics_table(ages, self.controller.facts.sampling_readers)
-            + panels.nodes_table(ages)
+            + panels.make_topics_table(ages, self.controller.facts.sampling_readers)
+            + panels.make_nodes_table(ages)
         )
         self._page.graph.show(tables, self._history.columns())
         self._show_state()
@@ -378,7 +378,7 @@ class Operator:
         self.controller.replay.rate = rate
 
 
-def reduce_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def downsample_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return every nth pixel of an image, so that it is at most `MAX_WIDTH_PX` wide."""
     step = -(-image.shape[1] // MAX_WIDTH_PX)
     return np.ascontiguousarray(image[::step, ::step])

@@ -12,7 +12,7 @@
     "3D view of arms, sheet, object and finger. Arrow keys rotate it, W, A, S, D, Q, E move it; the " +
     "sliders under Touch move the finger.";
 
-  // viser takes dark mode from its address only.
+  // viser reads the dark mode from the address only.
   const asked = new URLSearchParams(location.search);
   const wantsDark = matchMedia("(prefers-color-scheme: dark)").matches;
   if (wantsDark && !asked.has("darkMode") && !asked.has("token")) {
@@ -44,7 +44,7 @@
       element.setAttribute("aria-label", text);
   };
 
-  // The nearest box around a label that also holds what is labelled.
+  // Return the controls in the nearest element around a label.
   const controlsOf = (label) => {
     for (let box = label.parentElement; box; box = box.parentElement) {
       const found = box.querySelectorAll("input:not([type=hidden]), [role=slider]");

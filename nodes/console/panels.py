@@ -81,7 +81,7 @@ def make_paragraph(html: str) -> str:
     return f'<p class="fs-words">{html}</p>'
 
 
-def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
+def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
     """Make the legend of the chart with numbers.
 
     latencies: by series, the latest and the maximum value (ms); NaN without a value.
@@ -99,7 +99,7 @@ def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
     return _table("Latencies", head, rows, numbers=(1, 2))
 
 
-def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
+def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     """Make a table of the nodes: state, processor load, last error or note.
 
     statuses: by node, its latest status and its age (s).
@@ -122,13 +122,13 @@ def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     return _table("Nodes", ("node", "state", "CPU, %", "note"), rows, numbers=(2,))
 
 
-def topics_table(
+def make_topics_table(
     statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
 ) -> str:
     """Make a table of the topics: rate, maximum age at the readers, losses.
 
-    statuses: as in `nodes_table`. sampling_readers: nodes that skip messages by design and are not
-    counted as readers.
+    statuses: as in `make_nodes_table`. sampling_readers: nodes that skip messages by design and are
+    not counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}

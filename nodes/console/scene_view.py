@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
 from flexsheet.nodes.console.creases import split_creases
-from flexsheet.nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
-from flexsheet.nodes.console.snapshot import SceneSnapshot, ray_vertices, rays, transform_from_pose
+from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points, make_sheet_triangles
+from flexsheet.nodes.console.snapshot import (
+    SceneSnapshot,
+    rays,
+    select_ray_vertices,
+    transform_from_pose,
+)
 from flexsheet.nodes.models.rigid import apply, quaternion_from_rotation, transform
 
 Floats = NDArray[np.float64]
@@ -128,7 +133,7 @@ class SceneView:
         self._object = self._add(
             "Object", self._scene.add_mesh_simple("/object", corners, split, color=OBJECT)
         )
-        self._skin_shape, self._ray_vertices = rest.shape, ray_vertices(rest)
+        self._skin_shape, self._ray_vertices = rest.shape, select_ray_vertices(rest)
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
@@ -150,7 +155,7 @@ class SceneView:
                 _set_pose(self._links[side][-1], snapshot.edges[side])
             if snapshot.sheet is not None:
                 self._sheet.vertices = _f32(lift_sheet(snapshot.sheet, SHEET_LIFT_M))
-                lines = line_segments(lift_sheet(snapshot.sheet, LINES_LIFT_M))
+                lines = make_line_segments(lift_sheet(snapshot.sheet, LINES_LIFT_M))
                 self._sheet_lines.points = _f32(lines)
             if snapshot.skin is not None and snapshot.skin.shape == self._skin_shape:
                 self._object.vertices = _f32(snapshot.skin[self._skin_source])
@@ -199,7 +204,7 @@ class SceneView:
             for link in range(7)
         ]
         for i, piece in enumerate(PIECES):
-            vertices, triangles = rounded_box(piece.size_m, piece.middle_m)
+            vertices, triangles = rounded_box(piece.size_m, piece.centre_m)
             self._scene.add_mesh_simple(
                 f"/{side}/{piece.link}/{i}",
                 _f32(vertices),
@@ -217,7 +222,7 @@ class SceneView:
 
     def _add_sheet(self, scene: Scene) -> None:
         half = 0.5 * scene.sheet.width_m
-        points = sheet_points(
+        points = compute_sheet_points(
             transform(np.eye(3), (-half, 0.0, 0.0)),
             transform(np.eye(3), (half, 0.0, 0.0)),
             height_m=scene.sheet.height_m,
@@ -230,7 +235,7 @@ class SceneView:
             self._scene.add_mesh_simple(
                 "/sheet",
                 _f32(lift_sheet(points, SHEET_LIFT_M)),
-                sheet_triangles(),
+                make_sheet_triangles(),
                 color=SHEET,
                 opacity=0.5,
                 side="double",
@@ -238,13 +243,13 @@ class SceneView:
                 receive_shadow=False,
             ),
         )
-        segments = line_segments(lift_sheet(points, LINES_LIFT_M))
+        segments = make_line_segments(lift_sheet(points, LINES_LIFT_M))
         lines = self._lines("/sheet_lines", segments, SHEET_LINES, 1.0)
         self._sheet_lines = self._add("Sheet", lines)
         self._make_touchable(self._sheet)
 
     def _add_finger(self, radius_m: float) -> None:
-        vertices, triangles = finger_mesh(radius_m)
+        vertices, triangles = make_finger_mesh(radius_m)
         self._finger = self._add(
             "Finger",
             self._scene.add_mesh_simple("/finger", _f32(vertices), triangles, color=FINGER),
@@ -288,11 +293,11 @@ class SceneView:
         """Add labels above the bodies."""
         camera, projector = scene.camera, scene.projector.world_from_projector
         baseline_m = -float(camera.right_from_left[0, 3])
-        middle = apply(
+        centre = apply(
             transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
         )
         positions = {
-            "stereo camera": middle + NAME_ABOVE_M,
+            "stereo camera": centre + NAME_ABOVE_M,
             "projector": np.asarray(projector.position_m) + NAME_ABOVE_M,
             "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
             "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
@@ -358,7 +363,7 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
     return np.asarray(points + lift_m * normal / np.linalg.norm(normal))
 
 
-def line_segments(points: Floats) -> Floats:
+def make_line_segments(points: Floats) -> Floats:
     """Return segments (n, 2, 3) of every fifth row and column of the sheet's grid."""
     grid = points.reshape(ROWS, COLUMNS, 3)
     rows, columns = grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)
@@ -366,7 +371,7 @@ def line_segments(points: Floats) -> Floats:
     return np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
+def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
     """Make a fingertip (n, 3) and its triangles: tip at the origin, axis away from the user."""
     rings, around = 8, 20
     tilt = np.linspace(0.0, 0.5 * np.pi, rings)
@@ -389,8 +394,8 @@ def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
             [0.0, np.sin(FINGER_TILT_RAD), np.cos(FINGER_TILT_RAD)],
         ]
     )
-    middle = np.array([0.0, 0.0, radius_m])
-    vertices = (vertices - middle) @ lean.T + middle
+    centre = np.array([0.0, 0.0, radius_m])
+    vertices = (vertices - centre) @ lean.T + centre
     triangles = []
     for ring in range(rings):
         for i in range(around):

@@ -38,13 +38,13 @@ def first_scene(plan_file: Path) -> Scene:
     return Scene.model_validate(values)
 
 
-def scene_names(folder: Path) -> list[str]:
+def list_scene_names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.json"))
 
 
 def load(folder: Path, name: str) -> Scene:
     """Load a scene of the run's folder by its name.  Raises SceneChoiceError."""
-    names = scene_names(folder)
+    names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
     return Scene.model_validate_json((folder / f"{name}.json").read_text())

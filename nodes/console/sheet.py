@@ -26,7 +26,7 @@ MIRRORED = 2
 """Number of images of the finger in each free edge."""
 
 
-def sheet_points(
+def compute_sheet_points(
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
     *,
@@ -95,7 +95,7 @@ def _fractions() -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def sheet_triangles() -> Indices:
+def make_sheet_triangles() -> Indices:
     """Return triangles (2 * (ROWS - 1) * (COLUMNS - 1), 3), counter-clockwise for the user."""
     index = np.arange(ROWS * COLUMNS, dtype=np.int32).reshape(ROWS, COLUMNS)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -103,17 +103,17 @@ def sheet_triangles() -> Indices:
     return np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
 
 
-def hit_by_ray(points: Floats, origin: Floats, towards: Floats) -> Floats:
+def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
     """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet.
 
-    points: of `sheet_points`. A miss is NaN. Method of Moeller and Trumbore (1997), on the
+    points: of `compute_sheet_points`. A miss is NaN. Method of Moeller and Trumbore (1997), on the
     triangles around the vertex whose direction is nearest to the ray.
     """
     direction = towards - origin
-    seen = points - origin
-    seen = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-12)
-    nearest = np.argmax(direction @ seen.T, axis=1)
-    triangles = sheet_triangles()[_around(nearest)]
+    directions = points - origin
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    nearest = np.argmax(direction @ directions.T, axis=1)
+    triangles = make_sheet_triangles()[_around(nearest)]
     a, b, c = (points[triangles[..., i]] for i in range(3))
     first, second, along = b - a, c - a, direction[:, None, :]
     across, away = np.cross(along, second), np.cross(origin - a, first)

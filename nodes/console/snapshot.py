@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
-from flexsheet.nodes.console.arms import link_poses
+from flexsheet.nodes.console.arms import compute_link_poses
 from flexsheet.nodes.console.latest_messages import MessageSource
-from flexsheet.nodes.console.sheet import hit_by_ray, sheet_points
+from flexsheet.nodes.console.sheet import compute_sheet_points, intersect_sheet
 from flexsheet.nodes.models.rigid import transform_from_rpy
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,8 @@ class SceneSnapshot:
     """Contents of the 3D view at one time; unknown values are None.
 
     links: by side, world_from_link (7, 4, 4). edges: by side, world_from_edge. sheet: (n, 3), see
-    `sheet_points`. skin: (n, 3), deformed. finger: (3,). finger_valid: whether it is tracked.
+    `compute_sheet_points`. skin: (n, 3), deformed. finger: (3,). finger_valid: whether it is
+    tracked.
     """
 
     links: dict[str, Floats]
@@ -47,13 +48,15 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         state = source.latest(f"arm_{side}", ArmState)
         if state is not None:
-            links[side] = link_poses(transform_from_pose(arm.world_from_base), state[0].joints_rad)
+            links[side] = compute_link_poses(
+                transform_from_pose(arm.world_from_base), state[0].joints_rad
+            )
             edges[side] = state[0].world_from_flange @ transform_from_pose(arm.flange_from_edge)
     finger = _message(source.latest("fingertip", Fingertip))
     tip = None if finger is None else finger.position_world_m
     sheet = None
     if len(edges) == 2:
-        sheet = sheet_points(
+        sheet = compute_sheet_points(
             edges["left"],
             edges["right"],
             height_m=scene.sheet.height_m,
@@ -85,16 +88,16 @@ def _skin(source: MessageSource) -> Floats | None:
     return np.asarray(rest + body[0].displacement_world_m, dtype=np.float64)
 
 
-def ray_vertices(rest: Floats) -> NDArray[np.int64]:
+def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
     """Return indices (9,) of skin vertices for rays: a grid on the side that faces the user."""
     low, high = rest.min(axis=0), rest.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
     chosen = []
     for up in RAY_POSITIONS:
         for across in RAY_POSITIONS:
-            position = middle[:2] + half[:2] * np.array([0.7 * across, up])
+            position = centre[:2] + half[:2] * np.array([0.7 * across, up])
             off = np.linalg.norm(rest[:, :2] - position, axis=1)
-            chosen.append(int(np.argmin(off - 0.3 * (rest[:, 2] - middle[2]))))
+            chosen.append(int(np.argmin(off - 0.3 * (rest[:, 2] - centre[2]))))
     return np.array(chosen)
 
 
@@ -106,7 +109,7 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
     """
     eye = scene.eyes.centre_world_m
     projector = transform_from_pose(scene.projector.world_from_projector)[:3, 3]
-    hits = hit_by_ray(sheet, eye, points)
+    hits = intersect_sheet(sheet, eye, points)
     hits = hits[np.isfinite(hits).all(axis=1)]
     to_eye = np.stack([np.broadcast_to(eye, hits.shape), hits], axis=1)
     from_projector = np.stack([hits, np.broadcast_to(projector, hits.shape)], axis=1)

@@ -30,17 +30,17 @@ class Shot:
 class Album:
     """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
-    bookmarks: (seconds, label), in order. seen: number of shots. left_out: number of shots at
+    bookmarks: (seconds, label), in order. count: number of shots. left_out: number of shots at
     bookmarks beyond the first `MAX_BOOKMARK_SHOTS`.
     """
 
     limit: int
     bookmarks: Sequence[tuple[float, str]] = ()
-    seen: int = 0
+    count: int = 0
     left_out: int = 0
     _every: int = 1
-    _held: list[Shot] = field(default_factory=list)
-    _marked: list[Shot] = field(default_factory=list)
+    _regular: list[Shot] = field(default_factory=list)
+    _at_bookmarks: list[Shot] = field(default_factory=list)
 
     def add(
         self, seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]]
@@ -48,27 +48,24 @@ class Album:
         """Add a shot; encode its images only if it is stored."""
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
-        if passed and len(self._marked) >= MAX_BOOKMARK_SHOTS:
+        if passed and len(self._at_bookmarks) >= MAX_BOOKMARK_SHOTS:
             self.left_out += 1
         elif passed:
-            self._marked.append(_shot(seconds, title, pictures, "; ".join(passed)))
-        elif self.seen % self._every == 0:
-            self._held.append(_shot(seconds, title, pictures))
-            if len(self._held) > self.limit:
-                del self._held[1::2]
+            self._at_bookmarks.append(_shot(seconds, title, pictures, "; ".join(passed)))
+        elif self.count % self._every == 0:
+            self._regular.append(_shot(seconds, title, pictures))
+            if len(self._regular) > self.limit:
+                del self._regular[1::2]
                 self._every *= 2
-        self.seen += 1
+        self.count += 1
 
     def shots(self) -> list[Shot]:
         """Return the stored shots in the order of time."""
-        return sorted((*self._held, *self._marked), key=lambda shot: shot.seconds)
+        return sorted((*self._regular, *self._at_bookmarks), key=lambda shot: shot.seconds)
 
 
 def _shot(
-    seconds: float,
-    title: str,
-    pictures: Sequence[tuple[str, NDArray[np.uint8]]],
-    marked: str = "",
+    seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]], marked: str = ""
 ) -> Shot:
     return Shot(seconds, title, tuple((name, jpeg(one)) for name, one in pictures), marked)
 

@@ -56,7 +56,7 @@ def draw_charts(session: Session) -> dict[str, Chart]:
         "latency": latencies,
         "path": paths,
         "errors": sheet_errors,
-        "joints": joint_speeds,
+        "joints": draw_joint_speeds,
         "force": forces,
     }
     found = {}
@@ -86,10 +86,10 @@ def mark_isolated(axes: Axes) -> None:
     """Add markers to values without neighbours, which a line does not show."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
-        beside = np.zeros_like(known)
-        beside[1:] |= known[:-1]
-        beside[:-1] |= known[1:]
-        isolated = np.flatnonzero(known & ~beside).tolist()
+        has_neighbour = np.zeros_like(known)
+        has_neighbour[1:] |= known[:-1]
+        has_neighbour[:-1] |= known[1:]
+        isolated = np.flatnonzero(known & ~has_neighbour).tolist()
         if isolated and line.get_marker() == "None":
             line.set_marker(".")
             line.set_markevery(isolated)
@@ -312,7 +312,7 @@ def sheet_errors(session: Session) -> Chart | None:
     )
 
 
-def joint_speeds(session: Session) -> Chart | None:
+def draw_joint_speeds(session: Session) -> Chart | None:
     """Draw each joint's maximum speed in percent of its limit."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:

@@ -62,6 +62,10 @@ def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
     return [*_check_load(numbers, others), *others]
 
 
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
 def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
     """Report an overloaded computer. others: the other findings."""
     stopped = numbers["events"]["counts"].get("arm", 0)
@@ -70,8 +74,7 @@ def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterat
             continue
         text = f"In {host['busy_fraction']:.0%} of the time {host['busy_at_worst']} (at worst). "
         if stopped:
-            times = "once" if stopped == 1 else f"{stopped} times"
-            text += f"An arm stopped following {times}; overload is the probable cause. "
+            text += f"An arm stopped following {_times(stopped)}; overload is the probable cause. "
         elif others:
             text += "Overload is the probable cause of the delays. "
         often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
@@ -86,9 +89,7 @@ def _check_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     bag = numbers["bag"]
     if not bag["complete"]:
         yield SessionFinding(
-            "bad",
-            f"The bag is incomplete ({bag['problem']}); its readable part is shown.",
-            "bag",
+            "bad", f"The bag is incomplete ({bag['problem']}); its readable part is shown.", "bag"
         )
     if lost := int(bag["recording"].get("lost_messages", 0)):
         yield SessionFinding(
@@ -119,8 +120,8 @@ def _check_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for kind, what in (("estop", "E-stop"), ("fault", "Arm fault"), ("arm", "Arm not operating")):
         if kind in counts:
             event = next(one for one in first if one["kind"] == kind)
-            times = "once" if counts[kind] == 1 else f"{counts[kind]} times"
-            text = f"{what}, {times}; first at {event['seconds']:.2f} s: {event['text']}."
+            start = f"first at {event['seconds']:.2f} s: {event['text']}"
+            text = f"{what}, {_times(counts[kind])}; {start}."
             yield SessionFinding("bad", text, "timeline")
     scene = numbers["scene"] or {}
     for side, arm in numbers["arms"].items():
@@ -170,8 +171,8 @@ def _check_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             text = f"{name} had {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
             yield SessionFinding("doubtful", text, "topics")
         if topic["silences"]:
-            times = "once" if topic["silences"] == 1 else f"{topic['silences']} times"
-            text = f"{name} stopped {times}, for at most {topic['longest_silence_s']:.2f} s."
+            gap_s = topic["longest_silence_s"]
+            text = f"{name} stopped {_times(topic['silences'])}, for at most {gap_s:.2f} s."
             yield SessionFinding("doubtful", text, "topics")
 
 
@@ -218,7 +219,7 @@ def _check_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         yield SessionFinding("doubtful", text, "sheet")
     for path in numbers["sheet"]["followed"]:
         if path["drop_outs"]:
-            times = "once" if path["drop_outs"] == 1 else f"{path['drop_outs']} times"
+            times = _times(path["drop_outs"])
             text = (
                 f'On the path "{path["path"]}" the arms stopped following in contact {times}; '
                 f"they followed for {path['following_ratio']:.1%} of the contact."

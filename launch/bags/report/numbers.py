@@ -89,13 +89,13 @@ def compute_numbers(session: Session) -> dict[str, Any]:
             "counts": session.events.counts,
             "first": [
                 {"seconds": seconds, "kind": kind, "text": text}
-                for seconds, kind, text in sorted(session.events.held)
+                for seconds, kind, text in sorted(session.events.stored)
             ],
         },
         "pictures": {
-            "stereo": session.stereo.seen,
-            "eye": session.eye.seen,
-            "frame": session.drawn.seen,
+            "stereo": session.stereo.count,
+            "eye": session.eye.count,
+            "frame": session.drawn.count,
         },
     }
 
@@ -131,9 +131,9 @@ def _graph(session: Session) -> dict[str, Any] | None:
 
 def _topics(session: Session) -> dict[str, Any]:
     found = {}
-    held = {one.name: one for one in session.info.topics}
-    for name in sorted({*held, *session.ports}):
-        info, flow, port = held.get(name), session.flows.get(name), session.ports.get(name)
+    recorded = {one.name: one for one in session.info.topics}
+    for name in sorted({*recorded, *session.ports}):
+        info, flow, port = recorded.get(name), session.flows.get(name), session.ports.get(name)
         topic = TOPICS.get(name)
         expected = None if topic is None or topic.many_writers else topic.rate_hz
         skipped, lost, refused = (None, None, None) if port is None else port.totals()
@@ -221,11 +221,7 @@ def _spread_ms(spread: Spread) -> dict[str, float | int | None]:
     found = {"p50": spread.quantile_s(0.5), "p99": spread.quantile_s(0.99)}
     longest = spread.longest_s if spread.count else None
     scaled = {key: None if value is None else 1e3 * value for key, value in found.items()}
-    return {
-        **scaled,
-        "max": None if longest is None else 1e3 * longest,
-        "count": spread.count,
-    }
+    return {**scaled, "max": None if longest is None else 1e3 * longest, "count": spread.count}
 
 
 def _most(range_: Range, scale: float) -> float | None:

@@ -262,7 +262,7 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
         "reader. Skipped: replaced by a newer message before it was read, by design. Lost: "
         "between writer and readers. Missing: not in the bag.",
         ("topic", "messages", "Hz", "expected, Hz", "age, ms", "age 99 %, ms",
-         "longest silence, s", "skipped", "lost", "missing", "refused"),
+         "maximum gap, s", "skipped", "lost", "missing", "refused"),
         rows,
     )  # fmt: skip
     if not any(name == "status" and one["messages"] for name, one in numbers["topics"].items()):

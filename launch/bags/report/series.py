@@ -173,13 +173,13 @@ class Events:
     """Events in order, at most `limit` of each kind, and the count of all."""
 
     limit: int = 100
-    held: list[tuple[float, str, str]] = field(default_factory=list)
+    stored: list[tuple[float, str, str]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, seconds: float, kind: str, text: str) -> None:
         self.counts[kind] = self.counts.get(kind, 0) + 1
         if self.counts[kind] <= self.limit:
-            self.held.append((seconds, kind, text))
+            self.stored.append((seconds, kind, text))
 
     def select(self, kind: str) -> list[tuple[float, str]]:
-        return [(seconds, text) for seconds, its, text in self.held if its == kind]
+        return [(seconds, text) for seconds, its, text in self.stored if its == kind]
