@@ -201,7 +201,7 @@ def measure_over(
         prepare = None
         if over == "veth":
             prepare = partial(enter_network, stack.enter_context(second_network()))
-            ring = stack.enter_context(keys.ring_of_two(folder))
+            ring = stack.enter_context(keys.create_two_rings(folder))
             loop = keys.Loop()
             stack.callback(loop.close)
 

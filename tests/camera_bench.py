@@ -31,7 +31,7 @@ Image = NDArray[np.uint8]
 
 
 def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
-    """The paper's scene with a small camera, its optics scaled with it."""
+    """Load the paper's scene with a small camera and scaled optics."""
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     size = {"width_px": width_px, "height_px": height_px}
     scale = width_px / scene.camera.width_px
@@ -50,7 +50,7 @@ def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
 
 
 def picture(number: int, side: int, width: int = WIDTH) -> Image:
-    """An even picture whose level tells its number and side, as compression leaves it."""
+    """Make a uniform image whose level encodes its number and side."""
     return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
 
 
@@ -109,7 +109,7 @@ async def running(
 
 @dataclass
 class Shot:
-    """What a fake camera delivers: when it arrives and what its driver stamps it with, ns."""
+    """Frame of a fake camera: image, arrival time and driver's stamp, ns."""
 
     image: Image
     arrival_ns: int
@@ -117,7 +117,7 @@ class Shot:
 
 
 class FakeCamera:
-    """A device that can be plugged in, unplugged, and refuses or bends what it is told."""
+    """Fake camera that can be unplugged, and that rejects or clips settings."""
 
     def __init__(self, bag: CameraBag) -> None:
         self.bag = bag
@@ -138,7 +138,8 @@ class FakeCamera:
         stamp_ns: int | None = None,
         image: Image | None = None,
     ) -> None:
-        """A frame that the driver stamps `at_ns` (or otherwise) and that arrives 8 ms later."""
+        """Deliver a frame with the driver's stamp `at_ns` (or `stamp_ns`) that arrives 8 ms
+        later."""
         pixels = picture(number, side) if image is None else image
         stamp = self.bag.base_ns + at_ns if stamp_ns is None else stamp_ns
         self.shots.put(Shot(pixels, self.bag.base_ns + at_ns + 8_000_000, stamp))
@@ -149,7 +150,7 @@ class FakeCamera:
 
 
 class FakeCapture:
-    """In the place of cv2.VideoCapture."""
+    """Substitute for cv2.VideoCapture."""
 
     def __init__(self, camera: FakeCamera | None) -> None:
         self.camera = camera
@@ -195,7 +196,7 @@ class FakeCapture:
 
 
 class CameraBag:
-    """All fake cameras, and a clock that each of their threads reads at its frame's arrival."""
+    """All fake cameras, with a clock that each reader thread reads at its frame's arrival."""
 
     def __init__(self) -> None:
         self.base_ns = time.monotonic_ns()
@@ -207,7 +208,7 @@ class CameraBag:
         return getattr(self.arrived, "ns", time.monotonic_ns())
 
     def plug(self, device: int | str, **properties: float) -> FakeCamera:
-        """A UVC camera as V4L2 shows it; properties: by the names of OpenCV, less CAP_PROP_."""
+        """Plug in a UVC camera as V4L2 reports it; properties: OpenCV's names without CAP_PROP_."""
         camera = self.cameras[device] = FakeCamera(self)
         usual = {
             "BUFFERSIZE": 4,
@@ -234,7 +235,7 @@ class CameraBag:
         return capture
 
     def empty(self) -> None:
-        """Let every grab that still waits come to its end."""
+        """Let every grab that still waits end."""
         for camera in self.cameras.values():
             for _ in camera.captures:
                 camera.shots.put(None)

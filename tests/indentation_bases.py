@@ -1,4 +1,5 @@
-"""Dent shapes for tests: fewer nodes than the renderer's, over less, solved once."""
+"""Compute indentation shapes for tests, with fewer nodes over a smaller range than the
+renderer's."""
 
 from __future__ import annotations
 

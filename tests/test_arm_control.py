@@ -506,7 +506,7 @@ def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
 
 
 def test_last_words_of_several_writers_may_come_in_any_order() -> None:
-    """For a restarted bridge the newest stop counts, not the one received last."""
+    """For a restarted bridge the newest stop counts, independent of the order of reception."""
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
     assert control.on_estop(stop, 30, 100) is None

@@ -44,7 +44,7 @@ STOPPED = {"stopping", "relax", "idle", "fault"}
 
 @dataclass
 class Stroke:
-    """Hold a running stroke that reverses until the test ends."""
+    """Stroke in the background that reverses until the test ends."""
 
     rig: Rig
     nodes: dict[str, Any]
@@ -95,7 +95,7 @@ def to_and_fro(radius: float, seconds: float) -> Path3:
 
 
 class FalseStatus(Cut):
-    """Repeat a part of the arm's status by a proxy, with a valid CRC and echo."""
+    """Proxy that repeats a part of the arm's status with a valid CRC and echo."""
 
     REPLY_BYTES, BLOCK_AT = 61, 9
     JOINTS, COUNTERS = slice(20, 44), slice(8, 16)

@@ -1,4 +1,4 @@
-"""Test that an arm moves only after a person arms it, again after each stop."""
+"""Test that an arm moves only after the user enables it, and again after each stop."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ EVENTS = ("no target", "silent", "lost", "watchdog", "estop", "reset", "fault", 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.sampled_from(EVENTS), min_size=1, max_size=12))
 def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list[str]) -> None:
-    """Once at rest with a slack sheet or isolated, it rests until it is armed."""
+    """At rest with a slack sheet or isolated, an arm rests until it is armed."""
     arms = following()
     goal = on_time(HOME)
     for event in events:

@@ -1,4 +1,4 @@
-"""`flexsheet arms stop` whatever other tools hold, and whoever does not answer."""
+"""Test `flexsheet arms stop` while other tools use the endpoint, or a process does not respond."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @dataclass
 class Graph:
-    """A launcher with two bridges that stand in for real ones."""
+    """Launcher with two substitute bridges."""
 
     launcher: subprocess.Popen[str]
     run: runs.Run
@@ -85,7 +85,7 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
 
 @pytest.fixture
 def holder(graph: Graph) -> Iterator[subprocess.Popen[bytes]]:
-    """A tool that holds the endpoint of the tools' e-stops, and stands still."""
+    """Start a tool that occupies the endpoint of the tools' e-stops and then hangs."""
     code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); "
     code += "s.listen(); print(flush=True); time.sleep(1000)"
     endpoint = graph.run.directory / "tools.estop"
@@ -151,7 +151,7 @@ def test_without_a_graph_there_is_nothing_to_stop() -> None:
 
 
 class Sockets:
-    """Stop sockets of this process, whose loop runs while `stop_arms` is in a thread."""
+    """Stop sockets of this process, whose loop runs while `stop_arms` runs in a thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -290,7 +290,7 @@ def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) 
 def test_a_stop_is_sent_before_the_command_line_is_imported(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], sent: tuple[str, str] | None
 ) -> None:
-    """With the command's own options; all else is for the command line to refuse or to explain."""
+    """The fast path handles its own options; the command line handles all others."""
     calls: list[tuple[str, str]] = []
 
     def record(directories: list[Path], reason: str) -> list[StopAttempt]:

@@ -1,4 +1,4 @@
-"""How long nodes wait for a processor, and what is said of a computer that is busy."""
+"""Test the measured waiting time for a processor, and the reports of a busy computer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Kernel:
-    """Counters of processes as the kernel shows them in a folder, and a clock."""
+    """Counters of processes in a folder, in the kernel's format, and a clock."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.now_s = folder, 100.0
@@ -26,7 +26,7 @@ class Kernel:
         (folder / "pressure").mkdir()
 
     def let(self, name: str, pid: int, *, wait_s: float = 0.0, run_s: float = 0.0) -> None:
-        """Let a process wait and run for so long."""
+        """Let a process wait and run for some time."""
         self._waited_s[pid] = self._waited_s.get(pid, 0.0) + wait_s
         self._used_s[pid] = self._used_s.get(pid, 0.0) + run_s
         folder = self.folder / str(pid)
@@ -46,7 +46,7 @@ ARMS = {"left": 11, "right": 12}
 
 
 def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
-    """Let both arms' nodes wait for so long in each second."""
+    """Let both arms' nodes wait for some time in each second."""
     found = None
     for _ in range(seconds):
         kernel.let("python", 11, wait_s=left_s, run_s=0.3)

@@ -1,4 +1,4 @@
-"""Boards of both kinds, printed and seen; live capture; and the commands around them."""
+"""Test both kinds of boards, live capture, and their commands."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ BOARDS = [CHESSBOARD, CHARUCO]
 
 
 def small_scene() -> dict[str, Any]:
-    """The paper's scene with a camera of a quarter of the pixels."""
+    """Return the paper's scene with a camera of a quarter of the pixels."""
     scene: dict[str, Any] = YAML(typ="safe").load(
         (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
     )
@@ -176,7 +176,7 @@ def test_the_same_corner_has_the_same_number_in_both_views(camera: StereoCamera)
 
 
 def posed(turn: list[float]) -> Floats:
-    """The pose (6,) of a board so turned, its middle straight ahead."""
+    """Return the pose (6,) of a rotated board with its middle straight ahead."""
     middle = board_points(CHESSBOARD).mean(axis=0)
     rotation = rigid.rotation_from_vector(turn)
     return pose_vector(rigid.transform(rotation, np.array([0.0, 0.0, 0.5]) - rotation @ middle))
@@ -298,7 +298,7 @@ Flexsheet = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flexsheet:
-    """Runs the command in this process: exit code, stdout, stderr."""
+    """Return a function that runs the command in this process: exit code, stdout, stderr."""
 
     def run(*words: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, words)])
@@ -317,7 +317,7 @@ GIVEN = ("--board", "7x5", "--square-mm", "30")
 def test_the_twin_is_calibrated_by_the_command(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
-    """From live capture to the file, the report, and a check on pictures taken otherwise."""
+    """The test covers live capture, the file, the report, and a check with other images."""
     taken, report, output = tmp_path / "taken", tmp_path / "report", tmp_path / "rig.yaml"
     code, out, err = flexsheet(
         "calibrate", "stereo", "--twin", scene_file, *GIVEN, "--pairs", 8, "--pictures", taken,
@@ -373,7 +373,7 @@ def test_the_twin_is_calibrated_by_the_command(
 def test_pictures_are_taken_from_the_camera_source(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
-    """Image files stand in for cameras; each picture comes four times, as of a board held still."""
+    """Image files replace the cameras; each image is repeated four times, as of a resting board."""
     for number, views in enumerate(shown(CHESSBOARD, camera, 6, seed=3)):
         for again in range(4):
             for side, picture in zip(("l", "r"), views, strict=True):

@@ -1,4 +1,4 @@
-"""The camera node: it plays, retries, refuses, cuts and tells; files are read by real decoders."""
+"""Test the camera node with real decoders: replay, retries, rejections, crops and reports."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, st
 
 
 async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side: Path) -> None:
-    """OpenCV opens a file as it opens a camera; at its end it is a camera that was unplugged."""
+    """OpenCV opens a file like a camera; its end is like an unplugged camera."""
     source = {"kind": "opencv", "left": str(side_by_side)}
     async with running(scene, source=source, retry_s=0.01) as bench:
         # A file cannot be told an exposure, and has a rate of its own: both are told once.
@@ -223,7 +223,7 @@ def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
 
 
 class StutteringReader:
-    """Frames at 60 Hz, but for three that never came."""
+    """Reader at 60 Hz without three of its frames."""
 
     paced = False
     rate_hz: float | None = 60.0
@@ -239,10 +239,10 @@ class StutteringReader:
         return ImagePair(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
 
     def interrupt(self) -> None:
-        """It does not wait."""
+        """Do nothing, since `read` does not wait."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
 
 def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
@@ -266,7 +266,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
 
 
 class BrokenReader(StutteringReader):
-    """OpenCV itself fails on what the device sends."""
+    """Reader with an error of OpenCV."""
 
     def read(self) -> ImagePair | None:
         raise cv2.error("no such colour")

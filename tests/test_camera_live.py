@@ -1,6 +1,6 @@
-"""Live cameras: stamps, pairs and their skew, settings, regions, unplugging, hanging.
+"""Test live cameras: stamps, pairs and skew, settings, regions, unplugged and hanging devices.
 
-The devices are fakes in the place of cv2.VideoCapture; the threads are the real ones.
+The devices are substitutes for cv2.VideoCapture; the threads are real.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def cameras(bag: CameraBag) -> tuple[FakeCamera, FakeCamera]:
 def reading(
     bag: CameraBag, scene: Scene, wanted: Regions | None = None, **source: Any
 ) -> Iterator[CameraReader]:
-    """A reader of both cameras, which is closed whatever happens."""
+    """Open a reader of both cameras, and close it at the end."""
     description = OpenCvSource.model_validate({**PAIR, **source})
     reader = CameraReader(description, scene.camera, bag.now_ns, wanted)
     try:
@@ -125,7 +125,7 @@ def test_stamps_of_another_clock_give_way_to_the_arrival(
 def test_a_stated_delay_from_exposure_to_arrival(
     bag: CameraBag, scene: Scene, cameras: tuple[FakeCamera, FakeCamera]
 ) -> None:
-    """OpenCV knows no clock of a stream's: its stamps are not requested."""
+    """OpenCV has no driver stamps of a stream: they are not requested."""
     bag.cameras = {"rtsp://left": cameras[0], "rtsp://right": cameras[1]}
     source = {"left": "rtsp://left", "right": "rtsp://right", "exposure_to_grab_s": 0.020}
     with reading(bag, scene, **source) as reader:
@@ -176,7 +176,7 @@ def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
 def test_frames_meet_their_own_partner(
     phase: float, lost_left: set[int], lost_right: set[int], jitter: list[float]
 ) -> None:
-    """Two cameras that run freely, lose frames, and whose frames arrive in any order."""
+    """Two free-running cameras lose frames, and their frames arrive in any order."""
     moments = {
         ("left", n): round((n + jitter[n]) * PERIOD_NS) for n in range(40) if n not in lost_left
     } | {

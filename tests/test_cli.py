@@ -1,4 +1,4 @@
-"""The `flexsheet` command: data on stdout, words on stderr, exit codes that mean something."""
+"""Test the `flexsheet` command: data on stdout, messages on stderr, exit codes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LISTENING: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a command left: exit code, stdout, stderr."""
+    """Result of a command: exit code, stdout, stderr."""
 
     code: int
     out: str
@@ -52,7 +52,7 @@ class Said:
 
 
 class Command:
-    """Runs the command in this process."""
+    """Runner of the command in this process."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         self._capsys, self._monkeypatch = capsys, monkeypatch
@@ -73,7 +73,7 @@ def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="module")
 def runs_root() -> Iterator[Path]:
-    """A directory of runs for this file's tests."""
+    """Create a directory of runs for this file's tests."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     before = os.environ.get(runs.ROOT_VARIABLE)
     os.environ[runs.ROOT_VARIABLE] = str(folder)
@@ -86,7 +86,7 @@ def runs_root() -> Iterator[Path]:
 
 
 class Launched:
-    """`flexsheet launch` in a process of its own, from ready to stop."""
+    """Process of `flexsheet launch`, from ready to stop."""
 
     def __init__(self, path: Path, *options: object) -> None:
         self.process = subprocess.Popen(
@@ -123,7 +123,7 @@ def write(folder: Path, graph: dict[str, Any]) -> Path:
 
 @pytest.fixture(scope="module")
 def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A tiny graph that runs, recording; gives its bag, which is whole after the tests."""
+    """Run and record a small graph; yield its bag, which is complete after the tests."""
     folder = tmp_path_factory.mktemp("graph")
     launched = Launched(write(folder, GRAPH), "--record", folder / "run.mcap")
     yield folder / "run.mcap"
@@ -131,7 +131,7 @@ def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def told_of_its_stop(bag: Path) -> bool:
-    """Return whether the bag has the listener's stop, and its word on what it took before."""
+    """Return whether the bag contains the listener's stop and its report."""
     stopped = False
     for topic, message, header, _ in BagReader(
         bag, {"estop", "status"} & set(BagReader(bag).topics)
@@ -144,7 +144,7 @@ def told_of_its_stop(bag: Path) -> bool:
 
 @pytest.fixture(scope="module")
 def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole bag of the tiny graph, all of it from the beginning."""
+    """Record a complete bag of the small graph."""
     folder = tmp_path_factory.mktemp("recorded")
     launched = Launched(
         write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=2.0"
@@ -512,7 +512,7 @@ def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> N
 
 
 def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
-    """All of it, for the quickest family: measured, drawn, written, printed."""
+    """The test measures, draws, writes and prints the fastest family."""
     said = flexsheet("chart", "triangulation", "--output", tmp_path)
     assert said.code == 0
     assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "dlt"]

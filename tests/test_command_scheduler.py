@@ -1,4 +1,4 @@
-"""Test when an arm is sent its next command."""
+"""Test the times of commands to an arm."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What the sheet presents of an object: the whole curve, within the arms' pull, and what it says
-where it cannot; judged by the twin's membrane."""
+"""Test the rendered force over depth within the arms' tension limits, with the simulated
+membrane."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ RADIUS = SCENE.finger.radius_m
 
 
 def soft_curve(scale: float, deepest: float = 0.05) -> ObjectCurve:
-    """Like the soft cylinder's: Hertz's power at first, then a straight line; 47 N/m at 1."""
+    """Return a force-depth curve similar to the soft cylinder's: Hertz's power, then linear; 47 N/m
+    at 1."""
     depths = deepest * np.linspace(0.0, 1.0, 40) ** 1.5
     forces = scale * 58.0 * (depths - 0.002 * -np.expm1(-depths / 0.002))
     return ObjectCurve(depths, forces)

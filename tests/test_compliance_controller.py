@@ -1,4 +1,4 @@
-"""The sheet yields to a push as the object would: where it goes, how smoothly, and what it says."""
+"""Test that the sheet complies like the object: position, smoothness and reports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RADIUS = SCENE.finger.radius_m
 
 
 def object_force_n(depths: Floats, scale: float = 1.0) -> Floats:
-    """Like the demo's soft cylinder: soft at first, then some 58 N/m."""
+    """Return a force like the demo's soft cylinder's: soft at first, then some 58 N/m."""
     return np.asarray(scale * 58.0 * (depths + 0.002 * np.expm1(-depths / 0.002)))
 
 
@@ -53,13 +53,13 @@ def soft_body(scale: float = 1.0) -> SoftBody:
 
 
 def stands_behind_m(target: SheetTarget) -> float:
-    """How far the sheet's plane is behind the object's tangent plane at the contact."""
+    """Return the distance of the sheet's plane behind the object's tangent plane at the contact."""
     sheet = target.world_from_sheet
     return float((target.contact_world_m - sheet[:3, 3]) @ sheet[:3, 2])
 
 
 async def pressed(desk: Table, angle_deg: float, depth_m: float, scale: float = 1.0) -> SheetTarget:
-    """The finger comes, touches, and goes to a depth where it stays."""
+    """Let the finger approach, touch, and rest at a depth."""
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
     for height in (0.03, 0.0, -0.5 * depth_m):
         await desk.rest_at(in_world(on_cylinder(angle_deg, height)), 90)
@@ -106,7 +106,7 @@ async def test_the_sheet_does_not_come_towards_a_finger_that_lies_on_a_stiff_obj
 
 
 async def test_pushing_and_stroking_make_no_step_and_keep_the_bounds() -> None:
-    """The paper's open problem: the finger goes deep while it strokes, lifts and comes again."""
+    """The finger goes deep while it strokes, lifts and returns: the paper's open problem."""
     desk = await table()
     await desk.planner.step("soft_body", soft_body(), desk.header())
     given = desk.planner.parameters

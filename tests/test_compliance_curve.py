@@ -1,4 +1,4 @@
-"""The object's force over depth, as the soft body says it whether it is touched or not."""
+"""Test the object's force over depth from the soft body, with and without contact."""
 
 from __future__ import annotations
 

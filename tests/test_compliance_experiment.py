@@ -1,4 +1,4 @@
-"""What a finger felt, judged from a recording: a sheet of known place and stretch comes out so."""
+"""Test the evaluation of the rendered force from a recording, with a known sheet."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
 
 
 def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceRecording:
-    """The finger rests at a depth; the sheet stands so far behind the object's tangent plane."""
+    """Simulate a finger at rest at a depth, with the sheet at a distance behind the tangent
+    plane."""
     tip = press.surface - depth_m * press.normal
     y_axis = np.cross(press.normal, [1.0, 0.0, 0.0])
     axes = np.column_stack([[1.0, 0.0, 0.0], y_axis, press.normal])

@@ -1,4 +1,4 @@
-"""What the console draws: arms, sheet, rays, and the picture of a moment."""
+"""Test the console's 3D view: arms, sheet, rays, and the image of a bookmark."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_rays_meet_the_flat_sheet_where_the_plane_is(x: float, y: float) -> None
 
 @pytest.mark.parametrize("tilt_rad", [-1.0, 0.0, 1.0])
 def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -> None:
-    """In one plane with a flat object, the sheet and the object were drawn in patches."""
+    """In one plane with a flat object, sheet and object were drawn in patches."""
     turned = transform(rotation_from_vector(np.array([tilt_rad, 0.0, 0.0])), (0.0, 0.0, 0.0))
     points = sheet_points(
         *(turned @ edge for edge in edges()),
@@ -128,7 +128,7 @@ def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -
 
 
 def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
-    """The smooth normals of a shared vertex drew teeth along the edges of a plane and a box."""
+    """Smooth normals of shared vertices drew artefacts along the edges of a plane and a box."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     box = np.array(
         [

@@ -1,4 +1,4 @@
-"""Looking through the user's eye, and what is put back."""
+"""Test the view from the user's eye, and its reset."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def frame(label: str, *, pixels: bool = True) -> Frame:
 
 
 def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
-    """On a busy computer each picture came after the next was asked for, and none was shown."""
+    """On a busy computer each image came after the next request, and none was shown."""
     sent: list[Message] = []
     eye_view = EyeViewRequester(sent.append, scene)
     eye_view.wanted = True

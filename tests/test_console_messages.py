@@ -1,4 +1,4 @@
-"""Messages are opened only when somebody looks."""
+"""Test that messages are decoded only for viewers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the mouse means, and how the finger gets there."""
+"""Test the meaning of the pointer, and the path of the finger."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
 
 
 def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
-    """Where the finger (3,) is once it does not move any more; each step within its speed."""
+    """Return the finger (3,) after it has stopped; each step is within its speed."""
     for _ in range(200):
         count = len(sent)
         finger.advance(0.05, None)
@@ -93,13 +93,13 @@ def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
 
 
 def depth_m(scene: Scene, point: Floats) -> float:
-    """How deep a point is in the cylinder's side."""
+    """Return the depth of a point in the cylinder's side."""
     away = (point - scene.object.world_from_object.position_m)[1:]
     return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
 
 
 def test_what_is_wanted_of_the_finger_outlives_scenes_and_lifting(scene: Scene) -> None:
-    """The push was forgotten with each new scene, and by lifting the finger."""
+    """The push was lost with each new scene, and by lifting the finger."""
     sent: list[FingerPath] = []
     finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
     finger.use(SurfacePicker(scene))

@@ -1,4 +1,4 @@
-"""What a plan makes of a console."""
+"""Test the plan of a console."""
 
 from __future__ import annotations
 
@@ -77,6 +77,6 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
 
 
 def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:
-    """On two busy cores the first picture of the Eye tab took a minute and a half."""
+    """On two busy cores the first image of the Eye tab took a minute and a half."""
     nodes = load_graph(ROOT / "launch" / "demo.yaml").nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice

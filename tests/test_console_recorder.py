@@ -1,4 +1,4 @@
-"""The recorder that waits for the console's word."""
+"""Test the recorder that waits for the console's request."""
 
 from __future__ import annotations
 

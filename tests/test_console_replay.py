@@ -1,4 +1,4 @@
-"""A bag that is shown in place of the running graph."""
+"""Test the display of a bag in place of the running graph."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def bag(tmp_path: Path, scene: Scene) -> Path:
-    """Ten seconds of a finger that moves 1 mm a second, with a moment at 4 s."""
+    """Write ten seconds of a finger that moves at 1 mm/s, with a bookmark at 4 s."""
     path = tmp_path / "sub" / "a.mcap"
     path.parent.mkdir()
     start_ns = 1_000_000_000_000

@@ -1,4 +1,4 @@
-"""Scenes that are chosen, changed by sliders, and taken up again."""
+"""Test scenes that are selected, changed by sliders, and restored."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: f
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
-    """At more than 8 % the arms of the demo stood still, and the scene's own limit was raised."""
+    """At more than 8 % the arms of the demo stopped, and the scene's own limit was raised."""
     scene = load_scene(path)
     limit = scenes.max_stretch_ratio(scene)
     tight = scenes.edit_scene(

@@ -1,4 +1,4 @@
-"""What the page tells: tables, banner, latencies, in words and colours that can be read."""
+"""Test the page's texts: tables, banner, latencies, and readable colours."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_words_of_the_tabs() -> None:
 
 
 def colors_of(scheme: str) -> dict[str, str]:
-    """The page's own colours by name, on a page that is "light" or "dark"."""
+    """Return the page's colours by name, in the scheme "light" or "dark"."""
     blocks = re.findall(r"^html:root(\S*) \{(.*?)^\}", PAGE_STYLE, re.MULTILINE | re.DOTALL)
     found: dict[str, str] = {}
     for where, block in blocks:
@@ -211,7 +211,7 @@ def colors_of(scheme: str) -> dict[str, str]:
 
 
 def contrast(one: str, other: str) -> float:
-    """WCAG's ratio of two colours, 1 to 21."""
+    """Return WCAG's contrast ratio of two colours, 1 to 21."""
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
 

@@ -1,4 +1,4 @@
-"""Equations (1)-(6): what they promise, on planes, on the pushed sheet, and where they fail."""
+"""Test equations (1)-(6): their validity on planes and on the pushed sheet, and their limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def tilted(tilt_x: float, tilt_y: float, centre: np.ndarray) -> ScreenPlane:
 
 
 def seen_at(on_screen: np.ndarray, screen_point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Where the eye sees, on z = 0, the light sent through `on_screen` and caught by a plane."""
+    """Return the visible point on z = 0 of light sent through `on_screen` and reflected by a
+    plane."""
     ray = on_screen - PROJECTOR
     share = ((screen_point - PROJECTOR) @ normal) / (ray @ normal)
     return on_imaginary_screen(PROJECTOR + share[:, None] * ray, EYE)

@@ -1,4 +1,4 @@
-"""Who is who among marks: known bystanders are not taken for the finger, which is found again."""
+"""Test data association: known clutter is not confused with the finger, which is found again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class Bench:
         self.time_s = 10.0
 
     def show(self, *markers: tuple[Place, Floats]) -> tuple[str, Floats | None]:
-        """One picture of marks with their looks: the reason, and the point that was chosen."""
+        """Process one image of markers with their appearances: return the reason and the selected
+        point."""
         self.time_s += FRAME_S
         at_ns = round(1e9 * self.time_s)
         candidates = [
@@ -93,7 +94,7 @@ def reasons(shown: Sequence[tuple[str, Floats | None]]) -> list[str]:
 
 
 def all_at(shown: Sequence[tuple[str, Floats | None]], place: Place, bench: Bench) -> bool:
-    """Return whether the last valid point is where that is now."""
+    """Return whether the last valid point is at the current position of that marker."""
     points = [point for reason, point in shown if reason == "ok" and point is not None]
     return bool(np.linalg.norm(points[-1] - place(bench.time_s)) < 1e-3)
 

@@ -1,4 +1,4 @@
-"""docs/deploy.md as what `make deploy-trial` types; and what it counts as having followed."""
+"""Test the parsing of docs/deploy.md for `make deploy-trial`, and the evaluation of following."""
 
 from __future__ import annotations
 

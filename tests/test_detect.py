@@ -1,4 +1,4 @@
-"""A stereo pair to a fingertip: which spots are the mark, and each way in which there is none."""
+"""Test the detection of a fingertip in a stereo pair, and each reason for its rejection."""
 
 from __future__ import annotations
 
@@ -100,7 +100,8 @@ def error_m(measured: TriangulatedPoint | None, tip: Floats = HERE) -> float:
 def test_a_point_is_drawn_and_found_again(
     point: tuple[float, float, float], origin: tuple[int, int]
 ) -> None:
-    """Through calibrated lenses to two discs in regions of the sensor, and back."""
+    """The point is projected through calibrated lenses to two discs in regions of the sensor, and
+    back."""
     truth, seed = np.array(point), np.random.default_rng(1)
     pixels = GEOMETRY.project(truth)
     depth_m = rigid.apply(GEOMETRY.left_from_world, truth)[2]
@@ -134,7 +135,7 @@ def test_a_point_is_drawn_and_found_again(
 def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
     name: str, speed_m_per_s: float
 ) -> None:
-    """The normalised squared error has a mean of 3 where the stated covariance is the true one."""
+    """The normalised squared error has a mean of 3 if the reported covariance is correct."""
     camera, random = twin(), np.random.default_rng(3)
     errors, normalised, reasons = [], [], Counter[str]()
     for _ in range(40):
@@ -158,7 +159,8 @@ def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
 
 
 def test_without_an_expected_place_the_mark_is_found_as_well() -> None:
-    """The lab's own glints (on the clamps, on the nail) are smaller than a mark, or in one view."""
+    """The lab's glints (on the clamps, on the nail) are smaller than a marker, or in one view
+    only."""
     camera, random = twin(), np.random.default_rng(5)
     for _ in range(20):
         tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
@@ -245,7 +247,7 @@ def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
     ("radius_m", "views"), [(0.0012, "both"), (0.008, "both"), (0.003, "left")]
 )
 def test_a_light_that_is_no_mark_does_not_count(radius_m: float, views: str) -> None:
-    """Too small or too large for its depth, or in one view only."""
+    """The light is too small or too large for its depth, or in one view only."""
     blob = Highlight(FixedPoint((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
     for expected in (None, HERE):
         reason, measured = detect_in(

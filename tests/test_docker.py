@@ -1,4 +1,4 @@
-"""Compose files and systemd unit, as far as can be told without an engine."""
+"""Test compose files and the systemd unit without running them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documentation hangs together: each page in the navigation, no link into the void."""
+"""Test the links of the documentation, and that the navigation contains each page."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from website.graph import LAB, TWIN, GraphDrawing
 from website.pages import generate
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
-"""Topics that the pictures of the graph leave out, as their page says."""
+"""Topics that the drawings of the graph omit, as their page explains."""
 
 START = DOCS / "index.md"
 
 
 def targets(page: Path) -> set[Path]:
-    """Pages of the site that a page links to."""
+    """Return the pages of the site that a page links to."""
     found = ((page.parent / link.target.partition("#")[0]).resolve() for link in links(page))
     return {target for target in found if target.suffix == ".md" and DOCS in target.parents}
 

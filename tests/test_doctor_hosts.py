@@ -87,7 +87,7 @@ def said(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> S
 
 
 def good(plan: ResolvedGraph) -> dict[str, HostProbe]:
-    """What three hosts say where all is well."""
+    """Return the reports of three hosts without faults."""
     found = {}
     for name in plan.hosts:
         nodes = plan.nodes_on(name)
@@ -305,7 +305,7 @@ async def test_how_far_one_comes_by_tcp(monkeypatch: pytest.MonkeyPatch) -> None
 async def shaken(
     known: Hosts, server: str | None, expected: str, asker: str = "main"
 ) -> Reachability:
-    """What the asker finds at a publisher of `server` where he expects `expected`."""
+    """Return the finding at a publisher of `server` where `expected` is expected."""
     keys = None if server is None else known.ring(server)
     publisher = Publisher(TOPICS["host"], ["tcp://127.0.0.1:*"], keys=keys)
     try:

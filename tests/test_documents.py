@@ -1,4 +1,4 @@
-"""Launch files and scenes that are too large, too deep or no text are refused before parsing."""
+"""Test that launch files and scenes that are too large, too deep or not text are rejected early."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ HOSTILE = {
 
 @pytest.fixture
 def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Counts the tokens that a test has read from a file: the work that was done."""
+    """Count the tokens that a test has read from a file."""
     counted = [0]
     scan = YAML.scan
 
@@ -96,7 +96,7 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
 
 
 class Choice(BaseModel):
-    """A model whose errors quote pydantic's own wording, and whose keys look like its tags."""
+    """Model whose errors quote pydantic's texts, and whose keys look like its tags."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -1,4 +1,4 @@
-"""How far a precomputation is, and how much longer it takes."""
+"""Test the progress and remaining time of a precomputation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiments' own arithmetic: a sheet known to be off is found off by just that."""
+"""Test the evaluation of experiments: a known error of the sheet is found."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def points_at(angles: np.ndarray, distance: float) -> np.ndarray:
 def edges_tangent_at(
     angles: np.ndarray, *, lifted_m: float = 0.0
 ) -> tuple[stroke.SampledMotion, ...]:
-    """Edges of a sheet that is tangent to the cylinder at `angles`, moved out along its normal."""
+    """Return edges of a sheet tangent to the cylinder at `angles`, displaced along its normal."""
     contact = points_at(angles, RADIUS + lifted_m)
     along = np.column_stack([np.zeros_like(angles), np.cos(angles), -np.sin(angles)])
     normal = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])

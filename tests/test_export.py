@@ -1,4 +1,4 @@
-"""Exported bags: opened by the readers of those who open them, and right in what they show."""
+"""Test that exported bags can be opened by the usual readers, with correct contents."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def opened(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Per channel (time, message): JSON as it is, protobuf by the schema that the file carries."""
+    """Return (time, message) per channel: JSON, or protobuf by the schema in the file."""
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])

@@ -1,4 +1,4 @@
-"""The judge of the picture: rays, occlusion, sizes, and the paper's figures 11 and 13 by rows."""
+"""Test the reference of the image: rays, occlusion, sizes, and figures 11 and 13 of the paper."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def bench(scene: Scene) -> CorrectionBench:
 
 
 def flat_sheet(world_from_sheet: np.ndarray, cells: int = 4) -> DeformedSheet:
-    """A plane sheet of 240 mm, without any mechanics."""
+    """Return a plane sheet of 240 mm, without mechanics."""
     x, y = np.meshgrid(np.linspace(-0.12, 0.12, cells + 1), np.linspace(-0.12, 0.12, cells + 1))
     points = np.stack([x, y, np.zeros_like(x)], axis=-1)
     positions = points @ world_from_sheet[:3, :3].T + world_from_sheet[:3, 3]
@@ -157,7 +157,7 @@ def test_expected_image_has_the_cylinders_own_size(scene: Scene) -> None:
 
 
 def blob(height: float, upper: float, lower: float, size: int = 300) -> np.ndarray:
-    """A trapezoid (sizes in pixels), antialiased by 16 x 16 samples, about the centre."""
+    """Draw a trapezoid about the centre (sizes in pixels), antialiased by 16 x 16 samples."""
     axis = (np.arange(size * 16) + 0.5) / 16 - size / 2
     y = axis[:, None] / height + 0.5
     half = 0.5 * (upper + (lower - upper) * y)
@@ -211,7 +211,8 @@ def mean_mm(
 
 
 def test_row_of_figure_11(bench: CorrectionBench) -> None:
-    """At 50 degrees the uncorrected error is the paper's tens of mm; corrected, a tenth."""
+    """At 50 degrees the uncorrected error is some tens of mm, as in the paper; corrected, a
+    tenth."""
     rolled = bench.situation(roll_sheet(bench.scene, np.radians(50.0)), None)
     assert 27.0 < mean_mm(bench, "none", rolled, tilt_sizes) < 34.0
     assert 1e3 * bench.size_errors("one_plane", *rolled, tilt_sizes).max() < 0.15
@@ -220,7 +221,7 @@ def test_row_of_figure_11(bench: CorrectionBench) -> None:
 
 
 def test_row_of_figure_13(bench: CorrectionBench) -> None:
-    """Pushed by 50 mm, four triangles leave the paper's few millimetres of its ten and more."""
+    """Pushed by 50 mm, four triangles reduce the paper's ten mm and more to a few millimetres."""
     pushed = bench.situation(*bench.pushed(0.05))
     corrections: tuple[Correction, ...] = ("none", "one_plane", "four_triangles", "two_pass")
     errors = {each: mean_mm(bench, each, pushed, push_sizes) for each in corrections}
@@ -243,7 +244,7 @@ class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
     async def step(
         self, port: str, message: Message, *, age_ms: float = 0.0, sequence: int = 1
     ) -> None:
-        """Pass a message with a fixed stamp; errors of the node are for the tests to judge."""
+        """Pass a message with a fixed stamp; the test checks the node's errors."""
         header = Header(1, 123, 124, "virtual", "test", 1)
         await self.node.step(port, message, header)
 
@@ -263,7 +264,7 @@ class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
         await self.step("twin__arms", self.arms)
 
     async def show(self, *frames: Frame) -> None:
-        """Frames, each followed by the true arms at the instant that it was drawn for."""
+        """Pass frames, each followed by the true arms at the time of its display."""
         for each in frames:
             await self.step("frame", each)
             await self.step("twin__arms", self.arms)

@@ -1,4 +1,4 @@
-"""Slow readers, storms and forgers over real sockets: who is not concerned notices nothing."""
+"""Test slow readers, message storms and forged messages over real sockets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["room"]
 
 
 async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Room) -> None:
-    """It is not read at all; the publisher never blocks, another reader loses nothing."""
+    """The reader never reads; the publisher does not block, and another reader loses nothing."""
     topic = TOPICS["twin/stereo"]
     publisher, ear = room.mouth(topic), room.ear(topic)
     ear.extra = lambda _: ear.heard.append((None, ear.heard.pop()[1]))  # pictures are not kept
@@ -56,7 +56,7 @@ def large_pictures(number: int) -> StereoPair:
 async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
     room: Room, name: str
 ) -> None:
-    """A hundred times as many messages as a topic has, faster than they can be handled."""
+    """The storm has a hundred times the topic's rate, more than can be handled."""
     topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
     publisher, ear = room.mouth(topic), room.ear(topic)
     start = await connected(publisher, ear, finger) + 1
@@ -77,7 +77,7 @@ async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
 
 
 async def test_of_thousands_of_forgeries_over_a_socket_none_is_taken(room: Room) -> None:
-    """Malformed, of another type, from an earlier start, again: counted, and good ones pass."""
+    """They are malformed, of another type, from an earlier start, or repeated; they are counted."""
     topic = TOPICS["fingertip"]
     endpoint = room.endpoint("forger")
     forger = room.raw(zmq.PUB, endpoint)

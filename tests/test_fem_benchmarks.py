@@ -1,4 +1,4 @@
-"""The soft body's family: what the chart is drawn from."""
+"""Test the soft body's method family, the data of the chart."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CHARTS = Path(__file__).parents[1] / "docs" / "charts"
 
 
 def small_scene() -> Scene:
-    """A small cylinder, that a coarse mesh does for."""
+    """Return a small cylinder, for which a coarse mesh is sufficient."""
     content = YAML(typ="safe").load(SCENE.read_text())
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]

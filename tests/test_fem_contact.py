@@ -1,4 +1,4 @@
-"""The fingertip's contact with the soft body: smooth, unique, bounded."""
+"""Test the fingertip's contact with the soft body: smooth, unique, bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A table's pushes on the workers of a lab's scheduler: real processes, on loopback."""
+"""Test the computation of a table by workers of a scheduler: real processes on loopback."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Lab:
-    """A scheduler of `distributed`, and workers that are started one by one."""
+    """Scheduler of `distributed`, with workers that are started one by one."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:
@@ -80,7 +80,8 @@ def lab() -> Iterator[Lab]:
 
 
 def job(depth_m: float = 0.0005) -> SnapshotJob:
-    """A block of 30 x 30 x 20 mm, glued to the ground, pushed in the middle of its top."""
+    """Return a job: a block of 30 x 30 x 20 mm, fixed at its bottom, pushed at the centre of its
+    top."""
     nodes, elements = box((4, 4, 2), (0.03, 0.03, 0.02))
     faces = boundary_faces(elements)
     return SnapshotJob(
@@ -96,7 +97,7 @@ def job(depth_m: float = 0.0005) -> SnapshotJob:
 
 
 def cpu_s(process: subprocess.Popen[str]) -> float:
-    """Time that a process has been at work."""
+    """Return the processor time of a process, s."""
     return float(sum(psutil.Process(process.pid).cpu_times()[:2]))
 
 

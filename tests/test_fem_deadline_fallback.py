@@ -1,4 +1,4 @@
-"""Which method answers when answers are late."""
+"""Test the selection of the method when results are late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The soft body's mesh and stiffness, against theory and against scikit-fem."""
+"""Test the soft body's mesh and stiffness against theory and scikit-fem."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def cylinder(
 
 
 def box(divisions: tuple[int, int, int], sides: tuple[float, float, float]) -> tuple[Floats, Ints]:
-    """Ten-node tetrahedra of a box: six per brick, along its main diagonal (Kuhn)."""
+    """Return ten-node tetrahedra of a box: six per brick, along its main diagonal (Kuhn)."""
     shape = tuple(n + 1 for n in divisions)
     grid = np.stack(
         np.meshgrid(
@@ -196,7 +196,8 @@ def test_a_rigid_motion_costs_nothing() -> None:
 
 
 def test_error_falls_with_the_third_power_of_the_element_size() -> None:
-    """Boundary values of a smooth equilibrium field: the gradient of a harmonic potential."""
+    """The boundary values are those of a smooth equilibrium field: the gradient of a harmonic
+    potential."""
     errors = []
     for n in (2, 4, 8):
         nodes, elements = box((n, n, n), (1.0, 1.0, 1.0))
@@ -241,7 +242,7 @@ def test_stiffness_needs_a_positive_modulus(modulus: float) -> None:
 
 
 def test_quadratic_elements_do_not_lock_near_incompressibility() -> None:
-    """A block squeezed between its end faces: it grows stiffer, but by far not tenfold."""
+    """A block compressed between its end faces becomes stiffer, but by far less than ten times."""
     nodes, elements = box((3, 3, 3), (1.0, 1.0, 1.0))
     held = degrees_of_freedom(np.flatnonzero((nodes[:, 2] == 0) | np.isclose(nodes[:, 2], 1.0)))
     values = np.where(np.isclose(nodes[held // 3, 2], 1.0) & (held % 3 == 2), -0.01, 0.0)

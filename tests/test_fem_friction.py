@@ -1,4 +1,4 @@
-"""A finger that sticks drags the skin along; pushed harder aside than it presses, it slips."""
+"""Test a sticking finger that drags the skin, and slips above the friction limit."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_pull_is_in_proportion_to_the_drag(body: LinearSoftBody) -> None:
 
 
 def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
-    """A tilted push: down and aside at once, from the touch on."""
+    """The push is tilted: downwards and sideways simultaneously, from the first contact."""
     way = np.linspace(0.0, 0.006, 400)
     answers = [body.respond(push(d, (0.5 * d, 0.0, 0.0))) for d in way]
     moves = [

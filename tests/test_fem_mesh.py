@@ -1,4 +1,4 @@
-"""Meshes of every shape: sound, true to the shape, fine where fingers go, held where asked."""
+"""Test meshes of every shape: validity, accuracy, resolution under fingers, and supports."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ CYLINDER = {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12}
 
 
 def egg_mesh() -> dict[str, Any]:
-    """An ellipsoid as triangles."""
+    """Return an ellipsoid as triangles."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.ascontiguousarray(ball.vertices * EGG_AXES_M, dtype=np.float64)
     return {
@@ -96,7 +96,7 @@ CLOSED = ("sphere", "ellipsoid", "rounded_box", "mesh")
 
 
 def scene(geometry: dict[str, Any], **changes: Any) -> Scene:
-    """The cylinder's scene with another object."""
+    """Return the cylinder's scene with another object."""
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     body = content["object"]
     del body["support_angle_rad"]
@@ -142,7 +142,7 @@ def hull_area(solid: SolidMesh, faces: Ints) -> float:
 
 
 def expected(geometry: dict[str, Any]) -> tuple[float, float]:
-    """Volume and area in closed form, or of a mesh's triangles."""
+    """Return volume and area in closed form, or of a mesh's triangles."""
     match geometry["shape"]:
         case "sphere":
             r = geometry["radius_m"]
@@ -174,7 +174,7 @@ def expected(geometry: dict[str, Any]) -> tuple[float, float]:
 
 
 def require_sound(solid: SolidMesh) -> None:
-    """Valid elements, a closed hull of the sphere's topology, parts that fit one another."""
+    """Assert valid elements, a closed hull with the sphere's topology, and consistent parts."""
     assert radius_ratios(solid.nodes, solid.elements).min() > MIN_RADIUS_RATIO
     assert np.degrees(min_dihedral_rad(solid.nodes, solid.elements).min()) > 8
     assert min_jacobian_ratios(solid.nodes, solid.elements).min() > 0.99 * MIN_JACOBIAN_RATIO
@@ -280,7 +280,7 @@ def test_symmetric_shapes_have_symmetric_meshes(name: str, axis: int) -> None:
 
 @pytest.mark.parametrize("angle_rad", [0.1, 1.2])
 def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> None:
-    """Or a finger that is pressed there is pushed aside: nodes and edges are mirrored."""
+    """Nodes and edges are mirrored; otherwise a pressed finger would be pushed sideways."""
     radius_m, near_m = CYLINDER["radius_m"], 0.011
     mesh = cylinder_mesh(
         radius_m=radius_m,

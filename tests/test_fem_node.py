@@ -1,4 +1,4 @@
-"""The soft body node, driven as the runner drives it."""
+"""Test the soft body node with the runner's calls."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 
 
 def scene(**changes: Any) -> Scene:
-    """The cylinder scene; `changes` go into its object."""
+    """Return the cylinder scene; `changes` are applied to its object."""
     content = YAML(typ="safe").load((SCENES / "cylinder.yaml").read_text())
     content["object"].update(changes)
     return Scene.model_validate(content)
@@ -58,7 +58,7 @@ def fingertip(
 
 
 class Named:
-    """A method under another name."""
+    """Method under another name."""
 
     def __init__(self, method: Any, name: str) -> None:
         self._method, self.name = method, name
@@ -68,7 +68,7 @@ class Named:
 
 
 class Bench(NodeHarness[FemSolver, VirtualClock]):
-    """A solver that gets fingertips by hand."""
+    """Solver that receives fingertips from the test."""
 
     def __init__(self, **parameters: Any) -> None:
         given = FemSolverParameters(skin_spacing_m=0.007, **parameters)
@@ -265,7 +265,7 @@ async def test_closing_interrupts_the_precomputation(tmp_path: Path) -> None:
 async def test_a_newer_scene_interrupts_the_precomputation(
     cache: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cached scene waited for minutes of work on the one that it replaced."""
+    """A cached scene waited for minutes of computation for the scene that it replaced."""
     begun, meshed, ended = threading.Event(), threading.Event(), threading.Event()
 
     def endless(spec: Any, progress: Any, parts: Any = None) -> Any:

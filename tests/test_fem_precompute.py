@@ -1,4 +1,4 @@
-"""The precomputation and its cache: right, whole or absent, never half."""
+"""Test the precomputation and its cache: correct and atomic."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_the_cache_is_where_the_desktop_wants_it(
 
 
 def test_the_node_module_is_light_to_import() -> None:
-    """No part of scipy is loaded before a scene needs it: processes must start quickly."""
+    """No part of scipy is loaded before a scene needs it, since processes must start quickly."""
     code = (
         "import sys, json, flexsheet.nodes.fem_solver.node;"
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('scipy', 'matplotlib')]))"

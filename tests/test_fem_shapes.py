@@ -1,4 +1,4 @@
-"""Every shape of a scene yields under the finger: dented where it is pushed, smoothly, bounded."""
+"""Test that every shape of a scene deforms smoothly under the finger, within bounds."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BASE = {"kind": "base", "height_m": 0.01}
 
 
 def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
-    """The demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object, its front at the world's origin."""
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     del content["object"]["support_angle_rad"]
     content["object"] |= {
@@ -79,7 +79,7 @@ def soft(request: pytest.FixtureRequest) -> SceneBody:
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:
-    """The answer to a finger at a depth below the surface near (x, y), and the normal there."""
+    """Return the result for a finger at a depth below the surface near (x, y), and the normal."""
     found = soft.shape.closest(soft.front + np.array([x, y, 0.0]))
     point = found.point - depth * found.normal
     return soft.respond(rigid.apply(soft.world_from_mesh, point), None)[0], found.normal

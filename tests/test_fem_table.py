@@ -1,4 +1,4 @@
-"""The nonlinear table: filled from few pushes, smooth, bounded, kept, made in other processes."""
+"""Test the nonlinear table: interpolation, smoothness, bounds, cache, and worker processes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MODULUS = 4000.0
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse() -> Iterator[None]:
-    """Few sites, few depths, a coarse mesh: what is tested does not depend on them."""
+    """Return a specification with few samples, few depths and a coarse mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
         patch.setattr(snapshots, "SPACING_RATIO", 1.0)
@@ -102,7 +102,7 @@ def largest_move(a: Response, b: Response) -> float:
 def test_away_from_the_finger_it_is_what_newton_finds(
     body: TableSoftBody, model: SoftBodyModel
 ) -> None:
-    """At a place that no push was solved at."""
+    """The test position is not a sample of the table."""
     there = push(0.005, 0.2, 0.003)
     mesh = build_mesh(SPEC.body.mesh)
     sample = SamplePoint(there.surface, there.normal)

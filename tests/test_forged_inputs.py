@@ -1,7 +1,7 @@
-"""Forged fingertips and forged states of the other arm move no arm beyond a limit.
+"""Test that forged fingertips and forged states of the other arm move no arm beyond a limit.
 
-Planner, both bridges and the simulated arms' controllers in virtual time.  Speeds are those of the
-simulated joints, the tool's by the simulator's kinematics.
+Planner, both bridges and the simulated controllers run in virtual time. Speeds are those of the
+simulated joints, and of the tool by the simulator's kinematics.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
 
 
 class Immediate(PathChecker):
-    """Check paths at once, since time is virtual here."""
+    """Path checker without delay, for virtual time."""
 
     def poll(
         self, question: PathCheckRequest | None
@@ -79,7 +79,7 @@ def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
 
 @dataclass
 class ForgedBench(Bench):
-    """The bench with a planner, and with somebody who replaces states of the other arm."""
+    """Harness with a planner, and with a replacement of the other arm's states."""
 
     forge_state: Callable[[ArmState, Header], tuple[ArmState, Header]] | None = None
     targets_told: list[SheetTarget] = field(default_factory=list)
@@ -132,7 +132,7 @@ class ForgedBench(Bench):
         self.max_length_m = max(self.max_length_m, length_m)
 
     async def point(self, seconds: float, tip: Callable[[], tuple[Fingertip, Header]]) -> None:
-        """Let time pass while the planner gets these fingertips."""
+        """Let time pass while the planner receives these fingertips."""
         begin_ns, told = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if passed_s * FINGER_HZ >= told:
@@ -212,7 +212,7 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
 
 
 def run_bench(test: Callable[[ForgedBench], Awaitable[None]]) -> None:
-    """Run a test on a bench of its own."""
+    """Run a test with a new harness."""
 
     async def main() -> None:
         with pytest.MonkeyPatch.context() as patch:

@@ -1,6 +1,7 @@
-"""Bytes from outside, changed by what knows their structure: understood, or refused as declared.
+"""Test the fuzzing targets with hypothesis: inputs are decoded, or rejected with the declared
+error.
 
-The same targets that `make fuzz` hunts in for longer.
+`make fuzz` runs the same targets for longer.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from benchmarks.fuzz_targets import (
 EXAMPLES = {
     "wire": 150, "bag": 40, "launch": 6, "scene": 6, "mesh": 15, "modbus": 30, "mxt": 30
 }  # fmt: skip
-"""Each some tenths of a second to two."""
+"""Number of examples by target; each target takes some tenths of a second to two seconds."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,4 +1,4 @@
-"""The whole graph on localhost, judged by its own bag: rates, ages, losses, exits, nothing left."""
+"""Test the whole graph on localhost by its own bag: rates, ages, losses, exits, remains."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MIN_FRAMES = 20
 
 
 def processes_of_run(run_id: str) -> list[psutil.Process]:
-    """Live processes that carry the run's tag."""
+    """Return the live processes with the run's tag."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -53,7 +53,7 @@ def processes_of_run(run_id: str) -> list[psutil.Process]:
 
 
 def on_ports(plan_ports: tuple[int, int]) -> list[str]:
-    """Settings that put the twin's arms on ports of this test's own."""
+    """Return settings that put the simulated arms on this test's ports."""
     left, right = plan_ports
     return [
         f"twin_arms.left_port={left}",
@@ -64,7 +64,7 @@ def on_ports(plan_ports: tuple[int, int]) -> list[str]:
 
 
 def free_ports() -> tuple[int, int]:
-    """Two TCP ports of the loopback that nobody listens on now."""
+    """Return two free TCP ports of loopback."""
     with socket.socket() as one, socket.socket() as other:
         one.bind(("127.0.0.1", 0))
         other.bind(("127.0.0.1", 0))
@@ -73,7 +73,7 @@ def free_ports() -> tuple[int, int]:
 
 @dataclass
 class Session:
-    """What a run of the graph left behind."""
+    """Results of a run of the graph."""
 
     bag: Path
     exit_codes: dict[str, int]
@@ -167,7 +167,7 @@ def recording(session: Session) -> stroke.StrokeRecording:
 
 
 def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> None:
-    """Rates over the first stroke, before anything is killed, from the publishers' own stamps."""
+    """Rates are computed over the first stroke, before the kill, from the publishers' stamps."""
     stamps: dict[str, list[int]] = {}
     windows = stroke.read_recording(session.bag).windows_ns
     begin_ns, end_ns = windows[stroke.stroke_label(STROKE_S)]
@@ -211,7 +211,7 @@ def test_sequences_in_the_bag_have_no_gaps(session: Session) -> None:
 
 
 def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
-    """What was used is nearly the newest that had been published, however slow the machine is."""
+    """Used data are nearly the newest that had been published, on any machine."""
     published: dict[str, list[tuple[int, int]]] = {"fingertip": [], "sheet_target": []}
     used: dict[str, list[tuple[int, int]]] = {"planner": [], "arms": [], "renderer": []}
     for topic, message, header, _ in BagReader(session.bag):
@@ -282,7 +282,7 @@ def test_every_node_ended_well_and_nothing_is_left(session: Session) -> None:
 
 @pytest.fixture
 def runs_folder() -> Iterator[Path]:
-    """A folder for runs with a path so short that sockets fit whatever the user's name is."""
+    """Create a folder for runs with a path that is short enough for sockets."""
     with tempfile.TemporaryDirectory(prefix="fs", dir="/tmp") as folder:
         yield Path(folder)
 
@@ -299,7 +299,7 @@ def start(runs: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def read_until(process: subprocess.Popen[str], words: str) -> None:
-    """Read its words on stderr until `words` come; the test's own limit is the deadline."""
+    """Read stderr of a process until a text occurs; the test's timeout is the deadline."""
     assert process.stderr is not None
     for line in process.stderr:
         if words in line:
@@ -325,7 +325,7 @@ def assert_nothing_is_left(runs: Path) -> None:
 
 @pytest.mark.parametrize("words", ["run ", "is ready", "all 10 nodes are ready"])
 def test_ctrl_c_at_any_moment_leaves_nothing(runs_folder: Path, words: str) -> None:
-    """SIGINT as the first process starts, in the middle of start-up, and when all are up."""
+    """SIGINT comes at the first process, during start-up, and when all nodes run."""
     settings = [part for setting in on_ports(free_ports()) for part in ("--set", setting)]
     launcher = start(runs_folder, "launch", str(DEMO_FILE), *settings)
     read_until(launcher, words)

@@ -1,4 +1,4 @@
-"""Where the arms' bases stand: measured from a board on the flange, with honest uncertainty."""
+"""Test the poses of the arms' bases, measured from a board on the flange, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ SIZE = (SCENE.camera.width_px, SCENE.camera.height_px)
 
 
 def seen(left_from_board: Floats, noise: Floats) -> list[CornerView]:
-    """The corners by the twin's own projection; noise (2, 35, 2) px."""
+    """Project the corners with the simulator; noise (2, 35, 2) px."""
     views = []
     for lens, eye_from_left, off in zip(
         (SCENE.camera.left, SCENE.camera.right),
@@ -81,7 +81,7 @@ def seen(left_from_board: Floats, noise: Floats) -> list[CornerView]:
 
 
 class Workplace:
-    """An arm of the twin with a board on its flange, before the camera."""
+    """Simulated arm with a board on its flange, in front of the camera."""
 
     def __init__(self, seed: int, side: Side = "left") -> None:
         self.random = np.random.default_rng(seed)
@@ -94,7 +94,8 @@ class Workplace:
         self.flange_from_board = inverse(flange) @ board
 
     def joints(self, turn_rad: Floats, shift_m: Floats) -> Floats:
-        """Joints that turn the board (rotation vector, in the camera's axes) and shift it."""
+        """Return joints that rotate the board (rotation vector, in the camera's axes) and shift
+        it."""
         rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(turn_rad)
         board = transform(rotation, self.held + shift_m - rotation @ CORNERS.mean(axis=0))
         return solve_inverse_kinematics(
@@ -119,7 +120,8 @@ class Workplace:
         joint_noise_rad: float = 0.0,
         turn_rad: Any = 0.3,
     ) -> list[BoardDetection]:
-        """turn_rad: deviation of the turns, one for all three axes or for each."""
+        """Simulate detections; turn_rad: standard deviation of the rotations, for all axes or for
+        each."""
         found: list[BoardDetection] = []
         while len(found) < count:
             turn = self.random.normal(0.0, 1.0, 3) * turn_rad
@@ -134,7 +136,7 @@ class Workplace:
         return found
 
     def error(self, fit: BaseFit) -> Floats:
-        """(6,) motion from the found base to the true one."""
+        """Return the motion (6,) from the estimated base to the true one."""
         turn = self.base[:3, :3] @ fit.world_from_base[:3, :3].T
         shift = self.base[:3, 3] - fit.world_from_base[:3, 3]
         return np.concatenate([vector_from_rotation(turn), shift])
@@ -288,7 +290,7 @@ def test_roll_pitch_yaw_of_straight_up_and_down(pitch: float) -> None:
 def write_poses(
     folder: Path, detections: list[BoardDetection], place: Workplace, unit: str
 ) -> None:
-    """A table with the board's poses instead of pictures."""
+    """Write a table with the board's poses instead of images."""
     names = ("board_x_m", "board_y_m", "board_z_m", "board_rx_rad", "board_ry_rad", "board_rz_rad")
     with (folder / TABLE).open("w", newline="") as file:
         writer = csv.writer(file)
@@ -351,7 +353,7 @@ def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
 
 
 class Live:
-    """A PoseRecorder that is shown what the twin's camera sees, with a clock of its own."""
+    """PoseRecorder with images of the simulated camera and a separate clock."""
 
     def __init__(self, folder: Path) -> None:
         self.place = Workplace(12)

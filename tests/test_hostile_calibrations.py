@@ -1,4 +1,4 @@
-"""Calibration files that no command of ours has written are refused in a sentence."""
+"""Test that invalid calibration files are rejected with an error text."""
 
 from __future__ import annotations
 

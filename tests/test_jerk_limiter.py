@@ -1,4 +1,4 @@
-"""The sheet's motion: bounded in speed, acceleration and jerk, and on its target all the same."""
+"""Test the sheet's motion: bounded in speed, acceleration and jerk, and accurate at its target."""
 
 from __future__ import annotations
 

@@ -246,9 +246,9 @@ def test_away_from_singularities_the_next_joints_are_exact(joints: Floats, step:
 
 
 def wrist_path(past_rad: float, step_rad: float, bend_rad: float = 0.0) -> list[Floats]:
-    """Poses on which the flange's axis passes that of the forearm at a distance.
+    """Return poses on which the flange's axis passes that of the forearm at a distance.
 
-    The wrist's centre stays; seen along the forearm the axis draws a line, which turns aside by
+    The wrist's centre is fixed. Seen along the forearm, the axis draws a line with a bend of
     `bend_rad` at the nearest point.
     """
     base = forward(np.array([*CENTRE_RAD[:3], 0.0, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""The lag of one motion behind another: found where it is known, and not where there is none."""
+"""Test the estimated lag of one motion behind another, with a known lag and without a relation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RATE_HZ = 60.0
 
 
 def wander(times_s: Floats, seed: int, *, band_hz: tuple[float, float] = (0.15, 1.2)) -> Floats:
-    """A slow random motion (n, 3) of 0.5 mm, known at any time."""
+    """Return a slow random motion (n, 3) of 0.5 mm, as a function of time."""
     generator = np.random.default_rng(seed)
     frequencies = generator.uniform(*band_hz, (7, 3))
     phases = generator.uniform(0.0, 2.0 * np.pi, (7, 3))
@@ -24,7 +24,7 @@ def wander(times_s: Floats, seed: int, *, band_hz: tuple[float, float] = (0.15, 
 
 
 def stroke(times_s: Floats, seed: int = 0) -> Floats:
-    """60 degrees around a cylinder in ten seconds, unsteadily."""
+    """Return 60 degrees around a cylinder in ten seconds, with tremor."""
     angle = np.radians(6.0) * times_s
     around = 0.035 * np.stack([np.zeros_like(angle), np.sin(angle), np.cos(angle)], axis=1)
     return np.asarray(around + wander(times_s, seed))

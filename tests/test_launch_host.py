@@ -1,4 +1,4 @@
-"""What a launcher says of its host, and the e-stop that it keeps for who comes late."""
+"""Test a launcher's reports of its host, and its e-stop for late subscribers."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def plan_of(folder: Path, nodes: dict[str, Any]) -> ResolvedGraph:
 async def heard_late(
     plan: ResolvedGraph, graph: RunningGraph, expected: dict[str, EStop]
 ) -> dict[str, EStop]:
-    """The e-stops, by writer, that somebody hears who comes only now.
+    """Return the e-stops, by writer, that a new subscriber receives.
 
-    Waits for the expected ones; without any, for a while in which none shall come.
+    Wait for the expected ones; without any, wait NOTHING_COMES_S.
     """
     heard: dict[str, EStop] = {}
     subscriber = make_subscriber(

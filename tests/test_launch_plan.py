@@ -1,4 +1,4 @@
-"""Launch files: what is wrong with one is said before any process starts, with line and remedy."""
+"""Test the errors of launch files, which name line and remedy before any process starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The supervisor: nodes come up, come back, and nothing of them stays."""
+"""Test the supervisor: nodes start, restart, and leave nothing."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FLEXSHEET = [sys.executable, "-m", "flexsheet"]
 
 @pytest.fixture(autouse=True)
 def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A directory of runs of the test's own, with a short path."""
+    """Create a directory of runs for the test, with a short path."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
     yield folder
@@ -66,7 +66,7 @@ LISTENER = {"type": "tests.launch_nodes:Listener"}
 
 
 def processes_of(run_id: str) -> list[psutil.Process]:
-    """All processes that carry the run's tag."""
+    """Return all processes with the run's tag."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -89,7 +89,7 @@ def assert_nothing_left(folder: Path) -> None:
 
 
 def session_niceness(pid: int) -> int | None:
-    """None where the kernel does not weigh sessions."""
+    """Return the niceness of a session; None if the kernel does not weight sessions."""
     autogroup = Path(f"/proc/{pid}/autogroup")
     return int(autogroup.read_text().split()[-1]) if autogroup.exists() else None
 
@@ -202,7 +202,7 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
 
 
 async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: Path) -> None:
-    """One stands still as a whole, the loop of the other does not turn; the third is well."""
+    """One process is stopped, and the loop of another hangs; the third is healthy."""
     quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
     plan = plan_of(
         tmp_path,
@@ -232,7 +232,7 @@ def any_has(lines: list[str], words: str) -> bool:
 async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Suspended, but with the readings of a process that waits for a processor."""
+    """The process is suspended, with the measurements of one that waits for a processor."""
     starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
     monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
@@ -287,7 +287,8 @@ def test_what_counts_as_starved_in_half_a_second(
     now: tuple[float, float, str] | None,
     starved: float,
 ) -> None:
-    """Asleep, suspended, in a loop of its own; sometimes and always waiting for a processor."""
+    """The cases are asleep, suspended, in an endless loop, and partly or always waiting for a
+    processor."""
     earlier = None if before is None else ProcessorTime(*before)
     later = None if now is None else ProcessorTime(*now)
     assert compute_starved_s(earlier, later, 0.5) == pytest.approx(starved)
@@ -362,7 +363,8 @@ async def test_a_port_in_use_is_named_before_anything_starts(
 
 
 def heard_estop(bag: Path) -> bool:
-    """Whether the listener has heard ten messages of the beacon, which it says by an e-stop."""
+    """Return whether the listener received ten messages of the beacon, which it reports by an
+    e-stop."""
     return "estop" in BagReader(bag).topics
 
 
@@ -406,7 +408,7 @@ async def test_the_directory_of_runs_must_be_ours(
 
 @pytest.fixture
 def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Commands of a test; those that it leaves running are killed, with their nodes."""
+    """Start commands for a test; remaining ones are killed with their nodes."""
     processes: list[subprocess.Popen[str]] = []
     yield processes
     left = [process for process in processes if process.poll() is None]
@@ -418,7 +420,7 @@ def started() -> Iterator[list[subprocess.Popen[str]]]:
 
 
 def set_sigint(action: signal.Handlers, *, blocked: bool) -> None:
-    """In a child before it runs: a test's own parent may ignore SIGINT, and children inherit it."""
+    """Set SIGINT in a child before it runs, since children inherit an ignored SIGINT."""
     signal.signal(signal.SIGINT, action)
     how = signal.SIG_BLOCK if blocked else signal.SIG_UNBLOCK
     signal.pthread_sigmask(how, {signal.SIGINT})
@@ -512,7 +514,8 @@ def test_a_killed_launcher_leaves_no_node_behind(
 
 
 def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
-    """An orphan that neither signal nor lifeline reached; a live launcher's; one without a tag."""
+    """The processes are an orphan without lifeline, one of a live launcher, and one without a
+    tag."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead_run = f"{dead.pid}.1.1"
     dead.wait()

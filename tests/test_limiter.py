@@ -228,8 +228,8 @@ whatever = st.one_of(
 def test_from_any_state_no_goal_and_no_step_leads_out_of_bounds(
     joints: Floats, share: Floats, goal: Floats, along: Floats, step_s: float
 ) -> None:
-    """NaN, infinite, huge and denormal goals; joints out of range, from where only the way back is
-    open; any speeds, be they such that the arm cannot stop in range."""
+    """Goals are NaN, infinite, huge and denormal; joints are also out of range, with any speed,
+    even if the arm cannot stop in range."""
     velocity = step(joints, share * LIMITS.speed_rad_per_s, goal, along, step_s)
     after = joints + velocity * step_s
     assert np.isfinite(velocity).all()
@@ -300,7 +300,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_random_or_adversarial_command_moves_an_arm_out_of_its_limits(seed: int) -> None:
-    """Run a short `python -m benchmarks.limiter` with its judging code."""
+    """Run a short `python -m benchmarks.limiter`."""
     result = run(5000, seed, hunting=False)
     assert result["commands"] >= 5000
     assert not any(result["violations"].values()), result

@@ -1,4 +1,4 @@
-"""Every number of a scene, a launch file and a node's parameters has limits that are checked."""
+"""Test that every number of a scene, a launch file and a node's parameters has limits."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Key = tuple[Any, ...]
 
 
 def numbers_in(value: Any, key: Key = ()) -> Iterator[Key]:
-    """The keys of all numbers in plain values."""
+    """Return the keys of all numbers in plain values."""
     match value:
         case dict():
             for name, one in value.items():
@@ -113,7 +113,7 @@ def test_an_absurd_parameter_is_refused(where: tuple[str, str], value: float) ->
     value=st.floats(min_value=-1e-12, max_value=1e-12, exclude_min=True, exclude_max=True),
 )
 def test_a_tiny_number_is_refused_or_is_a_coordinate(where: tuple[str, Key], value: float) -> None:
-    """What must be above zero is not accepted below what a device resolves."""
+    """A value that must be positive is not accepted below a device's resolution."""
     name, key = where
     if name == "organ":
         return
@@ -169,7 +169,7 @@ def models_below(base: type[BaseModel]) -> Iterator[type[BaseModel]]:
 
 
 def test_what_files_hold_is_limited() -> None:
-    """The roots; their parts derive from the same class, as they share it."""
+    """The test lists the top-level models; nested ones derive from the same class."""
     limited = set(models_below(LimitedModel))
     assert {LaunchFile, StereoCalibration, *PARAMETERS.values()} <= limited
     for name, field in Scene.model_fields.items():

@@ -1,4 +1,4 @@
-"""A node's log repeats no warning without end."""
+"""Test that a node's log does not repeat a warning endlessly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.nodes.log_limit import MAX_DISTINCT, REPORT_PERIOD_S, RepeatLimit
 
 
 class Log:
-    """A logger behind a limiter whose clock the test sets."""
+    """Logger behind a limiter with a clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 0.0

@@ -1,4 +1,4 @@
-"""Marks in single pictures: what counts as one, and its centre against the best possible."""
+"""Test the detection of markers in single images, and the accuracy of their centres."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def disc(
     ground: float = 30.0,
     blur_px: float = 0.0,
 ) -> Image:
-    """A disc on an even ground, every pixel lit by the share of it that is covered."""
+    """Draw a disc on a uniform ground, with each pixel weighted by its covered fraction."""
     y, x = np.mgrid[0 : 100 * 8, 0 : 120 * 8] / 8.0 - 0.4375
     covered = np.hypot(x - centre[0], y - centre[1]) < radius
     share = covered.reshape(100, 8, 120, 8).mean(axis=(1, 3))
@@ -66,7 +66,7 @@ def sound_marks_in(image: Image) -> list[Marker]:
 @given(x=st.floats(20, 100), y=st.floats(20, 80), radius=st.floats(2.5, 8))
 @settings(max_examples=40, deadline=None)
 def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: float) -> None:
-    """Without a lens's blur the least mark is hardest: the grid's worst place, not its mean."""
+    """Without blur the smallest marker is the hardest at the worst position on the pixel grid."""
     image = disc((x, y), radius=radius)
     for name, limit_px in (
         ("moments", 0.35),
@@ -139,7 +139,7 @@ def test_a_mark_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> Non
 def drawn(
     count: int, radius_px: float, motion_px: float, *, seed: int, noise: PixelNoise = SENSOR
 ) -> list[tuple[DrawnDisc, Image]]:
-    """Discs all over the pixel grid that move in all directions, as a noisy sensor sees them."""
+    """Draw discs at random subpixel positions and motions, with sensor noise."""
     random = np.random.default_rng(seed)
     discs = []
     for _ in range(count):
@@ -152,8 +152,8 @@ def drawn(
 
 @pytest.mark.parametrize(("radius_px", "motion_px"), [(1.6, 0.0), (3.2, 0.0), (3.2, 4.0), (6.0, 0)])
 def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: float) -> None:
-    """Within 1.25 of what no method can beat, though it also allows for a ground that slopes,
-    which the bound does not; and the normalised errors are those of what it states (2 if exact)."""
+    """The error is within 1.25 of the bound, although the fit also estimates a sloped ground. The
+    errors, normalised by the reported covariance, are near 2, as for an exact one."""
     discs = drawn(100, radius_px, motion_px, seed=5)
     bound_px = np.mean([centre_bound_px(one, SENSOR) for one, _ in discs[:3]])
     errors, normalised = [], []
@@ -179,7 +179,7 @@ def test_a_mark_drawn_out_by_motion_is_less_certain_along_it() -> None:
 
 
 def test_more_noise_than_the_sensor_should_have_is_stated() -> None:
-    """The residuals tell it, whatever the sensor's data sheet says."""
+    """The residuals show it, independent of the sensor's specification."""
     loud = PixelNoise(4.0 * SENSOR.read_levels, SENSOR.photons_per_level / 16.0)
     normalised = []
     for one, image in drawn(100, 3.2, 0.0, seed=7, noise=loud):
@@ -216,7 +216,7 @@ def test_a_mark_out_of_focus_is_said_to_be() -> None:
 
 @pytest.mark.parametrize("gap_px", [3.0, 4.0, 5.5])
 def test_a_mark_that_runs_into_a_light_is_no_sound_one(gap_px: float) -> None:
-    """Two lights in one spot: never a mark that is sound, of its size, and lies between them."""
+    """Two lights in one blob never give a valid marker of the right size between them."""
     image = np.maximum(disc((50.0, 40.0), radius=3.2), disc((50.0 + gap_px, 41.0), radius=2.5))
     image = np.maximum(image, disc((50.0 + gap_px, 41.0), radius=2.5, level=255.0))
     for marker in sound_marks_in(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7))):
@@ -250,7 +250,7 @@ def test_a_fit_that_starts_beside_the_disc_or_on_nothing_does_not_settle() -> No
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=12, deadline=None)
 def test_no_picture_breaks_the_search(seed: int) -> None:
-    """Rough noise, smooth noise and steps: marks may be found, but numbers are finite."""
+    """Noise and steps can give markers, but all numbers are finite."""
     random = np.random.default_rng(seed)
     image = random.normal(120.0, 80.0, (60, 80))
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), float(random.uniform(0.3, 3.0))))

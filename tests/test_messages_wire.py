@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out, byte for byte; whatever else comes in is one WireError."""
+"""Test the wire format: lossless encoding, and WireError for any invalid input."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def scene() -> Scene:
 
 
 def same(a: object, b: object) -> bool:
-    """Equality that looks into arrays, bit by bit."""
+    """Compare values bit by bit, including arrays."""
     if isinstance(a, BaseModel):
         return type(a) is type(b) and same(a.__dict__, b.__dict__)
     if isinstance(a, dict) and isinstance(b, dict):
@@ -218,7 +218,7 @@ def test_foreign_msgpack(value: object, more: list[bytes]) -> None:
 
 @given(st.data())
 def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
-    """Any one element of a good header replaced, any one field replaced."""
+    """Any one element of a valid header or any one field is replaced."""
     message = data.draw(fingertips)
     codec = codec_of(Fingertip)
     fields: dict[str, object] = {
@@ -237,7 +237,7 @@ def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
 @settings(max_examples=300)
 @given(messages, st.data())
 def test_mutated_messages_are_refused_or_valid(message: Message, data: st.DataObject) -> None:
-    """Flipped, cut, lengthened, exchanged, dropped: a WireError or a message that is valid."""
+    """Bytes are flipped, cut, added, exchanged or dropped: WireError, or a valid message."""
     frames = [bytearray(frame) for frame in encode(message, HEADER, inline_bytes=64)]
     which = data.draw(st.integers(0, len(frames) - 1))
     frame = frames[which]

@@ -1,4 +1,4 @@
-"""The real-time external control: its packets, its link, and the simulated controller."""
+"""Test the real-time external control: packets, link, and the simulated controller."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_the_document_has_the_layout_of_the_code() -> None:
 
 
 def test_the_bytes_of_a_command_are_the_makers() -> None:
-    """Offsets from the maker's struct: command 0, types 2 and 4, data 8, counters 58 and 60."""
+    """The offsets are those of the manufacturer's struct: command 0, types 2 and 4, data 8,
+    counters 58 and 60."""
     packet = encode_joints(np.array([0.5, -0.25, 1.5, 2.0, -1.0, 0.0]))
     assert len(packet) == 196
     assert packet[:8].hex() == "0100020008000000"
@@ -195,7 +196,7 @@ def controller(**changed: float) -> MxtController:
 
 
 def ask(arm: MxtController, packet: bytes, sender: tuple[str, int] = ME) -> bytes | None:
-    """One cycle with that packet; the answer, if there was one."""
+    """Exchange one packet; return the answer, if any."""
     arm.receive_command(packet, sender)
     arm.advance(CONTROLLER_CYCLE_S)
     answers, arm.answers = arm.answers, []
@@ -447,7 +448,7 @@ async def test_late_answers_are_thrown_away() -> None:
 
 
 async def test_an_older_answer_is_not_taken_for_the_newest() -> None:
-    """A network that delivers an answer twice: the second is told by its count."""
+    """The network delivers an answer twice: the second is identified by its counter."""
 
     class Twice(asyncio.DatagramProtocol):
         count = 4

@@ -1,4 +1,4 @@
-"""The node form: ports, parameters, handlers, mailboxes, errors and status."""
+"""Test the node base class: ports, parameters, handlers, mailboxes, errors and status."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class EchoParameters(NodeParameters):
 
 
 class Echo(Node):
-    """Sends each stop on; fails when told to."""
+    """Node that forwards each stop, or fails on request."""
 
     parameters: EchoParameters
     estop: Input[EStop]

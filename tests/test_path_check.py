@@ -42,7 +42,7 @@ from tests.waiting import DEADLINE_S, until
 Floats = NDArray[np.float64]
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
 FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 0.0, 0.0]))
-"""Sheet so far to the right that the left arm's J3 is out of range."""
+"""Pose of the sheet so far to the right that the left arm's J3 is out of range."""
 
 
 def make_request(start: SheetMotion, goal: SheetMotion) -> PathCheckRequest:
@@ -57,13 +57,13 @@ def mirrored(way: PathCheckRequest) -> PathCheckRequest:
 
 
 def find_violation(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> str | None:
-    """Return why the path is blocked; None where it is clear, without its alignment."""
+    """Return why the path is blocked; None if it is clear, independent of its alignment."""
     result = check_path(arm, other, request)
     return result if isinstance(result, str) else None
 
 
 def run_with_checks(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
-    """Run both arms like `run`, and check each requested path at once."""
+    """Run both arms like `run`, and check each requested path immediately."""
     for _ in range(cycles):
         for arm, other in (arms, arms[::-1]):
             control = arm.control

@@ -1,4 +1,4 @@
-"""The planner: approach, rolling, holding, bounds, compliance, and the same bytes every time."""
+"""Test the planner: approach, rolling, holding, bounds, compliance and determinism."""
 
 from __future__ import annotations
 
@@ -38,13 +38,14 @@ FRAME_NS = 16_666_667
 
 
 def on_cylinder(angle_deg: float, height: float = 0.0, x: float = 0.0) -> Floats:
-    """A point at a height over the cylinder's skin, in the object's frame."""
+    """Return a point at a height over the cylinder's skin, in the object's frame."""
     angle, reach = math.radians(angle_deg), RADIUS + height
     return np.array([x, reach * math.sin(angle), reach * math.cos(angle)])
 
 
 def sheet_on_cylinder(angle: float, y_m: float) -> Floats:
-    """object_from_sheet in closed form: tangent at the angle, the sheet's line at `y_m` there."""
+    """Return object_from_sheet in closed form: tangent at the angle, with the sheet's line at
+    `y_m`."""
     normal = np.array([0.0, math.sin(angle), math.cos(angle)])
     along = np.array([0.0, math.cos(angle), -math.sin(angle)])
     axes = np.column_stack([[1.0, 0.0, 0.0], along, normal])
@@ -57,7 +58,7 @@ def in_world(point: Floats) -> Floats:
 
 
 class Table:
-    """A planner, fed by hand at 60 Hz."""
+    """Planner with messages from the test at 60 Hz."""
 
     def __init__(self, scene: Scene, **parameters: Any) -> None:
         self.sent: list[SheetTarget] = []
@@ -148,7 +149,7 @@ async def test_the_sheet_approaches_the_tangent_plane_under_the_finger(angle_deg
 async def stroke(
     desk: Table, from_deg: float, to_deg: float, frames: int, height: float = -0.002
 ) -> list[SheetTarget]:
-    """A finger that goes evenly from one angle to another; its velocity is known exactly."""
+    """Return a finger that moves uniformly from one angle to another, with its exact velocity."""
     rate = math.radians(to_deg - from_deg) / (frames * FRAME_NS * 1e-9)
     reach, sent = RADIUS + height, []
     for number in range(1, frames + 1):
@@ -257,7 +258,7 @@ STILL = np.zeros(3)
 
 
 class Desk:
-    """An encounter with the cylinder, in the terms of its cross-section."""
+    """Encounter with the cylinder, in coordinates of its cross-section."""
 
     def __init__(self) -> None:
         self.machine = ContactStateMachine(SHAPE, np.eye(3), LIMITS)
@@ -314,7 +315,7 @@ def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_bac
 
 
 def test_a_deep_push_neither_shakes_nor_leaves_the_sheet() -> None:
-    """To the axis and past it, with a measured finger that trembles by a tenth of a millimetre."""
+    """The finger moves to the axis and beyond, with a tremor of a tenth of a millimetre."""
     desk = touched()
     noise = np.random.default_rng(1)
     for depth in np.concatenate([np.linspace(0.001, 0.05, 200), np.full(200, 0.05)]):
@@ -434,7 +435,7 @@ async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
 
 
 def soft(stiffness: float) -> SoftBody:
-    """An object of that stiffness, a spring as far as it is known."""
+    """Return an object of that stiffness, a linear spring."""
     return SoftBody(
         mesh_id="m",
         method="test",

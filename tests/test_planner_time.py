@@ -1,4 +1,4 @@
-"""Times that a planner and a bridge are given: late, stepped, from the future."""
+"""Test stamps that a planner and a bridge receive: late, stepped, in the future."""
 
 from __future__ import annotations
 

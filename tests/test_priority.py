@@ -1,4 +1,4 @@
-"""How far priorities may be raised, and what is said where they may not."""
+"""Test the allowed priorities, and the report if they are not allowed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
-    """Let the user have the capability or not, and this soft limit of niceness."""
+    """Set whether the user has the capability, and the soft limit of niceness."""
     monkeypatch.setattr(priority, "_has_cap_sys_nice", lambda: capable)
     monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
     monkeypatch.setattr(os, "getpriority", lambda which, who: 0)

@@ -1,4 +1,5 @@
-"""Two passes: as the equations on a flat sheet, right on a dented one, nothing where it is none."""
+"""Test the two-pass correction: equal to the equations on a flat sheet, correct on a deformed
+one."""
 
 from __future__ import annotations
 

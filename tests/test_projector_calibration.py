@@ -1,4 +1,4 @@
-"""The projector's calibration: Gray code read back, optics recovered, bad pictures refused."""
+"""Test the projector's calibration: decoded Gray code, optics, and rejected images."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def halved(lens: Lens) -> Lens:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """The demo's scene with camera and projector of half the pixels, to be quick."""
+    """Return the demo's scene with half the pixels of camera and projector, for speed."""
     full = load_scene(SCENE_FILE)
     camera, projector = full.camera, full.projector
     return full.model_copy(
@@ -86,7 +86,7 @@ def true(scene: Scene) -> Projector:
 
 @pytest.fixture(scope="module")
 def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> ProjectorPoints:
-    """What the rig, its optics known, measures of the true projector's light."""
+    """Return the rig's measurement of the true projector's light, with known optics."""
     lit = LitSheet(scene, true_rig, true, seed=3)
     shown = patterns(scene.projector.width_px, scene.projector.height_px)
     views = [lit.pair(shown, pose) for pose in sheet_poses(4)]
@@ -107,7 +107,7 @@ def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
 
 
 def test_a_pixel_is_found_between_the_cameras_pixels() -> None:
-    """A camera that sees the projector's picture turned, shrunk and bent."""
+    """The camera sees the projector's image rotated, scaled and distorted."""
     shown = patterns(256, 192)
     rows, columns = np.mgrid[:110, :140].astype(np.float64)
 
@@ -231,7 +231,7 @@ def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projector) -> None:
-    """What a pixel lights, and the pixel that lights it, agree through a bent lens."""
+    """The pixel of a lit point, and the point of a pixel, agree through a distorting lens."""
     vertices = np.array([[-0.12, -0.12, 0], [0.12, -0.12, 0], [0.12, 0.12, 0], [-0.12, 0.12, 0]])
     projector = TrueProjector(true, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     pixels = np.array([[200.0, 150.0], [20.5, 30.25], [380.0, 280.0]])

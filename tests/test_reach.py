@@ -169,7 +169,8 @@ def test_no_places_are_all_reached() -> None:
 
 
 def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
-    """Both edges agree with the sheet along the path; no joint jumps or is too fast."""
+    """Assert that both edges agree with the sheet along the path, without fast or discontinuous
+    joints."""
     assert path.places.world_from_sheet[0] == pytest.approx(start.world_from_sheet)
     assert path.places.world_from_sheet[-1] == pytest.approx(goal.world_from_sheet)
     assert path.places.stretch_ratio[-1] == pytest.approx(goal.stretch_ratio)
@@ -269,7 +270,7 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
 
 
 def barred_scene() -> Scene:
-    """Return a scene whose left base is so far off that much is out of its reach."""
+    """Return a scene whose left base is so far away that many poses are not reachable."""
     return with_base_moved(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
 
 

@@ -1,4 +1,4 @@
-"""The correction family: errors at the eye as each method's range says, and what is compared."""
+"""Test the correction family: errors at the eye within the stated range of each method."""
 
 from __future__ import annotations
 

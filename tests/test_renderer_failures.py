@@ -1,4 +1,5 @@
-"""Where drawing fails: behind the eye, before the sheet, without an area, folded, nowhere."""
+"""Test the limits of drawing: behind the eye, in front of the sheet, degenerate, folded,
+infinite."""
 
 from __future__ import annotations
 
@@ -70,7 +71,7 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
 
 
 def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> None:
-    """A sheet 25 mm behind the object's front is no obstacle to the equations or two passes."""
+    """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
     rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
@@ -87,9 +88,9 @@ def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> 
 
 
 def folded(overhang_m: float) -> SheetMesh:
-    """A sheet that goes on above, then back below itself by an overhang, then on, in the y axis.
+    """Return a sheet with a fold along y that overlaps itself by an overhang.
 
-    Seen from far off along z its middle strip is turned over.
+    Seen along z, its middle strip is reversed.
     """
     y = np.array([-0.1, 0.02, 0.02 - overhang_m, 0.1])
     z = np.array([0.0, 0.0, -0.02, -0.02])
@@ -111,7 +112,7 @@ def test_what_folds_take_is_measured() -> None:
 def test_a_folded_sheet_is_drawn_and_told(
     stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The projector lights what is nearest to it; of two places on its ray one has the light."""
+    """The projector lights the nearest point; of two points on its ray one gets the light."""
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
     stage.note = ""
     picture = drawn(stage, "two_pass", stage.sheet_at_rest())

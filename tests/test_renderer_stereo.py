@@ -1,5 +1,5 @@
-"""Two eyes: parallax in every mode, where the eyes are, the projector's lens, and the foretelling
-of the light."""
+"""Test two eyes: parallax in every mode, eye positions, the projector's lens, predicted display
+times."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ async def frame_of(bench: Bench, mode: StereoMode, *, swap_eyes: bool = False) -
 
 
 def middle_m(picture: NDArray[np.uint8], *, columns: float = 1.0) -> float:
-    """World x of the middle of what is bright in the middle rows; 2 px/mm, mirrored."""
+    """Return the world x of the centre of the bright part of the middle rows; 2 px/mm, mirrored."""
     rows = picture.shape[0] // 2 + np.arange(-5, 5)
     bright = np.nonzero(picture[rows].astype(int).sum(axis=0) > 5 * 255)[0]
     return -((bright.min() + bright.max() + 1) / 2.0 * columns - 0.5 - 399.5) / 2000.0
 
 
 def eyes_pictures(mode: StereoMode, frames: list[Frame]) -> tuple[float, float]:
-    """World x of the object's front as the left and the right eye's picture has it."""
+    """Return the world x of the object's front in the left and the right eye's image."""
     picture = frames[0].pixels[0]
     height, width = picture.shape[:2]
     if mode == "side_by_side":
@@ -81,7 +81,7 @@ def eyes_pictures(mode: StereoMode, frames: list[Frame]) -> tuple[float, float]:
 async def test_what_lies_behind_the_screen_has_uncrossed_parallax(
     bench: Bench, mode: StereoMode
 ) -> None:
-    """The right eye sees it to the right of where the left one does, by b d / (d + e)."""
+    """The right eye sees it to the right of the left one's image, by b d / (d + e)."""
     wanted = 0.064 * -FRONT_M / (0.4 - FRONT_M)
     for swap_eyes, sign in ((False, 1.0), (True, -1.0)):
         frames = [await frame_of(bench, mode, swap_eyes=swap_eyes) for _ in range(2)]
@@ -230,7 +230,7 @@ def test_light_is_foretold_from_how_long_drawing_took() -> None:
 def test_light_is_foretold_to_the_refresh_that_the_picture_makes(
     draw_s: float, phase: float, period_s: float
 ) -> None:
-    """Against a projector that swaps at multiples of its period after a picture is drawn."""
+    """The simulated projector swaps at multiples of its period after an image is drawn."""
     lead = DisplayLatencyEstimator(
         first_s=0.016, display_latency_s=0.5 * period_s, period_s=period_s
     )

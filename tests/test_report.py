@@ -1,4 +1,4 @@
-"""`bag report`: what it says of a session is so, whatever the session lacks."""
+"""Test `bag report`: correct contents, also for incomplete sessions."""
 
 from __future__ import annotations
 
@@ -272,7 +272,7 @@ def test_the_numbers_are_json(numbers: dict[str, Any]) -> None:
 
 
 class Reader(HTMLParser):
-    """What of a page can be checked: tags, headings, pictures, what is fetched."""
+    """Parser of the tested parts of a page: tags, headings, images, loaded resources."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -442,7 +442,7 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
 
 
 def test_a_single_value_is_a_point_of_the_chart() -> None:
-    """A bag with one frame had a latency chart without anything in it."""
+    """A bag with one frame had an empty latency chart."""
     nan = np.nan
     axes: Any = Figure().subplots()
     seconds = np.arange(6.0)

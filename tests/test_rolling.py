@@ -1,4 +1,4 @@
-"""Rolling without slip or spin, judged by geometry that is known in closed form."""
+"""Test rolling without slip or spin on geometries with closed-form results."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_axes_are_turned_by_the_least_rotation(
 
 @pytest.mark.parametrize("steps", [12, 600])
 def test_arc_and_way_on_the_sheet_are_equal_on_a_cylinder(steps: int) -> None:
-    """Within 0.01 mm after 60 degrees, whether the finger is seen 600 times on the way or 12."""
+    """The error is at most 0.01 mm after 60 degrees, with 600 samples or 12."""
     radius = 0.0353553
     shape = CylinderShape(radius, 0.12)
     angles = np.radians(60.0) * np.arange(1, steps + 1) / steps

@@ -1,4 +1,4 @@
-"""Nobody is heard who should not be: strangers, forgers, replays, garbage."""
+"""Test that unauthorised peers are rejected: unknown keys, forgeries, replays, invalid data."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def free_port() -> int:
 
 @dataclass
 class Ear:
-    """A subscriber's record."""
+    """Record of a subscriber."""
 
     heard: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Ear:
 
 
 class Street:
-    """Main publishes at a tcp endpoint of its own; anybody may try to listen or to be it."""
+    """Publisher of main at a tcp endpoint; other processes try to subscribe or to replace it."""
 
     def __init__(self, known: Hosts) -> None:
         self.known = known
@@ -94,7 +94,7 @@ class Street:
         return ear
 
     async def speak(self, publisher: Publisher, until_: Callable[[], object]) -> None:
-        """Publish numbered e-stops until something has come true."""
+        """Publish numbered e-stops until a condition holds."""
         while not until_():
             self.sent += 1
             header = replace(HEADER, sequence=self.sent)
@@ -124,7 +124,7 @@ async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> Non
 
 @pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
 async def test_only_the_host_of_the_plan_is_heard(street: Street, impostor: str) -> None:
-    """Another host, even one of the plan, sits at main's endpoint: it lacks main's key."""
+    """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
     if impostor == "without":
         mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{street.port}"])
         street.closers.append(mouth.close)
@@ -200,7 +200,7 @@ async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(stre
 
 
 class Meddler(Cut):
-    """On the wire between two hosts: keeps what passes, and can change, repeat or replay it."""
+    """Proxy between two hosts that stores data, and can change, repeat or replay them."""
 
     def __init__(self, target_port: int) -> None:
         super().__init__(target_port)
@@ -258,8 +258,8 @@ async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
 
 
 async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
-    """All bytes that a subscriber sent open no connection again: the session's keys were made
-    for it, by both ends."""
+    """All bytes that a subscriber sent open no connection again: both ends create the session's
+    keys."""
     mouth = street.mouth()
     sent: list[bytes] = []
 
@@ -298,7 +298,7 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
 async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
     street: Street,
 ) -> None:
-    """Each topic has its own limit; what is longer is refused, and its memory is given back."""
+    """Each topic has its limit; longer messages are rejected, and their memory is freed."""
     foreign = ForeignPublisher(f"tcp://127.0.0.1:{street.port}")
     street.closers.append(foreign.close)
     ear = Ear()
@@ -368,7 +368,7 @@ def plain(frames: list[Any]) -> list[bytes]:
 
 
 def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, list[bytes]]]:
-    """For ever: what must not be taken by one who has heard HEADER's message; no two alike."""
+    """Yield different messages endlessly that a receiver of HEADER's message must reject."""
     other: Message = stop("x") if not isinstance(message, EStop) else finger(1.0)
     good = plain(encode(message, HEADER))
     head = msgpack.unpackb(good[0], strict_map_key=False)

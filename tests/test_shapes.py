@@ -1,4 +1,4 @@
-"""Shapes with a formula: nearest points and distances hold, and what is undefined is decided."""
+"""Test shapes with a formula: nearest points, distances, and defined results in singular cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes of every shape: meshes are read, repaired or refused; who handles none says so."""
+"""Test scenes of every shape: meshes are read, repaired or rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes as smooth shapes: errors against known surfaces, no rattle, no jump, bad ones refused."""
+"""Test meshes as smooth shapes: errors against known surfaces, continuity, rejected meshes."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_gradient_and_curvature_by_differences(shape: object) -> None:
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:
-    """Normals (steps, 3) on a straightest way over the surface, and where it is on an edge."""
+    """Return normals (steps, 3) on a geodesic over the surface, and whether they are on an edge."""
     here = shape.closest(start)
     point, normal = here.point, here.normal
     heading = np.cross(normal, [0.36, 0.48, 0.8])
@@ -183,7 +183,7 @@ def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tu
 
 
 def worst_turn(normals: Floats, edges: Floats, step_m: float) -> float:
-    """The largest second derivative of the normal by arc length (1/m^2), edges left out."""
+    """Return the largest second derivative of the normal by arc length (1/m^2), without edges."""
     second = np.linalg.norm(np.diff(normals, 2, axis=0), axis=1) / step_m**2
     off = ~(edges[2:] | edges[1:-1] | edges[:-2])
     return float(second[off].max())
@@ -306,7 +306,7 @@ def test_one_is_as_many() -> None:
 
 @pytest.mark.parametrize("make", [lambda: smooth_ellipsoid(AXES, 3), smooth_cube, liver])
 def test_one_goes_on_as_many_do(make: Callable[[], SmoothMeshShape]) -> None:
-    """Also from starts far off, over edges and inside: the same place by the same descent."""
+    """Single and batch queries give the same point, also from far off, over edges and inside."""
     shape = make()
     rng = np.random.default_rng(4)
     begun = shape.closest(rng.uniform(-0.05, 0.05, (120, 3)))

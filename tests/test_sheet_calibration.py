@@ -1,4 +1,4 @@
-"""`flexsheet calibrate sheet`: what it finds again, says of bad rows, and keeps in its file."""
+"""Test `flexsheet calibrate sheet`: estimated values, invalid rows, and its file."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def pushes_of(
     edges: bool = False,
     seed: int = 1,
 ) -> list[MeasuredPush]:
-    """What a gauge would say of a sheet that has this law."""
+    """Simulate a gauge's measurements of a sheet with this force model."""
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:

@@ -1,4 +1,5 @@
-"""The sheet's laws: their scaling, their slopes, their ranges, and the twin's membrane as judge."""
+"""Test the sheet's force models: scaling, slopes, ranges, and the simulated membrane as
+reference."""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ def force(
 
 
 def true_push(stretch: float, depth: float, place: SheetPosition = CENTRE) -> tuple[float, float]:
-    """Force and edge force by the twin, on a mesh that is good to 1.5 % and quick."""
+    """Return force and edge force by the simulator, on a mesh with an error of 1.5 %."""
     return twin_push(SHEET, stretch, depth, place, RADIUS, cells=24)
 
 

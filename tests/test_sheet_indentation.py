@@ -1,4 +1,4 @@
-"""Dent shapes: the solved ones again, those between them, and what is out of range."""
+"""Test indentation shapes: solved ones, interpolated ones, and the range."""
 
 from __future__ import annotations
 

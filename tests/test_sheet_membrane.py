@@ -1,4 +1,4 @@
-"""The sheet's own finite elements: theory, the twin's other elements, and hard cases."""
+"""Test the sheet's finite elements: theory, the simulator's elements, and hard cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the hour of use calls a leak."""
+"""Test the detection of leaks in the soak benchmark."""
 
 from __future__ import annotations
 

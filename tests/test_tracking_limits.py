@@ -1,4 +1,4 @@
-"""Each way in which a fingertip can be lost: a little of it does no harm, much of it is said."""
+"""Test each disturbance of the tracking: a mild one has no effect, a severe one is reported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.tracking_endurance import evaluate_sequence, follow
 from benchmarks.tracking_limits import FAILURES, measure
 
 SIGMAS = 6.0
-"""No valid fingertip is off by more of its stated standard deviations."""
+"""Maximum error of a valid fingertip, in reported standard deviations."""
 
 MILD = {
     "one-view": 2.5,
@@ -29,7 +29,7 @@ MILD = {
 }
 FRAME_MS = 1000.0 / 60.0
 CONFIRMED_MS = 2.0 * FRAME_MS
-"""From the first picture to the third, which begins a track."""
+"""Time from the first image to the third, which starts a track."""
 
 SEVERE = {
     "one-view": (0.5, {"merged", "inconsistent"}, CONFIRMED_MS),
@@ -105,7 +105,7 @@ def test_bad_times_cost_a_few_frames_and_no_wrong_place(
 
 
 def test_in_a_crowd_no_other_mark_is_taken_for_the_finger() -> None:
-    """A short form of `benchmarks.tracking_endurance`."""
+    """This is a short form of `benchmarks.tracking_endurance`."""
     count = 0
     for seed, frames in ((2, 900), (3, 600)):
         seen, _ = asyncio.run(follow(seed, frames))

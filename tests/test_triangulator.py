@@ -1,4 +1,4 @@
-"""The triangulator as a node: pictures in, fingertips out, and every reason why there is none."""
+"""Test the triangulator node: images in, fingertips out, and every reason for an invalid one."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def camera(scene: Scene) -> TwinCamera:
 
 
 class Bench(NodeHarness[Triangulator, VirtualClock]):
-    """A triangulator that gets images by hand."""
+    """Triangulator with images from the test."""
 
     def __init__(self, camera: TwinCamera, **parameters: Any) -> None:
         super().__init__(
@@ -95,7 +95,7 @@ class Bench(NodeHarness[Triangulator, VirtualClock]):
         return self.sent[-1]
 
     def pictures(self, *tips: tuple[float, float, float]) -> tuple[Image, Image]:
-        """Pictures of so many fingers at once: the brighter of each pixel."""
+        """Return images of several fingers: the maximum of each pixel."""
         left, right = self.camera.picture(lambda _: np.array([0, 0, 5.0]), exposure_s=0.004)
         for tip in tips:
             pair = self.camera.picture(lambda _, tip=tip: np.array(tip), exposure_s=0.004)
@@ -264,7 +264,7 @@ async def test_nothing_is_said_before_there_is_a_scene(camera: TwinCamera) -> No
 
 
 def calibration_of(rig: StereoCamera) -> StereoCalibration:
-    """What a perfect calibration would find."""
+    """Return an exact calibration of the rig."""
     return StereoCalibration(
         device=rig.device,
         date="2026-01-01T00:00:00+00:00",
@@ -301,7 +301,8 @@ async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
 
 
 def stroke() -> tuple[Floats, Floats]:
-    """Section V of the paper: 60 degrees around the cylinder in 10 s, its first 4 s."""
+    """Return the stroke of section V of the paper: 60 degrees around the cylinder in 10 s, its
+    first 4 s."""
     times_s = np.linspace(0.0, 4.0, 200)
     angle = np.radians(6.0) * times_s
     radius_m = 0.0353553
@@ -311,7 +312,8 @@ def stroke() -> tuple[Floats, Floats]:
 
 
 def fast_reach() -> tuple[Floats, Floats]:
-    """To and fro over 0.2 m with a peak speed of 1.2 m/s, as reaching hands do."""
+    """Return a motion back and forth over 0.2 m with a peak speed of 1.2 m/s, as of reaching
+    hands."""
     ends = np.array([[-0.09, -0.03, 0.08], [0.08, 0.05, 0.0]])
     share = np.concatenate([0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 60)[i:]) for i in (0, 1)])
     share[60:] = 1.0 - share[60:]
@@ -326,10 +328,8 @@ def fast_reach() -> tuple[Floats, Floats]:
 async def test_from_the_twins_pixels_to_the_true_fingertip(
     tmp_path: Path, scene: Scene, path: Callable[[], tuple[Floats, Floats]], limit_mm: float
 ) -> None:
-    """The design asks for 0.3 mm rms near the sheet.
-
-    With the rig as it is: what a calibration gets wrong is no noise, and not in the covariance.
-    """
+    """The design requires 0.3 mm rms near the sheet. The error includes that of the calibration,
+    which is not in the covariance."""
     clock, truths, found = VirtualClock(10**9), list[TwinFinger](), list[Fingertip]()
 
     def keep(topic: Topic, message: Message, header: Header) -> None:

@@ -1,4 +1,4 @@
-"""Choosing methods for a scene: the cheapest that is good enough, else the nearest miss."""
+"""Test the selection of methods for a scene: the fastest sufficient one, else the nearest."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_where_none_is_good_enough_the_nearest_miss_is_taken() -> None:
 
 
 def test_a_method_that_is_meant_for_little_is_no_near_miss() -> None:
-    """However exact it is there, it gives no answer that could be near anywhere else."""
+    """It is exact in its range, but has no results elsewhere."""
     points = [
         point("cheap", 1.1),
         *(point("cheap", 0.1, depth=depth, in_range=False) for depth in (2, 3)),
@@ -126,7 +126,7 @@ def family(name: str, methods: Sequence[str]) -> Family:
 
 @pytest.fixture
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Families "quick" and "slow" in place of a node's own; which were measured is told."""
+    """Substitute families "quick" and "slow" for a node's own; return the measured ones."""
     there = {"quick": family("made-up", ["cheap"]), "slow": family("made-up", ["cheap", "dear"])}
     monkeypatch.setattr(tune, "load_family", there.__getitem__)
     return []
@@ -314,7 +314,7 @@ def test_files_are_named_from_where_a_scene_goes(tmp_path: Path, quote: str) -> 
 
 
 def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
-    """From a folder that may only be read, which the tests' user may be above."""
+    """The scene is in a read-only folder, except for root."""
     here, there = tmp_path / "here", tmp_path / "far" / "there: b"
     here.mkdir()
     there.mkdir(parents=True)

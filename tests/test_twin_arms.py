@@ -1,4 +1,4 @@
-"""The twin's arms: their kinematics, servo and refusals."""
+"""Test the simulated arms: kinematics, servo and rejected commands."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_a_stop_keeps_to_the_path_and_ends_as_soon_as_the_slowest_joint_can(
 
 @pytest.mark.parametrize("how", ["stop", "idle", "watchdog", "fault"])
 def test_however_an_arm_is_stopped_it_stays_on_its_way(how: str) -> None:
-    """Fast and slow joints end together: a straight line in the joints remains one."""
+    """Fast and slow joints end together: a straight line in joint space remains straight."""
     arm, way = controller(), np.array([0.08, -0.01, 0.02, 0.1, -0.05, 0.03])
     for number in range(20):
         assert arm.receive_command(command(number + 2, JOINTS + way * number / 10.0))
@@ -250,7 +250,7 @@ async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
 
 
 async def switch_on(joints_file: Path) -> TwinArmsNode:
-    """Start the node and give it a scene."""
+    """Start the node with a scene."""
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
     parameters = TwinArmsParameters(left_port=0, right_port=0, joints_file=str(joints_file))
     node = TwinArmsNode(parameters, name="twin", clock=VirtualClock(), send=lambda *_: None)
@@ -307,7 +307,7 @@ def test_a_gear_has_play_when_its_motor_turns_back() -> None:
 
 
 def test_the_play_of_the_gears_is_the_arms_repeatability() -> None:
-    """A pose come to from all sides: as the maker's +-0.02 mm, neither much better nor worse."""
+    """Poses approached from all sides differ by about the manufacturer's +-0.02 mm."""
     random = np.random.default_rng(3)
     play = TwinArmsParameters().backlash_rad
     places = []

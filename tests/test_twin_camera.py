@@ -1,4 +1,4 @@
-"""The twin's rig and what it sees: boards, clutter, and how much the pixels can tell at best."""
+"""Test the simulated rig and its images: boards, clutter, and the bound of the information."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def sheet(scene: Scene) -> StereoCamera:
-    """A data sheet: ideal lenses, straight rig."""
+    """Return the scene of the data sheet: ideal lenses, straight rig."""
     lens = Lens(fx_px=540.0, fy_px=540.0, cx_px=319.5, cy_px=239.5)
     assert scene.camera.left == scene.camera.right == lens
     return scene.camera
@@ -110,10 +110,10 @@ def chessboard(rig: StereoCamera) -> TwinBoard:
 
 
 def crossing_misfit(p: Floats, image: NDArray[np.float32], middle: Floats) -> Floats:
-    """Two smeared edges that cross at p[:2], against the picture in a round window.
+    """Return the misfit of two blurred edges that cross at p[:2] to the image in a round window.
 
-    Slanting edges smear otherwise than this has it, alike on both sides of the corner: a window
-    that lies round the corner keeps that from shifting it.
+    Oblique edges are blurred differently than in this model, but symmetrically about the corner. A
+    window centred on the corner therefore has no bias.
     """
     rows, columns = (slice(round(at) - 5, round(at) + 6) for at in (middle[1], middle[0]))
     y, x = np.mgrid[rows, columns]
@@ -126,7 +126,7 @@ def crossing_misfit(p: Floats, image: NDArray[np.float32], middle: Floats) -> Fl
 
 
 def fitted_corner(image: NDArray[np.float32], near: Floats, along: Floats, down: Floats) -> Floats:
-    """The crossing (2,) of the two edges that run `along` and `down` the board, near a pixel."""
+    """Return the crossing (2,) of the edges along the board's axes near a pixel."""
     angles = [np.arctan2(along[1], along[0]), np.arctan2(down[1], down[0])]
     guess = np.array([*near, *angles, 1.0, 80.0, 60.0, 0.0, 0.0])
     for _ in range(2):
@@ -234,7 +234,7 @@ def plain(rig: StereoCamera) -> TwinCamera:
 
 
 def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats]:
-    """The light (height, width) that the mark adds to each view."""
+    """Return the light (height, width) that the marker adds to each view."""
     lit, unlit = (
         camera.levels(still, exposure_s=0.004, marker=marker, time_s=time_s)
         for marker in (True, False)
@@ -244,7 +244,7 @@ def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats
 
 
 def of_the_clutter(camera: TwinCamera, plain: TwinCamera, time_s: float = 0.0) -> list[Floats]:
-    """What clutter changes in each view of a camera whose background is the plain one's."""
+    """Return the change of each view by clutter, for a camera with a plain background."""
     return [
         np.asarray(a, float) - b
         for a, b in zip(
@@ -256,7 +256,7 @@ def of_the_clutter(camera: TwinCamera, plain: TwinCamera, time_s: float = 0.0) -
 
 
 def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
-    """Centre (2,) and variance (2,) of a light in pixels."""
+    """Return centre (2,) and variance (2,) of a light in pixels."""
     y, x = np.mgrid[: light.shape[0], : light.shape[1]]
     centre = np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
     off = np.array([(light * (x - centre[0]) ** 2).sum(), (light * (y - centre[1]) ** 2).sum()])
@@ -399,7 +399,7 @@ def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) ->
 
 
 def test_a_long_thing_that_the_lens_bends_is_drawn_whole(rig: StereoCamera) -> None:
-    """Across its middle it is as wide as it is, with the ground on both sides of it."""
+    """In its middle it has its full width, with the ground on both sides."""
     ends = FixedPoint((-0.22, 0.35, -0.05)), FixedPoint((-0.22, -0.35, 0.35))
     camera = looking(rig, Clutter(occluders=(Occluder(*ends, radius_m=0.012, level=200.0),)))
     seen = camera.levels(still, exposure_s=0.004)
@@ -445,7 +445,7 @@ def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera)
 
 
 def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
-    """Neither as bright over six pixels as half of the mark's height, nor as large."""
+    """No clutter is as bright over six pixels as half of the marker's height, or as large."""
     camera = looking(rig, CLUTTER["lab"])
     for image in camera.picture(still, exposure_s=0.004, marker=False):
         bright = (image > 140).astype(np.uint8)
@@ -467,12 +467,13 @@ BESIDE = np.array([0.05, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def disc(rig: StereoCamera) -> TwinCamera:
-    """A mark on even ground, beside the finger."""
+    """Return a marker on uniform ground, beside the finger."""
     return looking(rig, sensor=EVEN).with_changes(marker_offset_m=BESIDE)
 
 
 def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
-    """With even noise n, contrast C, radius r, blur s << r: variance 2 s n^2 / (sqrt(pi) r C^2).
+    """With uniform noise n, contrast C, radius r and blur s << r, the variance is 2 s n^2 /
+    (sqrt(pi) r C^2).
 
     The rim's gradient C g(d) n_x, squared, integrates over the rim to C^2 pi r / (2 sqrt(pi) s).
     """
@@ -492,7 +493,8 @@ def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera
 
 
 def disc_misfit(p: Floats, image: Image, x0: int, y0: int) -> Floats:
-    """A smeared disc (x, y, radius, spread, ground, height) against the picture, in deviations."""
+    """Return the misfit of a blurred disc (x, y, radius, blur, ground, height) in standard
+    deviations."""
     y, x = np.mgrid[y0 - 8 : y0 + 9, x0 - 8 : x0 + 9]
     inside = (p[2] - np.hypot(x - p[0], y - p[1])) / p[3]
     level = p[4] + p[5] * ndtr(inside)
@@ -513,7 +515,7 @@ def test_a_most_likely_fit_reaches_the_bound_and_does_not_beat_it(disc: TwinCame
 
 
 def test_the_position_bound_follows_from_the_views(disc: TwinCamera) -> None:
-    """Along the view, depth errs by Z^2 / (f B) of the disparity's error."""
+    """Along the view, the depth error is Z^2 / (f B) times that of the disparity."""
     bound = fingertip_bound(disc, still, exposure_s=0.0)
     eye = disc.eyes[0]
     _, depth_m = eye.see(TIP + BESIDE)

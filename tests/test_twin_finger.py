@@ -1,4 +1,4 @@
-"""The twin's finger and camera: the truth is a pure function of time, and the pixels show it."""
+"""Test the simulated finger and camera: the truth is a function of time, and the images show it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def motion_along(
 
 
 def path_time(motion: FingerMotion, path_time_s: float) -> float:
-    """Seconds since the path was given at which `path_time_s` is reached."""
+    """Return the seconds since the start of the path at which `path_time_s` is reached."""
     return path_time_s - motion.at(0.0).path_time_s
 
 
@@ -171,7 +171,8 @@ def write_recording(path: Path, text: str) -> Path:
 
 
 def check_recorded(path: FingerPath, scene: Scene) -> None:
-    """Such a path is followed, stays in the volume, reaches the surface, presses and leaves it."""
+    """Assert that a recorded path is followed within the volume, and touches, presses and
+    leaves."""
     radius_m = scene.object.geometry.radius_m
     points = path.positions_world_m
     assert (points >= scene.finger.volume_min_m).all()
@@ -248,7 +249,7 @@ def test_the_twins_own_optics_agree_with_opencv(
 
 
 def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
-    """Centre of what is brighter than any finger, within 12 px of a place."""
+    """Return the centre of the light brighter than any finger, within 12 px of a position."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     weight = np.maximum(image.astype(float) - 110.0, 0.0)
     weight[np.hypot(x - near[0], y - near[1]) > 12] = 0.0
@@ -259,7 +260,7 @@ def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
 def test_the_marks_light_is_centred_on_the_fingertip(
     camera: TwinCamera, speed_m_per_s: float
 ) -> None:
-    """The share of the mark in each pixel: its light over that of black ground under it."""
+    """The light is compared with the marker over black ground."""
     generator = np.random.default_rng(5)
     velocity = speed_m_per_s * np.array([0.8, 0.6, 0.0])
     for _ in range(10):
@@ -306,7 +307,7 @@ def test_a_finger_out_of_sight_is_not_drawn(camera: TwinCamera, place: list[floa
 
 
 class Sent:
-    """What a node sent, by topic."""
+    """Messages of a node by topic."""
 
     def __init__(self) -> None:
         self.messages: list[tuple[str, Any, Header]] = []
@@ -384,7 +385,7 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
 
 
 class SkippingClock(SystemClock):
-    """The machine's clock, which a test can push ahead as a stalled process would find it."""
+    """Real clock with jumps, as a stalled process would experience."""
 
     ahead_ns = 0
 

@@ -1,4 +1,4 @@
-"""`bag verify` of every node: what it did live is done again, though it was late; or why not."""
+"""Test `bag verify` of every node: replayed results equal live ones, or the reason why not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plan_of(folder: Path) -> ResolvedGraph:
 
 @dataclass
 class Live:
-    """Nodes of the demo on one clock, each late now and then, and a recorder that is not."""
+    """Nodes of the demo on one clock, with random delays, and a recorder without."""
 
     plan: ResolvedGraph
     writer: BagWriter
@@ -65,13 +65,13 @@ class Live:
         self.writer.write(topic, message, header, self.clock.now_ns() + 1000)
 
     def say(self, topic: str, message: Message, sequence: int, writer: str) -> None:
-        """What a node said that does not take part."""
+        """Publish a message of a node that does not run."""
         now_ns = self.clock.now_ns()
         header = Header(sequence, now_ns - 4_000_000, now_ns, "lab", writer, 5)
         self.send(TOPICS[topic], message, header)
 
     async def hand(self, topic: str, *names: str) -> None:
-        """Give the newest message of a topic to nodes; time passes meanwhile."""
+        """Pass the newest message of a topic to nodes, while time passes."""
         for name in names:
             entry = self.newest.get(topic)
             if entry is not None and self.handed.get((topic, name)) is not entry:
@@ -85,7 +85,7 @@ class Live:
 
 
 async def live(folder: Path) -> Path:
-    """A finger that comes and presses, as it went through the graph."""
+    """Record a finger that approaches and presses."""
     bag, plan = folder / "live.mcap", plan_of(folder)
     scene = plan.scene_message()
     assert scene is not None

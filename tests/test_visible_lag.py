@@ -1,4 +1,4 @@
-"""How late what is drawn is when its light leaves, from pictures whose lag is known."""
+"""Test the lag of displayed images, with images of known lag."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def angle(times_s: Floats) -> Floats:
 
 
 def axes(times_s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Contact point, y and z axis (n, 3) of a sheet that is tangent where the finger is."""
+    """Return contact point, y and z axis (n, 3) of a sheet that is tangent at the finger."""
     a, zero = angle(times_s), np.zeros(len(times_s))
     normal = np.column_stack([zero, np.sin(a), np.cos(a)])
     return RADIUS * normal - [0, 0, RADIUS], np.column_stack([zero, np.cos(a), -np.sin(a)]), normal
