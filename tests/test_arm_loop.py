@@ -328,7 +328,7 @@ async def test_a_fault_relaxes_the_sheet_on_both_arms() -> None:
         assert rig.newest("right").faults == ()
 
 
-async def test_a_bridge_that_ends_tells_its_arm_to_stop() -> None:
+async def test_a_bridge_that_ends_commands_its_arm_to_stop() -> None:
     async with running_rig() as (rig, nodes):
         await both_follow(rig, nodes["planner"], AT_FRONT)
         controllers = [server.controller for server in nodes["twin"].servers.values()]

@@ -124,7 +124,7 @@ def test_a_tool_that_holds_the_endpoint_does_not_hinder_a_stop(graph: Graph) -> 
 
 
 @pytest.mark.usefixtures("holder")
-def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
+def test_a_suspended_launcher_receives_a_stop(graph: Graph) -> None:
     graph.launcher.send_signal(signal.SIGSTOP)
     code, answer = stop_by_command()
     assert code == 0
@@ -133,7 +133,7 @@ def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
 
 
 @pytest.mark.usefixtures("holder")
-def test_a_bridge_that_hangs_is_stopped_when_it_goes_on(graph: Graph) -> None:
+def test_a_bridge_that_hangs_is_stopped_when_it_resumes(graph: Graph) -> None:
     graph.hangs.touch()
     code, answer = stop_by_command()
     assert code == 0
@@ -201,7 +201,7 @@ async def test_another_user_stops_nothing(
         one.close()
 
 
-async def test_what_is_no_stop_stops_nothing_and_keeps_nobody_waiting(sockets: Sockets) -> None:
+async def test_an_invalid_request_stops_nothing_and_is_answered(sockets: Sockets) -> None:
     sockets.open("launcher", "launch")
     (file,) = sockets.folder.iterdir()
     held = []
@@ -253,7 +253,7 @@ def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path
         bridge.communicate()
 
 
-def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) -> None:
+def test_without_an_answer_the_senders_of_targets_are_killed(runs_root: Path) -> None:
     port = {"topic": "sheet_target"}
     plan = {"nodes": {"planner": {"outputs": [port]}, "camera": {"outputs": []}}}
     (runs_root / "plan.json").write_text(json.dumps(plan))

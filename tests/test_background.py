@@ -18,7 +18,7 @@ def priority_in(workers: Executor) -> tuple[int, int]:
     return niceness.result(), scheduling.result()
 
 
-def test_a_background_process_gives_way_to_all_others() -> None:
+def test_a_background_process_has_the_lowest_priority() -> None:
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=enter_background) as workers:
         assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
 

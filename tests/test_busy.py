@@ -57,7 +57,7 @@ def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPr
     return found
 
 
-def test_the_first_look_says_nothing(kernel: Kernel) -> None:
+def test_the_first_sample_reports_nothing(kernel: Kernel) -> None:
     assert run(kernel, 1, left_s=0.9, right_s=0.9) is None
 
 
@@ -85,7 +85,7 @@ def test_what_is_long_past_does_not_count(kernel: Kernel) -> None:
     assert not found.busy
 
 
-def test_a_process_that_is_started_again_begins_anew(kernel: Kernel) -> None:
+def test_a_restarted_process_starts_from_zero(kernel: Kernel) -> None:
     run(kernel, 5, left_s=0.01, right_s=0.01)
     kernel.now_s += 1.0
     found = kernel.watch.update({"left": 11, "right": 99})
@@ -128,6 +128,6 @@ def test_where_waiting_is_not_measured_the_load_decides() -> None:
     )
 
 
-def test_a_load_of_programs_that_give_way_makes_no_computer_busy() -> None:
+def test_a_load_of_low_priority_programs_makes_no_computer_busy() -> None:
     cpu = CpuPressure(busy=False, wait_ratio=0.1, node="planner")
     assert not is_busy(host(load_ratio=8.0, cpu=cpu))

@@ -184,7 +184,7 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
         check_stereo(calibration, [blank], [blank], board=BOARD)
 
 
-def test_unusable_pictures_are_named(
+def test_unusable_images_are_named(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
     text, small = tmp_path / "text.png", tmp_path / "small.png"
@@ -257,7 +257,7 @@ def without(key: str) -> Callable[[str], str]:
     ],
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
 )
-def test_a_spoilt_file_is_refused(
+def test_a_spoilt_file_is_rejected(
     tmp_path: Path, calibration: StereoCalibration, spoil: Callable[[str], str], said: str
 ) -> None:
     path = tmp_path / "rig.yaml"
@@ -325,7 +325,7 @@ def test_outlying_corners_are_left_out(
     assert result.left.fx_px == pytest.approx(calibration.left.fx_px, rel=1e-3)
 
 
-def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
+def test_an_image_given_twice_counts_once(rendered: Pictures) -> None:
     order = [0, 1, 2, 3, 4, 5, 0, 1, 2]
     calibration = calibrate([rendered.left[i] for i in order], [rendered.right[i] for i in order])
     assert [pair.used for pair in calibration.pairs] == [True] * 6 + [False] * 3
@@ -351,7 +351,7 @@ def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
         calibrate(pictures.left, pictures.right)
 
 
-def test_check_names_pictures_used_for_the_calibration(
+def test_check_names_images_used_for_the_calibration(
     rendered: Pictures, calibration: StereoCalibration
 ) -> None:
     result = check_stereo(calibration, rendered.left[7:11], rendered.right[7:11], board=BOARD)

@@ -119,7 +119,7 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
         ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 holds 50"),
     ],
 )
-def test_impossible_charuco_boards_are_refused(change: dict[str, Any], said: str) -> None:
+def test_impossible_charuco_boards_are_rejected(change: dict[str, Any], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         CornerFinder(CHARUCO.model_copy(update=change))
 
@@ -221,7 +221,7 @@ def watching(camera: StereoCamera, *, pairs: int, still_pictures: int) -> Captur
     )
 
 
-def test_pair_is_taken_when_the_board_rests_at_a_new_place(camera: StereoCamera) -> None:
+def test_pair_is_taken_when_the_board_rests_at_a_new_position(camera: StereoCamera) -> None:
     first, second = shown(CHESSBOARD, camera, 2, seed=6)
     blank = (np.full_like(first[0], 60), np.full_like(first[1], 60))
     capture = watching(camera, pairs=8, still_pictures=3)
@@ -276,7 +276,7 @@ def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:
     console.file.close()
 
 
-def test_ctrl_c_keeps_the_pictures_taken(camera: StereoCamera, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_images_taken(camera: StereoCamera, tmp_path: Path) -> None:
     pictures = shown(CHESSBOARD, camera, 3, seed=6)
 
     def until_interrupted() -> Iterator[tuple[Image, Image]]:
@@ -370,7 +370,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert "rigid_fit_rms_mm" in out
 
 
-def test_pictures_are_taken_from_the_camera_source(
+def test_images_are_taken_from_the_camera_source(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
     """Image files replace the cameras; each image is repeated four times, as of a resting board."""

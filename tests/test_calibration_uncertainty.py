@@ -277,7 +277,7 @@ def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
     assert np.linalg.norm(errors, axis=1).max() < 2.5e-4
 
 
-def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
+def test_the_twin_calibrated_again_agrees_with_the_shipped_file() -> None:
     """This calibration has fewer pairs, other poses and other noise."""
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None

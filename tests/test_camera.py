@@ -136,7 +136,7 @@ async def test_a_camera_that_is_not_there_is_tried_again(scene: Scene, tmp_path:
         await bench.until(lambda: len(bench.sent) > 0)
 
 
-async def test_pictures_of_another_size_are_an_error(scene: Scene, tmp_path: Path) -> None:
+async def test_images_of_another_size_are_an_error(scene: Scene, tmp_path: Path) -> None:
     wide = write_video(tmp_path / "w.avi", [picture(n, 0, 2 * WIDTH) for n in range(3)])
     source = {"kind": "video", "left": wide, "right": wide}
     async with running(scene, source=source, retry_s=0.01) as bench:
@@ -146,7 +146,7 @@ async def test_pictures_of_another_size_are_an_error(scene: Scene, tmp_path: Pat
         assert bench.sent == []
 
 
-async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
+async def test_the_twins_images_pass_with_their_time(scene: Scene) -> None:
     async with running(scene, source="twin") as bench:
         pair = StereoPair(
             device="twin-bumblebee",
@@ -171,7 +171,7 @@ async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
         assert bench.node.reader is None
 
 
-async def test_the_twins_pictures_are_left_alone_by_a_real_camera(
+async def test_the_twins_images_are_left_alone_by_a_real_camera(
     scene: Scene, images: dict[str, str]
 ) -> None:
     pair = StereoPair(
@@ -217,7 +217,7 @@ def test_an_unreadable_image_is_named(scene: Scene, tmp_path: Path) -> None:
         open_reader(source, scene.camera, lambda: 0).read()
 
 
-def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
+def test_a_side_by_side_image_of_odd_width_is_rejected() -> None:
     with pytest.raises(DeviceError, match="camera: side-by-side image of odd width 161"):
         split_side_by_side(picture(0, 0, 161), "camera")
 
@@ -306,6 +306,6 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
         {"kind": "twin", "x": 1},
     ],
 )
-def test_a_wrong_source_is_refused(source: object) -> None:
+def test_a_wrong_source_is_rejected(source: object) -> None:
     with pytest.raises(ValidationError):
         CameraParameters.model_validate({"source": source})

@@ -223,7 +223,7 @@ def test_wrong_times_are_named(tmp_path: Path, text: str, said: str) -> None:
         read_times(path, 2)
 
 
-def test_absent_times_and_times_beside_a_rate_are_refused(scene: Scene, tmp_path: Path) -> None:
+def test_absent_times_and_times_beside_a_rate_are_rejected(scene: Scene, tmp_path: Path) -> None:
     patterns = write_images(tmp_path, 1)
     absent = ImagesSource(kind="images", times=tmp_path / "absent.csv", **patterns)
     with pytest.raises(DeviceError, match=r"absent\.csv: file not found"):
@@ -254,14 +254,14 @@ def test_a_side_by_side_video_has_the_scenes_size(scene: Scene, tmp_path: Path) 
     assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH)
 
 
-def test_times_that_are_no_text_are_told_as_such(tmp_path: Path) -> None:
+def test_times_that_are_not_text_are_reported(tmp_path: Path) -> None:
     times = tmp_path / "times.csv"
     times.write_text("t_s\n0.0\n0.1\n", encoding="utf-16")
     with pytest.raises(DeviceError, match=r"times\.csv: cannot be read as UTF-8 CSV"):
         read_times(times, 2)
 
 
-def test_whatever_goes_wrong_while_reading_is_told() -> None:
+def test_all_errors_of_a_reader_are_reported() -> None:
     """A thread that ends without a report would leave a node that seems healthy."""
     errors: list[DeviceError] = []
 

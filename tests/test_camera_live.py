@@ -80,7 +80,7 @@ def read(reader: CameraReader) -> ImagePair:
     return pictures
 
 
-def test_the_drivers_stamp_tells_the_exposure(
+def test_the_drivers_stamp_gives_the_exposure(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -106,7 +106,7 @@ def test_a_driver_that_stamps_the_beginning_of_the_exposure(
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 1_790_000_000 * 10**9], ids=["none", "time of day"])
-def test_stamps_of_another_clock_give_way_to_the_arrival(
+def test_stamps_of_another_clock_are_replaced_by_the_arrival(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene, stamp_ns: int
 ) -> None:
     """Check one camera alone, since the two are compared by one kind of stamp."""
@@ -202,7 +202,7 @@ def test_frames_meet_their_own_partner(
         assert [(left[1], right[1]) for left, right in pairs] == [(n, n) for n in sorted(kept)]
 
 
-async def test_the_skew_is_published_and_too_much_is_refused(
+async def test_the_skew_is_published_and_too_much_is_rejected(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -280,7 +280,7 @@ def test_settings_are_made_in_the_devices_units(
         assert reader.warnings == ()
 
 
-async def test_what_a_device_does_not_take_is_told_once(
+async def test_a_rejected_setting_is_reported_once(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -312,7 +312,7 @@ async def test_what_a_device_does_not_take_is_told_once(
         bag.empty()
 
 
-def test_a_device_that_keeps_its_automatic_exposure_does_not_tell_it(
+def test_with_automatic_exposure_the_exposure_is_unknown(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     for fake in cameras:
@@ -417,7 +417,7 @@ def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
         assert right.captures[0].released.wait(DEADLINE_S)
 
 
-def test_two_cameras_that_never_meet_are_told_of(
+def test_two_cameras_without_pairs_are_reported(
     bag: CameraBag,
     cameras: tuple[FakeCamera, FakeCamera],
     scene: Scene,

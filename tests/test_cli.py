@@ -259,7 +259,7 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("echo", "estop", "--run", "/nowhere"), 2, "no plan.json"),
     ],
 )
-def test_wrong_words_to_topics(
+def test_wrong_arguments_of_topic_commands(
     flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, word: str
 ) -> None:
     said = flexsheet("topic", *arguments)
@@ -289,7 +289,7 @@ def test_a_message_of_any_size_is_taken_as_json(
         assert word in said.err
 
 
-def test_nobody_publishes_for_a_node(flexsheet: Command, running: Path) -> None:
+def test_a_tool_cannot_publish_for_a_node(flexsheet: Command, running: Path) -> None:
     finger = (
         "{path_label: '', path_done: true, path_time_s: 0, position_world_m: [0, 0, 0], "
         "velocity_world_m_per_s: [0, 0, 0]}"
@@ -307,7 +307,7 @@ def test_hz_goes_by_the_writers_stamps(flexsheet: Command, running: Path) -> Non
     assert "beacon" in flexsheet("topic", "hz", "status", "--duration", "2.5").out
 
 
-def test_info_knows_the_graph(flexsheet: Command, running: Path) -> None:
+def test_info_shows_the_graph(flexsheet: Command, running: Path) -> None:
     described = flexsheet("topic", "info", "twin/finger", "--json").json()
     assert described["writers"] == ["beacon"]
     assert described["readers"] == ["listener", "recorder"]
@@ -387,7 +387,7 @@ def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
     assert "Traceback" not in said.err
 
 
-def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
+def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     said = flexsheet("bag", "verify", "listner", recorded)
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
     said = flexsheet("bag", "verify", "recorder", recorded)
@@ -449,7 +449,7 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
     assert "an e-stop or its reset is not repeated" in said.err
 
 
-def test_without_a_graph_that_is_said(
+def test_a_missing_graph_is_reported(
     flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
@@ -474,7 +474,7 @@ def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> Non
         ({"-o": "/nowhere/c.yaml"}, "does not exist"),
     ],
 )
-def test_wrong_words_to_calibrate(
+def test_wrong_arguments_of_calibrate(
     flexsheet: Command, tmp_path: Path, options: dict[str, str], word: str
 ) -> None:
     (tmp_path / "left.png").touch()
@@ -491,7 +491,7 @@ def test_wrong_words_to_calibrate(
     assert word in said.err
 
 
-def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> None:
+def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> None:
     pictures = ROOT.parent / "shared/data/stereo"
     if not pictures.is_dir():
         pytest.skip("the real stereo pairs are not here")

@@ -109,7 +109,7 @@ def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
     assert found.drift_ratio == pytest.approx(8e-5, abs=2e-5)
 
 
-def test_a_clock_that_was_stepped_is_measured_anew() -> None:
+def test_a_clock_that_was_stepped_is_measured_again() -> None:
     clock = OtherClock(5e-4)
     for number in range(20):
         clock.add(Sample(number * S, 7 * S, MS))
@@ -311,7 +311,7 @@ def bridge() -> ArmBridge:
     )
 
 
-async def test_a_reset_whose_moment_is_not_known_is_refused_a_stop_never() -> None:
+async def test_a_reset_with_an_unknown_time_is_rejected_but_never_a_stop() -> None:
     node = bridge()
     await node.setup()
     header = replace(SOME_HEADER, clock_id="there", source_ns=50_100 * S, publish_ns=50_100 * S)

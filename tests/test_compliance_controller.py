@@ -93,7 +93,7 @@ async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -
 
 
 @pytest.mark.parametrize("depth_m", [0.0002, 0.0004])
-async def test_the_sheet_does_not_come_towards_a_finger_that_lies_on_a_stiff_object(
+async def test_the_sheet_does_not_move_towards_a_finger_on_a_stiff_object(
     depth_m: float,
 ) -> None:
     desk = await table()
@@ -175,7 +175,7 @@ async def test_in_touch_the_stretch_stays_and_the_retreat_makes_up_for_it() -> N
     assert compliance.stretch_ratio < before
 
 
-async def test_a_soft_body_that_tells_no_curve_leaves_all_as_it_is() -> None:
+async def test_a_soft_body_without_a_curve_changes_nothing() -> None:
     compliance = ComplianceController(SCENE, make_force_model(SCENE.sheet), "force_curve")
     untold = soft_body().model_copy(update={"force_curve": np.zeros((0, 2))})
     compliance.update(untold, in_contact=False)
@@ -193,7 +193,7 @@ async def test_a_soft_body_that_tells_no_curve_leaves_all_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(("scale", "words"), [(0.0005, "too soft for"), (30.0, "stiffer than")])
-async def test_what_the_sheet_cannot_present_is_said(scale: float, words: str) -> None:
+async def test_what_the_sheet_cannot_render_is_reported(scale: float, words: str) -> None:
     desk = await table()
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
     assert f"object is {words} the" in desk.planner.note

@@ -156,7 +156,7 @@ def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
     np.testing.assert_allclose(to_eye[0, 1], from_projector[0, 0])
 
 
-def test_a_picture_of_what_is_known(scene: Scene) -> None:
+def test_the_drawing_shows_the_received_messages(scene: Scene) -> None:
     nothing = take_snapshot(scene, Shelf())
     assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
     left, right = edges()

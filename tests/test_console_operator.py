@@ -146,7 +146,7 @@ async def test_lifted_the_finger_comes_down_where_the_sliders_are(bench: Bench) 
     bench.assert_agreement()
 
 
-async def test_after_a_refused_command_the_page_shows_what_holds(bench: Bench) -> None:
+async def test_after_a_rejected_command_the_page_shows_what_holds(bench: Bench) -> None:
     bench.operator.handle_request("push", 0.006)
     bench.touch._depth.value = 30.0
     bench.operator.handle_request("push", float("nan"))
@@ -192,7 +192,7 @@ async def test_own_display_messages_are_known_by_their_writer(
     assert (bench.sent[-1] is others) == restored
 
 
-async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench: Bench) -> None:
+async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench) -> None:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)

@@ -75,7 +75,7 @@ def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
         ("size_ratio", np.inf),
     ],
 )
-def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: float) -> None:
+def test_values_that_make_no_scene_are_rejected(scene: Scene, name: str, value: float) -> None:
     good = {"young_modulus_pa": 4e3, "stretch_ratio": 1.02, "size_ratio": 1.0}
     with pytest.raises(scenes.SceneChoiceError):
         scenes.edit_scene(scene, **good | {name: value})
@@ -117,7 +117,7 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     assert len(sent) == 2
 
 
-def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_path: Path) -> None:
+def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "plan.json").write_text(f'{{"scene": {scene.model_dump_json()}}}')
     other = scene.model_copy(update={"name": "other"})
     (tmp_path / "scenes").mkdir()

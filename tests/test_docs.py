@@ -34,7 +34,7 @@ def test_each_page_is_in_the_navigation_once() -> None:
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)
-def test_links_anchors_and_pictures_are_there(page: Path) -> None:
+def test_links_anchors_and_images_are_there(page: Path) -> None:
     for link in links(page):
         if link.target.startswith(("http://", "https://")):
             continue
@@ -71,7 +71,7 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
 
 
 @pytest.mark.parametrize(("drawing", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
-def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing, file: str) -> None:
+def test_drawings_of_the_graph_agree_with_launch_files(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
         (writer.name, port.topic, node.name)

@@ -80,7 +80,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_each_block_says_what_it_is() -> None:
+def test_each_block_names_its_language() -> None:
     for block in (block for those in BLOCKS.values() for block in those):
         assert block.language in LANGUAGES, (
             f"{block.place}: ```{block.language}; one of {', '.join(sorted(LANGUAGES))}"
@@ -112,9 +112,7 @@ def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     "block", [b for those in with_language("yaml").values() for b in those], ids=lambda b: b.place
 )
-def test_yaml_is_what_it_looks_like(
-    block: Block, clone: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_yaml_blocks_are_valid(block: Block, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = YAML(typ="safe").load(block.text)
     if block.not_run is None:
         write_modules(block.page, clone, monkeypatch)

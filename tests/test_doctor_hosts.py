@@ -316,7 +316,7 @@ async def shaken(
         publisher.close()
 
 
-async def test_keys_that_do_not_fit_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_keys_that_do_not_match_are_distinguished(monkeypatch: pytest.MonkeyPatch) -> None:
     with hosts("main", "left") as known:
         assert await shaken(known, "left", "left") == Reachability.RESPONDING
         assert await shaken(known, "main", "left") == Reachability.KEY_MISMATCH
@@ -363,7 +363,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
         assert ("main", "plan", "failed") in bad(found)
 
 
-def test_own_keys_and_address_are_looked_at_before_the_start(
+def test_own_keys_and_address_are_checked_before_the_start(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")

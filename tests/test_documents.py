@@ -60,7 +60,7 @@ def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-def test_a_hostile_file_is_refused_with_little_work(
+def test_a_hostile_file_is_rejected_with_little_work(
     tmp_path: Path, tokens: list[int], name: str
 ) -> None:
     text, said = HOSTILE[name]
@@ -75,7 +75,7 @@ def test_a_hostile_file_is_refused_with_little_work(
     assert tokens[0] < MAX_TOKENS
 
 
-def test_what_is_no_utf_8_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_utf_8_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_bytes(b"nodes: {a: \xff\xfe}\n")
     with pytest.raises(BadInputError, match="is not UTF-8 text"):

@@ -186,7 +186,7 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
         assert await third.heard_late(None) == set()
 
 
-async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
+async def test_a_reset_from_the_future_is_rejected(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
         launchers.say(STOP)
         await until(lambda: len(files(folder)) == 2, launchers.said)
@@ -218,7 +218,7 @@ async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
         assert any("arms reset" in line for line in launchers.said)
 
 
-async def test_what_cannot_be_written_is_said_kept_and_tried_again(folder: Path) -> None:
+async def test_failed_writes_are_reported_and_retried(folder: Path) -> None:
     plan = plan_of(folder)
     (folder / "state").write_text("no folder")
     async with Launchers(folder, plan) as launchers:
@@ -263,7 +263,7 @@ def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
     assert files(folder) == []
 
 
-def test_an_arm_shows_an_estop_by_its_typed_field_whatever_its_faults_say() -> None:
+def test_an_arm_shows_an_estop_by_its_typed_field_only() -> None:
     assert shows_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
     assert shows_estop(arm_state("left", mode="estop"))
     assert not shows_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))

@@ -125,7 +125,7 @@ def test_part_of_the_sheet_behind_another_gets_no_light(scene: Scene) -> None:
     assert lit.tolist() == [False, True]
 
 
-def test_flat_sheet_on_the_imaginary_screen_shows_the_picture_mirrored_back(
+def test_flat_sheet_on_the_imaginary_screen_shows_the_image_mirrored_back(
     scene: Scene,
 ) -> None:
     projected = np.zeros((600, 800, 3), np.uint8)
@@ -185,7 +185,7 @@ def test_a_second_small_blob_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("what", ["black", "specks", "cut off", "split"])
-def test_what_cannot_be_measured_is_said(what: str) -> None:
+def test_what_cannot_be_measured_is_reported(what: str) -> None:
     picture = blob(80.0, 120.0, 120.0)
     if what == "black":
         picture[:] = 0
@@ -291,7 +291,7 @@ def frame(label: str, **changes: object) -> Frame:
     return Frame.model_validate({**values, **changes})
 
 
-async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
+async def test_eye_node_renders_each_label_once(scene: Scene) -> None:
     bench = EyeBench(scene)
     await bench.ready()
     display = Display(correction="none", stereo="mono", shading="flat", label="a")
@@ -323,7 +323,7 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
     await bench.node.close()
 
 
-async def test_eye_node_reports_what_has_no_picture_and_goes_on(
+async def test_eye_node_reports_a_missing_image_and_continues(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = EyeBench(scene, max_queue=2)
@@ -345,7 +345,7 @@ async def test_eye_node_reports_what_has_no_picture_and_goes_on(
     await bench.node.close()
 
 
-async def test_eye_node_takes_the_sheet_at_the_instant_of_the_light(scene: Scene) -> None:
+async def test_eye_node_uses_the_sheet_at_the_display_time(scene: Scene) -> None:
     bench = EyeBench(scene)
     await bench.ready()
     # Arms' stamps are 123 in this bench: before this frame's light nothing is pictured.

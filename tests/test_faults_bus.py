@@ -23,7 +23,7 @@ from tests.waiting import until
 __all__ = ["room"]
 
 
-async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Room) -> None:
+async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(room: Room) -> None:
     """The reader never reads; the publisher does not block, and another reader loses nothing."""
     topic = TOPICS["twin/stereo"]
     publisher, ear = room.mouth(topic), room.ear(topic)
@@ -53,7 +53,7 @@ def large_pictures(number: int) -> StereoPair:
 
 
 @pytest.mark.parametrize("name", ["sheet_target", "twin/finger"])
-async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
+async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
     room: Room, name: str
 ) -> None:
     """The storm has a hundred times the topic's rate, more than can be handled."""
@@ -76,7 +76,7 @@ async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
     assert told == (topic.delivery is Delivery.EVERY and ear.counts.gaps > 0)
 
 
-async def test_of_thousands_of_forgeries_over_a_socket_none_is_taken(room: Room) -> None:
+async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(room: Room) -> None:
     """They are malformed, of another type, from an earlier start, or repeated; they are counted."""
     topic = TOPICS["fingertip"]
     endpoint = room.endpoint("forger")

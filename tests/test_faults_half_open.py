@@ -167,7 +167,7 @@ def established(pid: int, port: int) -> int:
     return sum(row[2].endswith(wanted) and row[3] == ESTABLISHED for row in rows)
 
 
-async def test_a_computer_that_loses_its_power_in_mid_stream_is_missed_and_heard_again() -> None:
+async def test_a_power_cut_in_mid_stream_is_detected_and_recovered() -> None:
     """Its messages are so frequent that libzmq's heartbeats would not notice."""
     if why := Computers.missing():
         pytest.skip(why)

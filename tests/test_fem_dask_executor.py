@@ -101,7 +101,7 @@ def cpu_s(process: subprocess.Popen[str]) -> float:
     return float(sum(psutil.Process(process.pid).cpu_times()[:2]))
 
 
-def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) -> None:
+def test_a_scheduler_without_workers_is_an_error_with_a_remedy(lab: Lab) -> None:
     with (
         pytest.raises(SchedulerError, match=r"dask worker tcp://127\.0\.0\.1"),
         connect_workers(lab.address, connect_s=0.3),
@@ -110,7 +110,7 @@ def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) 
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1", "post://127.0.0.1:8786"])
-def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
+def test_no_scheduler_is_an_error_with_a_remedy(address: str) -> None:
     with (
         pytest.raises(SchedulerError, match=r"no scheduler answers.*null"),
         connect_workers(address),
@@ -118,7 +118,7 @@ def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
         pass
 
 
-def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_said(
+def test_jobs_of_a_lost_worker_move_to_others_and_a_lost_scheduler_is_reported(
     lab: Lab, tmp_path: Path
 ) -> None:
     first = lab.add_worker()

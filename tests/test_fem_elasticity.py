@@ -103,7 +103,7 @@ def test_the_mesh_is_a_sound_solid(spacing: float) -> None:
     assert (np.diff(mesh.slab) >= 0).all()
 
 
-def test_the_side_lies_on_the_cylinder_and_is_fine_in_front() -> None:
+def test_the_side_is_on_the_cylinder_and_fine_in_front() -> None:
     mesh = cylinder(0.0045)
     contact_nodes = mesh.nodes[mesh.contact_nodes]
     assert np.hypot(contact_nodes[:, 1], contact_nodes[:, 2]) == pytest.approx(RADIUS, rel=1e-12)
@@ -134,7 +134,7 @@ def test_exactly_the_strip_at_the_back_is_fixed(support: float, spacing: float) 
         ({"touch_angle_rad": 3.0}, "touchable"),
     ],
 )
-def test_a_cylinder_that_cannot_be_meshed_is_refused(change: dict[str, float], word: str) -> None:
+def test_a_cylinder_that_cannot_be_meshed_is_rejected(change: dict[str, float], word: str) -> None:
     good = {
         "radius_m": RADIUS,
         "length_m": LENGTH,
@@ -228,7 +228,7 @@ def test_cantilever_bends_as_a_timoshenko_beam() -> None:
 
 
 @pytest.mark.parametrize("nu", [0.5, 0.49999, 1.0, -1.0, float("nan")])
-def test_poisson_ratios_that_lose_the_answer_are_refused(nu: float) -> None:
+def test_poisson_ratios_that_lose_the_answer_are_rejected(nu: float) -> None:
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="poisson_ratio"):
         stiffness_matrix(nodes, elements, young_modulus_pa=1.0, poisson_ratio=nu)

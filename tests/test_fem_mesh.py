@@ -313,7 +313,7 @@ def test_the_same_scene_gives_the_same_mesh(name: str) -> None:
         assert (getattr(first, part) == getattr(again, part)).all(), part
 
 
-def test_a_key_stands_for_all_that_a_mesh_depends_on() -> None:
+def test_a_key_covers_all_inputs_of_a_mesh() -> None:
     moved = dict(EGG, vertices_m=EGG["vertices_m"] * 1.0001)
     range_changed = scene(SPHERE).model_copy(
         update={"working_range": scene(SPHERE).working_range.model_copy(update={"tilt_rad": 0.9})}
@@ -500,7 +500,7 @@ def test_a_push_on_every_shape_goes_in_and_is_held(name: str) -> None:
         ),
     ],
 )
-def test_what_cannot_be_meshed_is_refused_with_the_reason(
+def test_what_cannot_be_meshed_is_rejected_with_the_reason(
     geometry: dict[str, Any], changes: dict[str, Any], spacing: float, words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
@@ -561,7 +561,7 @@ def test_a_lattice_fills_its_box_with_outward_diagonals() -> None:
     depth=st.integers(1, 4),
 )
 @settings(max_examples=20, deadline=None)
-def test_bisection_conforms_and_knows_three_shapes_only(
+def test_bisection_conforms_with_three_shapes_only(
     places: list[tuple[float, float, float]], depth: int
 ) -> None:
     targets = np.array(places) * CELL
@@ -581,12 +581,12 @@ def test_bisection_conforms_and_knows_three_shapes_only(
     assert ratios.min() > 0.4
 
 
-def test_bisection_beyond_the_unit_is_refused() -> None:
+def test_bisection_beyond_the_unit_is_rejected() -> None:
     with pytest.raises(UnfitMeshError, match="far too small"):
         bisect(*make_lattice((1, 1, 1)), lambda v, t: (v[t] == 0).all(axis=2).any(axis=1))
 
 
-def test_a_core_gives_way_to_pinches_until_nothing_is_left() -> None:
+def test_a_core_shrinks_at_pinches_until_nothing_is_left() -> None:
     by_edge = np.array([[0, 1, 2, 3], [0, 1, 4, 5]])
     depth = -np.arange(1.0, 7.0)
     core = np.array([False, False, True, False, True, False])

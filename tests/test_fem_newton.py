@@ -106,7 +106,7 @@ def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBo
     assert states[2].force_n[2] == pytest.approx(slope, rel=1e-4)
 
 
-def test_without_friction_every_way_there_gives_the_same(
+def test_without_friction_the_result_is_independent_of_the_path(
     body: NeoHookeanBody, pressed: EquilibriumState
 ) -> None:
     aside = press(body, centre(0.0, x=-0.004), centre(0.003, x=-0.004, y=0.003), centre(0.004))[-1]
@@ -116,7 +116,7 @@ def test_without_friction_every_way_there_gives_the_same(
         assert other.force_n == pytest.approx(pressed.force_n, abs=1e-5 * pressed.force_n[2])
 
 
-def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None:
+def test_the_answer_is_smooth_in_the_fingers_position(body: NeoHookeanBody) -> None:
     """Its change from step to step is small, since the contact energy is twice differentiable."""
     step = 4e-5
     places = [centre(0.003, x=-0.0004 + step * i) for i in range(13)]

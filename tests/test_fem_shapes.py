@@ -85,7 +85,7 @@ def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response,
     return soft.respond(rigid.apply(soft.world_from_mesh, point), None)[0], found.normal
 
 
-def test_a_push_dents_the_skin_where_it_is(soft: SceneBody) -> None:
+def test_a_push_deforms_the_skin_where_it_is(soft: SceneBody) -> None:
     answer, normal = pushed(soft, 0.003, 0.002, 0.004)
     assert answer.in_range
     assert answer.push_depth_m == pytest.approx(0.004)
@@ -130,7 +130,7 @@ def test_a_deep_push_is_bounded_and_flagged(soft: SceneBody) -> None:
     assert not answer.in_range
 
 
-def test_the_force_curve_is_said_before_the_touch(soft: SceneBody) -> None:
+def test_the_force_curve_is_published_before_contact(soft: SceneBody) -> None:
     curve = soft.at_rest().force_curve
     assert (np.diff(curve[:, 1]) >= 0.0).all()
     answer, normal = pushed(soft, 0.0, 0.0, 0.006)

@@ -51,7 +51,7 @@ def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response,
     return body.method.respond(push), push
 
 
-def test_it_dents_where_it_is_pushed_as_the_linear_method_does(
+def test_it_deforms_at_the_push_like_the_linear_method(
     both: tuple[Body, SceneBody],
 ) -> None:
     linear, table = both

@@ -134,7 +134,7 @@ def test_drop_outs_are_counted_in_contact(tmp_path: Path, by: str) -> None:
     assert row["following_ratio"] == pytest.approx(1.1 / 1.6, abs=0.02)
 
 
-def test_the_report_says_the_same(tmp_path: Path) -> None:
+def test_the_report_agrees(tmp_path: Path) -> None:
     bag = write_hand(tmp_path / "a.mcap", mode=lambda s: "hold" if 1.0 <= s < 1.2 else "follow")
     session = read_session(bag)
     numbers = make_result(session)
@@ -149,7 +149,7 @@ def test_the_report_says_the_same(tmp_path: Path) -> None:
     )
 
 
-def test_the_demo_takes_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demo_uses_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_hand(tmp_path / "a.mcap")
     row = read_followed_path(bag, LABEL)
     json.dumps(row, allow_nan=False)

@@ -254,7 +254,7 @@ def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: in
 
 
 @pytest.mark.parametrize("kind", ["nan", "infinite", "stale", "future", "path nan"])
-def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_says_why(kind: str) -> None:
+def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_reports_why(kind: str) -> None:
     async def test(bench: ForgedBench) -> None:
         random = np.random.default_rng(len(kind))
         await bench.point(0.4, bench.honest)

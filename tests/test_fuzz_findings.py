@@ -66,7 +66,7 @@ ARRAY = msgpack.ExtType(1, struct.pack("<BBxxI", 9, 1, 2) + bytes(8))
 
 
 @pytest.mark.parametrize("place", ["protocol", "name", "fingerprint", "sequence", "writer"])
-def test_an_array_where_a_name_belongs_is_refused_and_ends_no_reader(place: str) -> None:
+def test_an_array_where_a_name_belongs_is_rejected_and_ends_no_reader(place: str) -> None:
     """The comparison of an array with a name raised ValueError."""
     problems: list[str] = []
     counts = PortCounts()
@@ -77,7 +77,7 @@ def test_an_array_where_a_name_belongs_is_refused_and_ends_no_reader(place: str)
 
 
 @pytest.mark.parametrize("place", ["protocol", "name", "sequence", "writer", "fields"])
-def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str) -> None:
+def test_lists_nested_to_the_parsers_limit_are_rejected_in_a_sentence(place: str) -> None:
     """Their text is not created: it would need more depth than Python has."""
     deep = b"\x91" * 1000 + b"\x90"
     mark = "here"
@@ -87,7 +87,7 @@ def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str)
     assert len(str(refused.value)) < 300
 
 
-def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
+def test_lists_with_a_false_length_allocate_no_memory() -> None:
     """Each allocated memory before its elements arrived: 8 GB for a message of a megabyte."""
     claim = b"\xdd" + struct.pack(">I", 60_000)
     bomb = claim * 1000 + bytes(100_000)
@@ -100,7 +100,7 @@ def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
         tracemalloc.stop()
 
 
-def test_a_header_of_many_small_values_is_refused_before_it_is_read() -> None:
+def test_a_header_of_many_small_values_is_rejected_before_it_is_read() -> None:
     """A byte of the message can need 64 bytes of memory, and an image's topic allows 64 MiB."""
     large = bytes(wire.HEADER_BYTES_MAX + 1)
     with pytest.raises(WireError, match="header of"):
@@ -238,7 +238,7 @@ def test_brackets_in_comments_and_strings_nest_nothing(open_: str, close: str) -
         parse_value("""['x]', """ * 200)
 
 
-def test_a_file_too_large_to_be_written_by_hand_is_refused(tmp_path: Path) -> None:
+def test_a_file_too_large_to_be_written_by_hand_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "a.yaml"
     file.write_text("a: 1\n" * 300_000)
     with pytest.raises(BadInputError, match="at most"):
@@ -264,7 +264,9 @@ def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
         ),
     ],
 )
-def test_an_impossible_mesh_is_refused_in_words(tmp_path: Path, text: str, said: str) -> None:
+def test_an_impossible_mesh_is_rejected_with_an_error_text(
+    tmp_path: Path, text: str, said: str
+) -> None:
     """Numbers beyond the range of integers overflowed in the library."""
     file = tmp_path / "a.obj"
     file.write_text(text)
@@ -272,7 +274,7 @@ def test_an_impossible_mesh_is_refused_in_words(tmp_path: Path, text: str, said:
         read_mesh(file, 0.1, None)
 
 
-def test_check_sums_of_a_rewritten_bag_are_looked_at(tmp_path: Path) -> None:
+def test_check_sums_of_a_rewritten_bag_are_verified(tmp_path: Path) -> None:
     """The check sums of the rewritten bags of the tests above must be valid."""
     records = small_bag(tmp_path / "a.mcap", compress=False)
     assert len(list(BagReader(rewritten(tmp_path / "b.mcap", records)))) == 1

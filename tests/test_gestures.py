@@ -275,7 +275,7 @@ def test_no_smooth_path_is_faster_than_its_bound(
         assert max(np.linalg.norm(path.at(time)[1]) for time in inside) <= bound + 1e-9
 
 
-def test_a_smooth_path_that_is_too_fast_between_its_samples_is_refused() -> None:
+def test_a_smooth_path_that_is_too_fast_between_its_samples_is_rejected() -> None:
     rest = FingerMotion.resting(np.zeros(3), seed=1)
     with pytest.raises(FingerPathError, match=r"speed .* after times_s\[0\]"):
         rest.followed_by(
@@ -289,12 +289,12 @@ def test_a_smooth_path_that_is_too_fast_between_its_samples_is_refused() -> None
         )
 
 
-def test_one_point_is_a_place_to_rest_however_it_is_joined() -> None:
+def test_one_point_is_a_rest_position_for_any_interpolation() -> None:
     path = validate_path(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
     assert path.at(3.0)[0][0] == pytest.approx(0.1)
 
 
-def test_speeds_add_up_to_the_way() -> None:
+def test_speeds_integrate_to_the_path() -> None:
     times, way = integrate_speed_profile(
         [(0.2, 0.1), (0.5, 0.1), (0.05, 0.0), (0.3, 0.0), (0.1, -0.2)]
     )

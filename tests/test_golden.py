@@ -47,7 +47,7 @@ def agree(picture: Image, wanted: Image) -> bool:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
+def test_the_image_is_as_it_was(context: moderngl.Context, name: str) -> None:
     mean, share = difference(CASES[name](context), golden(name))
     assert mean <= MAX_MEAN
     assert share <= MAX_OFF
@@ -68,6 +68,6 @@ def test_light_from_elsewhere_is_noticed(
     assert not agree(CASES["shape-cylinder"](context), golden("shape-cylinder"))
 
 
-def test_a_picture_moved_by_a_pixel_is_noticed() -> None:
+def test_an_image_moved_by_a_pixel_is_noticed() -> None:
     wanted = golden("texture-grid")
     assert not agree(np.roll(wanted, 1, axis=1), wanted)

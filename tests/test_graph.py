@@ -187,7 +187,7 @@ def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> N
         assert len(stamps.get(name, ())) / duration_s >= 0.5 * rate[0], name
 
 
-def test_nothing_was_lost_or_refused_on_the_way(session: Session) -> None:
+def test_nothing_was_lost_or_rejected(session: Session) -> None:
     problems = Counter()
     writers = set()
     for _, message, _, _ in BagReader(session.bag, topics=["status"]):
@@ -244,7 +244,7 @@ def test_the_sheet_follows_the_finger(recording: stroke.StrokeRecording) -> None
     assert errors.true_delta_theta_rad.mean() < np.radians(2.0)
 
 
-def test_the_arms_stand_safely_while_the_triangulator_is_gone_and_follow_again(
+def test_the_arms_rest_safely_without_the_triangulator_and_follow_again(
     session: Session,
 ) -> None:
     modes: dict[str, list[str]] = {"left": [], "right": []}

@@ -161,7 +161,7 @@ HOSTILE: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-def test_a_hostile_bag_is_refused_or_read_in_part(
+def test_a_hostile_bag_is_rejected_or_read_in_part(
     whole: bytes, command: Command, tmp_path: Path, name: str
 ) -> None:
     bag, graph = tmp_path / "hostile.mcap", tmp_path / "graph.yaml"

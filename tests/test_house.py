@@ -87,7 +87,7 @@ def test_models_know_neither_messages_nor_sockets_nor_files() -> None:
         assert not found, f"{path.relative_to(ROOT)} imports {found}"
 
 
-def test_the_twin_shares_nothing_with_what_it_judges() -> None:
+def test_the_simulator_shares_nothing_with_the_code_it_evaluates() -> None:
     for path in modules("nodes/twin"):
         shared = {
             name

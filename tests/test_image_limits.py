@@ -130,7 +130,7 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
         ((0.0, 0.0, -0.02), ""),
     ],
 )
-def test_a_push_out_of_range_is_drawn_and_said(
+def test_a_push_out_of_range_is_drawn_and_reported(
     stage: SceneRenderer, tip: tuple[float, float, float], said: str
 ) -> None:
     picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))

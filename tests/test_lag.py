@@ -55,7 +55,7 @@ def test_a_lag_of_the_papers_size_is_found_in_one_axis() -> None:
     assert lag_s(times, late, stroke(times)[:, 1]) == pytest.approx(0.067, abs=1e-3)
 
 
-def test_quick_taps_are_not_taken_for_their_neighbours() -> None:
+def test_quick_taps_are_not_confused_with_their_neighbours() -> None:
     times = np.arange(0.0, 4.0, 1.0 / RATE_HZ)
 
     def taps(at: Floats) -> Floats:
@@ -66,13 +66,13 @@ def test_quick_taps_are_not_taken_for_their_neighbours() -> None:
     )
 
 
-def test_an_even_motion_tells_no_lag() -> None:
+def test_a_uniform_motion_gives_no_lag() -> None:
     times = np.arange(0.0, 5.0, 0.01)
     even = np.stack([0.1 * times, -0.02 * times], axis=1)
     assert lag_s(times, even - 0.003, even) is None
 
 
-def test_another_motion_tells_no_lag() -> None:
+def test_another_motion_gives_no_lag() -> None:
     times = np.arange(0.0, 30.0, 1.0 / RATE_HZ)
     assert lag_s(times, wander(times, 1, band_hz=(1.0, 4.0)), wander(times, 2)) is None
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (len(times), 3))
@@ -96,7 +96,7 @@ def test_a_lag_beyond_the_range_is_not_given_as_its_edge() -> None:
         (np.arange(0), np.zeros(0), np.zeros(0), "too few"),
     ],
 )
-def test_what_holds_no_lag_is_said(
+def test_a_missing_lag_is_reported(
     times: Floats, follower: Floats, leader: Floats, said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):

@@ -66,7 +66,7 @@ async def heard_late(
     return heard
 
 
-async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -> None:
+async def test_an_estop_outlives_its_sender_until_it_is_reset(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, {"beacon": BEACON})
     said: list[str] = []
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
@@ -86,7 +86,7 @@ async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -
         assert await heard_late(plan, graph, {}) == {}
 
 
-async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) -> None:
+async def test_each_host_reports_its_state_and_its_nodes(tmp_path: Path) -> None:
     nodes = {
         "beacon": BEACON | {"restart": {"delay_s": 0.01}},
         "other": BEACON | {"host": "left", "topics": {"twin__finger": None}},

@@ -94,7 +94,7 @@ def session_niceness(pid: int) -> int | None:
     return int(autogroup.read_text().split()[-1]) if autogroup.exists() else None
 
 
-async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Path) -> None:
+async def test_a_nice_node_has_low_priority_as_a_process_and_as_a_session(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(), quiet=beacon(nice=7, topics={"twin__finger": None}))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
@@ -105,7 +105,7 @@ async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Pat
             assert session_niceness(pid) in (None, more)
 
 
-async def test_a_node_takes_precedence_where_the_user_may_give_it(tmp_path: Path) -> None:
+async def test_a_node_has_high_priority_if_the_user_may_raise_it(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(nice=-7))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
@@ -201,7 +201,7 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
     assert_nothing_left(runs_root)
 
 
-async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: Path) -> None:
+async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(tmp_path: Path) -> None:
     """One process is stopped, and the loop of another hangs; the third is healthy."""
     quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
     plan = plan_of(
@@ -313,7 +313,7 @@ async def test_waiting_for_ready_has_a_deadline_of_its_own(tmp_path: Path) -> No
             await graph.wait_ready(0.05)
 
 
-async def test_a_node_that_hears_no_signal_is_killed_with_its_children(
+async def test_a_node_that_ignores_signals_is_killed_with_its_children(
     tmp_path: Path, runs_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)
@@ -382,14 +382,14 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
             await asyncio.to_thread(wait_until, heard, "the listener to hear the beacon")
 
 
-async def test_addresses_beyond_loopback_are_refused_without_keys(tmp_path: Path) -> None:
+async def test_addresses_beyond_loopback_are_rejected_without_keys(tmp_path: Path) -> None:
     hosts = {"main": {"address": "192.0.2.1"}}
     plan = load_graph(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
     with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is bey"):
         await RunningGraph(plan).__aenter__()
 
 
-async def test_an_unknown_host_is_refused(tmp_path: Path) -> None:
+async def test_an_unknown_host_is_rejected(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon())
     with pytest.raises(BadInputError, match="unknown host"):
         await RunningGraph(plan, host="left").__aenter__()
@@ -513,7 +513,7 @@ def test_a_killed_launcher_leaves_no_node_behind(
     assert_nothing_left(runs_root)
 
 
-def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
+def test_only_orphans_are_killed(tmp_path: Path) -> None:
     """The processes are an orphan without lifeline, one of a live launcher, and one without a
     tag."""
     dead = subprocess.Popen([sys.executable, "-c", ""])

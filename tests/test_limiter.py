@@ -179,20 +179,20 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
         ),
     ],
 )
-def test_a_sheet_in_trouble_is_named(own: Floats, other: Floats, words: str | None) -> None:
+def test_a_violation_of_the_sheet_is_named(own: Floats, other: Floats, words: str | None) -> None:
     for left in (True, False):
         pair = (own, other) if left else (other, own)
         found = check_sheet(*pair, left=left, limits=SHEET)
         assert (found is None) if words is None else (found is not None and words in found)
 
 
-def test_edges_that_have_changed_places_are_in_trouble() -> None:
+def test_swapped_edges_are_a_violation() -> None:
     found = check_sheet(edge(0.12), edge(-0.12), left=True, limits=SHEET)
     assert found is not None
     assert "skewed by 180" in found
 
 
-def test_flanges_outside_the_workspace_or_too_near_are_in_trouble() -> None:
+def test_flanges_outside_the_workspace_or_too_near_are_a_violation() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
     assert check_flange(transform(np.eye(3), [-0.15, 0.0, 0.0]), far, SHEET) is None
     outside = check_flange(transform(np.eye(3), [0.0, 0.0, 0.31]), far, SHEET)
@@ -253,7 +253,7 @@ def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() ->
         assert way >= 0.9 * TOOL_SPEED * min(gap_s, MAX_TRAVEL_STEP_S)
 
 
-def test_what_is_not_finite_is_trouble() -> None:
+def test_non_finite_values_are_a_violation() -> None:
     sound, odd = edge(-0.12), edge(0.12)
     for row, column in ((0, 0), (1, 2), (0, 3), (2, 3)):
         broken = odd.copy()
@@ -266,7 +266,7 @@ def test_what_is_not_finite_is_trouble() -> None:
     assert check_tracking_error(np.full(6, np.nan), np.zeros(6), 0.1) is not None
 
 
-def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
+def test_a_command_far_from_the_measured_joints_is_a_violation() -> None:
     joints = np.zeros(6)
     assert check_tracking_error(joints + 0.1, joints, 0.12) is None
     assert (
@@ -275,7 +275,7 @@ def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
     )
 
 
-def test_measured_places_have_some_slack_and_commanded_ones_none() -> None:
+def test_measured_poses_have_a_tolerance_and_commanded_ones_none() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
     outside = transform(np.eye(3), [0.0, 0.0, 0.301])
     assert check_flange(outside, far, SHEET) is not None

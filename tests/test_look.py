@@ -58,7 +58,7 @@ def drawn(
     return picture
 
 
-def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: SceneRenderer) -> None:
+def test_the_indentation_is_darker_and_its_walls_are_shaded(plain: SceneRenderer) -> None:
     follow(plain, None)
     before = drawn(plain).astype(int)
     follow(plain, dent(plain, 0.015))
@@ -185,7 +185,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image", "has no image"),
     ],
 )
-def test_a_file_that_is_no_texture_is_told(tmp_path: Path, appearance: str, told: str) -> None:
+def test_a_file_that_is_no_texture_is_reported(tmp_path: Path, appearance: str, told: str) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
     cv2.imwrite(str(tmp_path / "huge.png"), np.zeros((1, 2050, 3), np.uint8))
     with pytest.raises(BadInputError, match=f"(?s){told}"):

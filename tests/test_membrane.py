@@ -130,7 +130,7 @@ def test_slack_sheet_is_found_and_pulls_nothing() -> None:
     assert np.linalg.norm(sheet.left_force_n) < 0.1
 
 
-def test_edges_that_coincide_are_refused() -> None:
+def test_edges_that_coincide_are_rejected() -> None:
     with pytest.raises(ValueError, match="apart"):
         solve(RUBBER, np.eye(4), np.eye(4))
 

@@ -375,7 +375,7 @@ def test_full_disk_is_reported(tmp_path: Path) -> None:
     assert len(list(BagReader(tmp_path / "full.mcap"))) > 20
 
 
-def test_changed_type_is_refused_by_name_but_its_bytes_stay_readable(
+def test_changed_type_is_rejected_by_name_but_its_bytes_stay_readable(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(

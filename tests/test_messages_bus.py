@@ -332,7 +332,7 @@ async def test_close_within_the_handler(room: Room) -> None:
     ear.subscriber.close()
 
 
-async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
+async def test_bad_messages_are_rejected_and_good_ones_pass(room: Room) -> None:
     topic = TOPICS["estop"]
     foreign = room.raw(zmq.PUB, room.endpoint())
     ear = room.ear(topic)
@@ -376,7 +376,7 @@ async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Ro
     assert "at most" in ear.problems[0]
 
 
-async def test_too_large_a_message_is_refused_at_the_sender(room: Room) -> None:
+async def test_too_large_a_message_is_rejected_at_the_sender(room: Room) -> None:
     publisher = room.mouth(replace(TOPICS["stereo"], max_bytes=5000))
     with pytest.raises(WireError, match=r"StereoPair.*at most 5000"):
         publisher.send(pictures(1), header(1))
@@ -394,7 +394,7 @@ async def test_endpoint_in_use(room: Room) -> None:
             room.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
 
 
-async def test_stale_ipc_file_of_a_killed_writer_is_taken_over(room: Room) -> None:
+async def test_stale_ipc_file_of_a_killed_writer_is_replaced(room: Room) -> None:
     dead = socket.socket(socket.AF_UNIX)
     dead.bind(room.endpoint().removeprefix("ipc://"))
     dead.close()

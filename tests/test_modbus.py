@@ -80,12 +80,12 @@ def test_a_sound_status_is_decoded() -> None:
         ({"j3": float("nan")}, "not finite"),
     ],
 )
-def test_an_unsound_status_is_refused(changed: dict[str, int | float], words: str) -> None:
+def test_an_unsound_status_is_rejected(changed: dict[str, int | float], words: str) -> None:
     with pytest.raises(ArmAnswerError, match=words):
         decode_status(status_registers(**changed))
 
 
-def test_a_status_of_another_length_is_refused() -> None:
+def test_a_status_of_another_length_is_rejected() -> None:
     with pytest.raises(ArmAnswerError, match="status of 3 registers"):
         decode_status([1, 2, 3])
 
@@ -176,7 +176,7 @@ async def test_a_silent_arm_is_closed_and_reopened_with_back_off() -> None:
         assert link.connected
 
 
-async def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
+async def test_a_late_answer_is_never_used_for_the_next_request() -> None:
     async with linked("slow", timeout_s=SHORT_S) as (link, controller):
         with pytest.raises(ArmSilentError):
             await exchange(link)
@@ -195,7 +195,7 @@ async def test_an_exception_keeps_the_connection() -> None:
         assert link.connections == 1
 
 
-async def test_nobody_listening_is_an_error_in_one_line() -> None:
+async def test_a_missing_server_is_an_error_in_one_line() -> None:
     link = ModbusLink("127.0.0.1", 1, timeout_s=DEADLINE_S)
     with pytest.raises(ArmSilentError, match=r"no connection to 127\.0\.0\.1:1"):
         await exchange(link)
@@ -212,7 +212,7 @@ async def test_an_answer_to_another_command_closes_the_connection(
         assert not link.connected
 
 
-async def test_a_sequence_that_is_not_newer_is_refused() -> None:
+async def test_a_sequence_that_is_not_newer_is_rejected() -> None:
     async with linked() as (link, controller):
         await exchange(link)
         controller.accepted = 1000
@@ -340,7 +340,7 @@ class LateServer:
         self.closed.set()
 
 
-async def test_an_answer_late_on_the_servers_side_is_told_by_its_echo() -> None:
+async def test_an_answer_late_on_the_servers_side_is_detected_by_its_echo() -> None:
     late = LateServer()
     server = await asyncio.start_server(late.serve, "127.0.0.1", 0)
     link = ModbusLink("127.0.0.1", server.sockets[0].getsockname()[1], timeout_s=0.05)
@@ -371,7 +371,7 @@ async def test_a_repeated_answer_is_not_believed() -> None:
         assert not link.connected
 
 
-async def test_an_arm_that_is_cut_off_is_silent_and_heard_again() -> None:
+async def test_an_arm_that_is_cut_off_is_reconnected() -> None:
     """A closed and a half-open connection each give one error, and the next exchange reopens it."""
     async with linked() as (link, _), Cut(link.port) as cut:
         through = ModbusLink("127.0.0.1", cut.port)

@@ -232,7 +232,7 @@ async def test_after_a_lift_the_sheet_is_met_at_its_middle_again() -> None:
     assert lifted.contact_sheet_m == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-async def test_a_contact_begun_on_the_way_takes_the_sheet_as_it_is() -> None:
+async def test_a_contact_during_the_approach_uses_the_sheet_as_it_is() -> None:
     desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(40.0, 0.02)))
     for _ in range(3):
@@ -300,7 +300,7 @@ def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, reason: str, dep
     assert (back.phase, angle_of(back)) == ("contact", pytest.approx(0.0, abs=1e-12))
 
 
-def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_back() -> None:
+def test_the_sheet_holds_at_its_usable_height_and_continues_when_the_finger_is_back() -> None:
     desk = touched()
     for angle_deg in np.arange(0.0, 61.0, 2.0):
         shown = desk.see(on_cylinder(angle_deg, -0.001))
@@ -409,7 +409,7 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
+async def test_motion_is_bounded_for_any_finger(seed: int) -> None:
     random = np.random.default_rng(seed)
     desk = await table(prediction_horizon_s=0.05)  # so that targets are even in time
     given = desk.planner.parameters
@@ -467,7 +467,7 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
-async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: str) -> None:
+async def test_what_the_sheet_cannot_render_is_reported(stiffness: float, words: str) -> None:
     desk = await table(compliance_mode="stiffness")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
     assert words in desk.planner.note
@@ -476,7 +476,7 @@ async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: st
     assert target.stretch_ratio == pytest.approx(least if words == "softer" else largest)
 
 
-def test_the_arms_pull_limits_the_stretch() -> None:
+def test_the_arms_force_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
     _, largest = stretch_range(weak)
     force = edge_force_n(
@@ -519,7 +519,7 @@ async def test_an_object_turned_in_the_world_is_met_from_the_users_side() -> Non
     assert np.hypot(on_object[1], on_object[2]) == pytest.approx(RADIUS)
 
 
-async def test_an_object_that_cannot_be_presented_is_said_and_nothing_is_sent() -> None:
+async def test_an_object_that_cannot_be_presented_is_reported_and_nothing_is_sent() -> None:
     desk = await table()
     await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 3)
     sent = len(desk.sent)

@@ -197,7 +197,7 @@ def eased_path(corners: list[Floats], steps: int) -> Floats:
 
 
 @pytest.mark.parametrize(("frames", "depth_m"), [(600, 0.001), (180, 0.001), (300, 0.004)])
-def test_after_60_degrees_on_the_cylinder_arc_and_way_on_the_sheet_are_equal(
+def test_after_60_degrees_on_the_cylinder_arc_and_path_on_the_sheet_are_equal(
     frames: int, depth_m: float
 ) -> None:
     """|arc AB - length A'B| <= 0.01 mm for the sheet that is sent to the arms."""
@@ -457,7 +457,7 @@ def test_over_an_edge_the_sheet_is_presented_but_no_touch_begins() -> None:
     assert met.reason == "past_object_edge"
 
 
-def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
+def test_a_concavity_is_reported_and_the_sheet_rests_on_its_rim() -> None:
     """The rim of z = r^2 / 2R is r^2 / 2R above the bottom, up to 24 mm."""
     desk, shape = fresh("bowl")
     bottom = shape.closest(np.array([0.0, 0.0, 0.02]))
@@ -575,21 +575,21 @@ def test_a_finger_that_is_none_is_held(
         ),
     ],
 )
-def test_a_shape_that_is_none_is_refused_with_the_measure(
+def test_a_shape_that_is_none_is_rejected_with_the_measure(
     geometry: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
         make_shape(geometry)
 
 
-def test_an_inverted_mesh_is_refused() -> None:
+def test_an_inverted_mesh_is_rejected() -> None:
     vertices, triangles = ellipsoid_mesh(2)
     with pytest.raises(MeshError, match="inside out"):
         SmoothMeshShape(vertices, triangles[:, ::-1], 0.01)
 
 
 @pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
-def test_an_object_that_turns_no_side_to_the_user_is_refused(turn_rad: float) -> None:
+def test_an_object_that_turns_no_side_to_the_user_is_rejected(turn_rad: float) -> None:
     with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
         Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
 

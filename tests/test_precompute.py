@@ -59,7 +59,7 @@ def flexsheet(
     return run
 
 
-def test_the_table_is_made_where_the_node_looks_for_it_and_once(
+def test_the_table_is_computed_once_in_the_nodes_cache(
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -92,7 +92,7 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
         ),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(
+def test_impossible_requests_are_rejected_with_an_error_text(
     scene_file: Path,
     tmp_path: Path,
     flexsheet: Callable[..., tuple[int, str]],

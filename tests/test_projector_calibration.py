@@ -144,7 +144,9 @@ def test_the_twins_projector_is_recovered(
     assert after.max() < 0.4e-3
 
 
-def test_points_that_make_no_calibration_are_refused(scene: Scene, points: ProjectorPoints) -> None:
+def test_points_that_make_no_calibration_are_rejected(
+    scene: Scene, points: ProjectorPoints
+) -> None:
     def some(keep: np.ndarray) -> ProjectorPoints:
         return ProjectorPoints(
             points.world[keep], points.pixels[keep], points.pose[keep], points.skew_m[keep]
@@ -171,7 +173,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
         calibrate_projector(some(points.pose < 0), scene.projector)
 
 
-def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
+def test_images_that_are_not_of_the_patterns_are_rejected(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
     with pytest.raises(DecodeError, match="5 images; the patterns are 38"):
         decode_patterns(dark[:5], 400, 300)
@@ -188,7 +190,7 @@ def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
     assert np.abs(project_points(fit.projector, world) - wanted).max() < 0.2
 
 
-def test_corners_in_no_order_are_refused() -> None:
+def test_corners_in_no_order_are_rejected() -> None:
     guess = load_scene(SCENE_FILE).projector
     crossed = np.array([[599.0, 499], [199, 99], [199, 499], [599, 99]])
     with pytest.raises(ProjectorError, match="no convex quadrangle"):
@@ -198,7 +200,7 @@ def test_corners_in_no_order_are_refused() -> None:
         keystone(mirrored, 0.1, 0.1, guess)
 
 
-def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) -> None:
+def test_the_scene_keeps_its_comments_and_gets_the_projector(tmp_path: Path) -> None:
     scene = load_scene(SCENE_FILE)
     found = make_true_projector(scene.projector, seed=5)
     copy = tmp_path / "scene.yaml"

@@ -90,7 +90,7 @@ async def test_it_writes_what_came_with_times_and_attachments(tmp_path: Path) ->
     assert node.inputs["in/estop"].counts.messages == 2
 
 
-def test_which_topics_it_wants() -> None:
+def test_which_topics_it_subscribes_to() -> None:
     written = [TOPICS[name] for name in ("scene", "stereo", "fingertip")]
 
     def wants(**parameters: Any) -> list[str]:
@@ -124,7 +124,7 @@ async def test_a_bag_is_named_after_its_start(tmp_path: Path) -> None:
     assert name.removeprefix("run-").removesuffix(".mcap").isdigit()
 
 
-async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+async def test_a_path_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     node = recorder(VirtualClock(), bag=tmp_path / "file" / "a.mcap")
     with pytest.raises(BagError, match="file: cannot be created"):
@@ -136,7 +136,7 @@ async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -
     await node.close()
 
 
-async def test_a_disk_that_refuses_is_said_and_what_is_lost_is_counted(
+async def test_a_failing_disk_is_reported_and_losses_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = VirtualClock()
@@ -190,7 +190,7 @@ def small_disk() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("keep_free_bytes", [8 << 20, 0])
-async def test_on_a_full_disk_the_bag_ends_readable_and_another_goes_on(
+async def test_on_a_full_disk_the_bag_ends_readable_and_another_follows(
     small_disk: Path, keep_free_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ended in time, the bag has an index; on a disk that is full suddenly, it has none."""

@@ -232,7 +232,7 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
         topic_named(old)
 
 
-def test_a_removed_method_in_a_scene_gets_an_error_that_says_to_remove_it(tmp_path: Path) -> None:
+def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path) -> None:
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     content["methods"] = {"kinematics": "closed_form_continuous"}
     file = tmp_path / "scene.yaml"

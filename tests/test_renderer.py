@@ -89,7 +89,7 @@ def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: SceneRe
             assert close[same].mean() > 0.999
 
 
-def test_uncorrected_silhouette_lies_where_the_projector_model_says(
+def test_uncorrected_silhouette_agrees_with_the_projector_model(
     scene: Scene, stage: SceneRenderer
 ) -> None:
     stage.deform(None)
@@ -157,7 +157,7 @@ def test_marks_are_drawn_on_the_object(stage: SceneRenderer) -> None:
     assert (ring[..., 2] > ring[..., 0].astype(int) + 80).any()
 
 
-def test_second_eye_sees_the_front_shifted_the_other_way(stage: SceneRenderer) -> None:
+def test_second_eye_sees_the_front_shifted_the_other_direction(stage: SceneRenderer) -> None:
     """The object is behind the screen: the right eye sees it further right (mirrored: left)."""
     stage.deform(None)
     shown = Display(correction="none", stereo="side_by_side", shading="flat")
@@ -383,7 +383,7 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
     assert len(bench.sent) == 2
 
 
-async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
+async def test_a_frame_contains_the_unlit_fraction_of_the_sheet(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The frame is that of a folded sheet (tests/test_renderer_failures.py)."""
@@ -406,7 +406,7 @@ async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench:
     assert 29 <= len(bench.sent) <= 31
 
 
-async def test_timer_keeps_the_picture_alive_only_when_idle(bench: Bench) -> None:
+async def test_timer_keeps_the_image_alive_only_when_idle(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     await bench.finger(0.0, 0.0, 0.1)
     bench.forward(34)
@@ -445,7 +445,7 @@ async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
     assert len(bench.sent) == begun + 3
 
 
-async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:
+async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
     await bench.arms(pose)

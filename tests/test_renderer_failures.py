@@ -70,7 +70,7 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
     half.release()
 
 
-def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> None:
+def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRenderer) -> None:
     """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
@@ -99,7 +99,7 @@ def folded(overhang_m: float) -> SheetMesh:
     return SheetMesh(np.array(points), np.array(triangles, np.int32).reshape(-1, 3))
 
 
-def test_what_folds_take_is_measured() -> None:
+def test_light_lost_at_folds_is_measured() -> None:
     far_eye, far_light = np.array([0.0, 0.0, 1e3]), np.array([0.0, 0.0, -1e3])
     turned = folded(0.04)
     # 40 mm turned over, and 40 in their shadow, of 120 + 40 + 120.
@@ -109,7 +109,7 @@ def test_what_folds_take_is_measured() -> None:
     assert occluded_fraction(pyramid_mesh(sheet_at(SCENE, np.eye(4), tip)), EYE, PROJECTOR) == 0.0
 
 
-def test_a_folded_sheet_is_drawn_and_told(
+def test_a_folded_sheet_is_drawn_and_reported(
     stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The projector lights the nearest point; of two points on its ray one gets the light."""
@@ -136,7 +136,7 @@ def test_triangles_without_area_are_nothing(
     assert stage.occluded_fraction < 0.001
 
 
-def test_what_is_nowhere_is_refused(stage: SceneRenderer) -> None:
+def test_non_finite_positions_are_rejected(stage: SceneRenderer) -> None:
     lost = np.full((4, 4), np.nan)
     rest = stage.sheet_at_rest()
     nowhere = SheetPose(lost, rest.corners, None)

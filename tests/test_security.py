@@ -111,7 +111,7 @@ async def street() -> AsyncIterator[Street]:
             close()
 
 
-async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> None:
+async def test_an_unknown_key_receives_nothing_and_is_reported(street: Street) -> None:
     mouth = street.mouth()
     friend, stranger = street.ear(street.rings["left"]), street.ear(street.rings["stranger"])
     without = street.ear(None)
@@ -123,7 +123,7 @@ async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> Non
 
 
 @pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
-async def test_only_the_host_of_the_plan_is_heard(street: Street, impostor: str) -> None:
+async def test_only_the_host_of_the_plan_is_accepted(street: Street, impostor: str) -> None:
     """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
     if impostor == "without":
         mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{street.port}"])
@@ -223,7 +223,7 @@ class Meddler(Cut):
         writer.transport.abort()
 
 
-async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
+async def test_changed_repeated_or_replayed_data_are_rejected(
     street: Street, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
@@ -295,7 +295,7 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
     assert len(answer) < 300
 
 
-async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
+async def test_messages_of_250_mib_are_counted_and_others_continue(
     street: Street,
 ) -> None:
     """Each topic has its limit; longer messages are rejected, and their memory is freed."""
@@ -329,7 +329,7 @@ async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
     assert process.memory_info().rss - before < 300 << 20
 
 
-async def test_nothing_speaks_beyond_loopback_without_keys() -> None:
+async def test_nothing_is_sent_beyond_loopback_without_keys() -> None:
     for address in ("192.0.2.1", "0.0.0.0", "*", "[::]", "eth0", "example.org"):
         with pytest.raises(BusError, match="beyond loopback and there are no keys"):
             Publisher(FINGER, [f"tcp://{address}:7777"])
@@ -411,7 +411,7 @@ def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, li
 
 
 @pytest.mark.parametrize("topic", ["estop", "sheet_target", "stereo"])
-def test_of_a_hundred_thousand_forgeries_none_is_taken(topic: str) -> None:
+def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
     message = {"estop": stop("good"), "sheet_target": target(), "stereo": pictures(3)}[topic]
     ear = Ear()
     subscriber = Subscriber(

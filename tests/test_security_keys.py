@@ -95,7 +95,7 @@ def test_a_secret_that_others_may_read_is_not_used(keys: Path, mode: int) -> Non
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
-def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
+def test_a_secret_of_another_user_is_not_used(keys: Path) -> None:
     make(keys, "main")
     os.chown(keys / "main.secret", 12345, -1)
     with pytest.raises(SecurityError, match="belongs to somebody else"):
@@ -103,7 +103,7 @@ def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "x" * 39, "x" * 41, "é" * 40, "~" * 40, "x" * 5000])
-def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
+def test_an_invalid_key_is_reported(keys: Path, text: str) -> None:
     make(keys, "main")
     (keys / "main.secret").write_text(text)
     with pytest.raises(SecurityError, match="holds no key"):

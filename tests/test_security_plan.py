@@ -221,7 +221,7 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
 
 
 @pytest.mark.parametrize("may", [None, True], ids=["as it comes", "may"])
-def test_a_console_that_may_not_reset_says_who_may(folder: Path, may: bool | None) -> None:
+def test_a_console_that_may_not_reset_names_hosts_that_may(folder: Path, may: bool | None) -> None:
     plan = lab(folder, may_reset_estop=may)
     (folder / "plan.json").write_text(plan.model_dump_json())
     sent: list[Message] = []

@@ -106,7 +106,7 @@ async def next_states(lab: Lab, side: str, count: int) -> list[ArmState]:
     return found()
 
 
-async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> None:
+async def test_stroking_arms_stop_at_failures_and_move_when_enabled() -> None:
     troubles = Troubles()
     async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
         await last_weeks_plan_is_refused(lab)

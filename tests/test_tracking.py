@@ -180,7 +180,7 @@ def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
     assert (0.6 if filter_.tremor else 0.3) < np.mean(squares) < 1.4
 
 
-def test_tremor_is_predicted_by_the_hand_and_not_the_wrong_way_by_the_others() -> None:
+def test_tremor_is_predicted_by_its_model_and_not_amplified_by_others() -> None:
     def trembling(time_s: float) -> Floats:
         return np.array([5e-5 * np.sin(2 * np.pi * 9.3 * time_s), 0.0, 0.0])
 
@@ -250,7 +250,7 @@ def test_a_swing_is_met_between_the_points() -> None:
         )
 
 
-def test_a_path_of_one_point_is_refused() -> None:
+def test_a_path_of_one_point_is_rejected() -> None:
     with pytest.raises(ValueError, match="two or more are needed"):
         interpolate_path(np.zeros((1, 3)), 0.01, 0.0)
 
@@ -280,7 +280,7 @@ def test_points_that_do_not_agree_begin_no_track() -> None:
             pytest.fail("three random points in a row look like a finger")
 
 
-def test_a_jump_is_refused_and_forgotten() -> None:
+def test_a_jump_is_rejected_and_forgotten() -> None:
     tracker = new_tracker()
     feed(tracker, steady, range(60))
     assert (
@@ -348,7 +348,7 @@ def test_nothing_beyond_a_fingers_reach_enters(way_m: float) -> None:
 
 
 @pytest.mark.parametrize("name", TRACKING_METHODS)
-def test_a_late_point_mends_the_track(name: str) -> None:
+def test_a_late_point_corrects_the_track(name: str) -> None:
     """Points out of order give the same track as points in order."""
     generator = np.random.default_rng(2)
     points = [
@@ -381,7 +381,7 @@ def test_a_late_jump_a_doubled_point_and_an_ancient_one_change_nothing() -> None
 
 
 @pytest.mark.parametrize("off_m", [0.003, 0.01, 0.02])
-def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
+def test_a_late_point_is_gated_like_one_in_time(off_m: float) -> None:
     """A point that is too fast in order is also rejected when it is late."""
     tracker = new_tracker()
     feed(tracker, still, range(58))
@@ -464,7 +464,7 @@ def reaching(time_s: float) -> Floats:
     return np.array([0.05 * np.sin(2 * np.pi * 0.5 * time_s), 0.0, 0.0])
 
 
-def test_methods_are_as_good_as_they_say_in_their_range() -> None:
+def test_methods_have_the_stated_accuracy_in_their_range() -> None:
     """More expensive methods are better for longer horizons and more dynamic fingers."""
     family = make_tracking_family(
         lambda scene: {

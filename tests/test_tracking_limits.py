@@ -68,7 +68,7 @@ def test_a_little_of_it_does_no_harm(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEVERE)
-def test_much_of_it_is_said_and_soon_over(name: str) -> None:
+def test_a_severe_disturbance_is_reported_and_recovered(name: str) -> None:
     severity, reasons, recovery_ms = SEVERE[name]
     row = measure(name, severity, repetitions=1)
     assert row.valid_share == 0.0
@@ -90,7 +90,7 @@ def test_much_of_it_is_said_and_soon_over(name: str) -> None:
         ("clock", -20.0, {"late"}, 1),
     ],
 )
-def test_bad_times_cost_a_few_frames_and_no_wrong_place(
+def test_bad_times_cost_a_few_frames_and_no_wrong_position(
     name: str, severity: float, reasons: set[str], lost: int | None
 ) -> None:
     row = measure(name, severity, repetitions=1)
@@ -104,7 +104,7 @@ def test_bad_times_cost_a_few_frames_and_no_wrong_place(
         assert row.recovery_ms[1] <= lost * FRAME_MS + 1e-3
 
 
-def test_in_a_crowd_no_other_mark_is_taken_for_the_finger() -> None:
+def test_no_clutter_is_confused_with_the_finger() -> None:
     """This is a short form of `benchmarks.tracking_endurance`."""
     count = 0
     for seed, frames in ((2, 900), (3, 600)):

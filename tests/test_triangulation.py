@@ -154,7 +154,7 @@ def test_the_covariance_is_that_of_noisy_pixels(geometry: StereoGeometry) -> Non
     assert along_view == pytest.approx(rule, rel=0.15)
 
 
-def test_marks_that_do_not_belong_together_show_in_the_reprojection(
+def test_mismatched_markers_have_a_large_reprojection_error(
     geometry: StereoGeometry,
 ) -> None:
     left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
@@ -195,13 +195,13 @@ def calibration_of(scene: Scene, **changes: object) -> StereoCalibration:
     return calibration.model_copy(update=changes)
 
 
-def test_a_calibration_replaces_the_optics_but_not_the_place(scene: Scene) -> None:
+def test_a_calibration_replaces_the_optics_but_not_the_pose(scene: Scene) -> None:
     geometry = StereoGeometry.of(scene.camera, calibration_of(scene))
     assert geometry.matrices[0][0, 0] == 600.0
     assert np.allclose(geometry.world_from_left[:3, 3], scene.camera.world_from_left.position_m)
 
 
-def test_a_calibration_of_another_camera_is_refused(scene: Scene) -> None:
+def test_a_calibration_of_another_camera_is_rejected(scene: Scene) -> None:
     with pytest.raises(CalibrationMismatchError, match=r'device "other".*"twin-bumblebee"'):
         StereoGeometry.of(scene.camera, calibration_of(scene, device="other"))
     with pytest.raises(CalibrationMismatchError, match=r"1024x480 px.*640x480 px"):

@@ -149,7 +149,7 @@ async def test_each_reason_and_back_again(scene: Scene, camera: TwinCamera) -> N
             assert np.linalg.norm(shown.position_world_m - HERE) < 3e-4
 
 
-async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
+async def test_a_second_marker_far_from_a_followed_one_does_not_disturb(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -161,7 +161,7 @@ async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
     assert lost.reason == "two_markers"
 
 
-async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alone(
+async def test_a_marker_outside_the_volume_is_tracked_only_when_it_is_the_only_one(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -174,7 +174,7 @@ async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alon
     assert np.linalg.norm(shown[-1].position_world_m - FAR) < 3e-4
 
 
-async def test_a_mark_seen_beside_the_finger_is_not_taken_for_it(
+async def test_a_marker_seen_beside_the_finger_is_not_confused_with_it(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -190,7 +190,7 @@ async def test_a_mark_seen_beside_the_finger_is_not_taken_for_it(
     assert np.linalg.norm(again[-1].position_world_m - HERE) < 3e-4
 
 
-async def test_late_pictures_are_counted_and_a_new_camera_is_not_late(
+async def test_late_images_are_counted_and_a_new_camera_is_not_late(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -222,7 +222,9 @@ async def test_a_part_of_the_sensor_gives_the_same_fingertip(
     assert np.allclose(whole.position_world_m, cut.position_world_m, atol=1e-6)
 
 
-async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCamera) -> None:
+async def test_images_of_another_camera_are_rejected_by_name(
+    scene: Scene, camera: TwinCamera
+) -> None:
     bench = await Bench(camera).start(scene)
     header = Header(1, 1, 1, "virtual", "camera", 1)
     full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
@@ -250,7 +252,7 @@ async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCa
     assert bench.sent == []
 
 
-async def test_nothing_is_said_before_there_is_a_scene(camera: TwinCamera) -> None:
+async def test_nothing_is_published_before_there_is_a_scene(camera: TwinCamera) -> None:
     bench = Bench(camera)
     pair = StereoPair(
         device="any",
@@ -280,7 +282,7 @@ def calibration_of(rig: StereoCamera) -> StereoCalibration:
     )
 
 
-async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
+async def test_a_calibration_file_is_used_and_a_foreign_one_rejected(
     tmp_path: Path, scene: Scene, camera: TwinCamera
 ) -> None:
     own = calibration_of(scene.camera)

@@ -148,7 +148,7 @@ def test_corners_lie_where_the_optics_put_them(chessboard: TwinBoard) -> None:
             assert off.max() < 0.01
 
 
-def test_a_chessboard_is_found_whole_in_both_noisy_pictures(chessboard: TwinBoard) -> None:
+def test_a_chessboard_is_found_whole_in_both_noisy_images(chessboard: TwinBoard) -> None:
     for pose in chessboard.poses(6):
         for image, corners in zip(chessboard.pair(pose), chessboard.corners(pose), strict=True):
             found, seen = cv2.findChessboardCorners(image, (9, 6))
@@ -195,14 +195,14 @@ def test_poses_are_near_and_far_tilted_to_all_sides_and_reach_every_edge(
             assert nearest < (110 if shared else 210)
 
 
-def test_a_boards_pictures_come_from_the_seed(rig: StereoCamera) -> None:
+def test_a_boards_images_come_from_the_seed(rig: StereoCamera) -> None:
     pose = TwinBoard(rig, CHESSBOARD, seed=1).poses(1)[0]
     pictures = [TwinBoard(rig, CHESSBOARD, seed=seed).pair(pose)[0] for seed in (1, 1, 2)]
     assert np.array_equal(pictures[0], pictures[1])
     assert not np.array_equal(pictures[0], pictures[2])
 
 
-def test_boards_that_cannot_be_drawn_are_refused(rig: StereoCamera, chessboard: TwinBoard) -> None:
+def test_boards_that_cannot_be_drawn_are_rejected(rig: StereoCamera, chessboard: TwinBoard) -> None:
     for change, said in (
         ({"marker_m": None}, "needs marker_m"),
         ({"marker_m": 0.03}, "does not fit"),
@@ -265,7 +265,7 @@ def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
 
 @given(offset=st.tuples(*[st.floats(-0.06, 0.06)] * 2))
 @settings(max_examples=10, deadline=None)
-def test_a_second_mark_is_where_it_was_asked_for(
+def test_a_second_marker_is_at_the_requested_position(
     rig: StereoCamera, plain: TwinCamera, offset: tuple[float, float]
 ) -> None:
     if np.hypot(*offset) < 0.015:
@@ -283,7 +283,7 @@ def test_a_second_mark_is_where_it_was_asked_for(
 
 
 @pytest.mark.parametrize("overlap", [-0.5, 0.0, 0.5])
-def test_a_highlight_touches_the_mark_by_as_much_as_asked(
+def test_a_highlight_overlaps_the_marker_as_requested(
     rig: StereoCamera, plain: TwinCamera, overlap: float
 ) -> None:
     camera = looking(rig, touching_highlight(overlap, radius_m=0.0015))
@@ -297,7 +297,7 @@ def test_a_highlight_touches_the_mark_by_as_much_as_asked(
 
 @given(share=st.floats(0.0, 1.0))
 @settings(max_examples=12, deadline=None)
-def test_an_occluder_hides_the_share_of_the_mark_that_was_asked_for(
+def test_an_occluder_hides_the_requested_fraction_of_the_marker(
     rig: StereoCamera, plain: TwinCamera, share: float
 ) -> None:
     camera = looking(rig, covered(share, views="right"))
@@ -307,7 +307,7 @@ def test_an_occluder_hides_the_share_of_the_mark_that_was_asked_for(
     assert seen[1].sum() / whole[1].sum() == pytest.approx(1.0 - share, abs=0.06)
 
 
-def test_a_wholly_covered_mark_leaves_nothing_in_that_view(rig: StereoCamera) -> None:
+def test_a_wholly_covered_marker_leaves_nothing_in_that_view(rig: StereoCamera) -> None:
     left, right = of_the_mark(looking(rig, covered(1.0, views="right")))
     assert left.max() > 100
     assert np.abs(right).max() < 0.1
@@ -315,7 +315,7 @@ def test_a_wholly_covered_mark_leaves_nothing_in_that_view(rig: StereoCamera) ->
 
 @given(defocus_px=st.floats(0.0, 4.0))
 @settings(max_examples=10, deadline=None)
-def test_out_of_focus_the_mark_spreads_as_optics_say_and_keeps_its_light(
+def test_out_of_focus_the_marker_spreads_as_in_optics_and_keeps_its_light(
     rig: StereoCamera, plain: TwinCamera, defocus_px: float
 ) -> None:
     even = Sensor(finger_level=0.0, background_level=0.0, texture_level=0.0, aperture_m=0.03)
@@ -332,12 +332,12 @@ def test_out_of_focus_the_mark_spreads_as_optics_say_and_keeps_its_light(
     assert np.allclose(grown, defocus_px**2, rtol=0.05, atol=0.02)
 
 
-def test_a_defocus_beyond_infinity_is_refused() -> None:
+def test_a_defocus_beyond_infinity_is_rejected() -> None:
     with pytest.raises(ValueError, match="aperture_m above"):
         Sensor(aperture_m=0.001).out_of_focus(3.0, 0.5, 540.0)
 
 
-def test_over_exposure_brightens_all_and_fills_the_mark(rig: StereoCamera) -> None:
+def test_over_exposure_brightens_all_and_fills_the_marker(rig: StereoCamera) -> None:
     lab = CLUTTER["lab"]
     once, thrice = (
         looking(rig, lab, Sensor(exposure=factor, background_level=40.0)) for factor in (1.0, 3.0)
@@ -353,7 +353,7 @@ def test_over_exposure_brightens_all_and_fills_the_mark(rig: StereoCamera) -> No
     assert counts[1] > 25
 
 
-def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> None:
+def test_the_sheets_texture_is_in_its_plane(rig: StereoCamera) -> None:
     camera = looking(rig, Clutter(sheet=Sheet()))
     generator = np.random.default_rng(1)
     seen: list[list[float]] = [[], []]
@@ -368,7 +368,7 @@ def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> N
     assert camera.eyes[0].background[row, column] < 0.8 * Sheet().level
 
 
-def test_a_lamps_image_may_stand_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
+def test_a_lamps_image_may_be_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
     place = (-0.09, 0.05, 0.0)
     spot = Highlight(FixedPoint(place), 0.0015, 300.0, views="left")
     camera = looking(rig, Clutter(highlights=(spot,)))
@@ -389,7 +389,7 @@ def test_what_moves_is_where_its_path_is_at_that_time(rig: StereoCamera, plain: 
             assert np.abs(centre_and_spread(light)[0] - place).max() < 0.05
 
 
-def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) -> None:
+def test_an_occluder_passes_before_the_marker_and_away_again(rig: StereoCamera) -> None:
     ends = [Moving((-0.1, y, 0.05), (0.1, 0.0, 0.0)) for y in (-0.3, 0.3)]
     camera = looking(rig, Clutter(occluders=(Occluder(ends[0], ends[1], 0.01),)))
     light = [of_the_mark(camera, time_s)[0].max() for time_s in np.arange(0.0, 2.0, 0.1)]
@@ -431,7 +431,7 @@ def test_joined_windows_cover_each_pixel_once(corners: list[tuple[int, int, int,
     assert (joined >= touched).all()
 
 
-def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera) -> None:
+def test_images_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera) -> None:
     def film(seed: int) -> list[tuple[Image, Image]]:
         camera = looking(rig, CLUTTER["crowded"], seed=seed)
         before = camera.levels(lambda _: np.array([9.0, 0.0, 0.0]), exposure_s=0.004)
@@ -444,7 +444,7 @@ def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera)
     assert not np.array_equal(film(1), film(2))
 
 
-def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
+def test_no_clutter_is_similar_to_a_marker(rig: StereoCamera) -> None:
     """No clutter is as bright over six pixels as half of the marker's height, or as large."""
     camera = looking(rig, CLUTTER["lab"])
     for image in camera.picture(still, exposure_s=0.004, marker=False):
@@ -539,7 +539,7 @@ def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) ->
     assert size(disc.with_changes(sensor=dim)) > 2.0 * plain
 
 
-def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -> None:
+def test_a_saturated_pixel_has_no_information_and_a_dark_one_all_of_it() -> None:
     sensor = Sensor()
     told = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
     noise_sq = np.array([100.0, 230.0, 255.0]) / 40.0 + 2.25 + 1.0 / 12.0
@@ -549,7 +549,7 @@ def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -
     assert told[3] < 1e-12
 
 
-def test_there_is_no_bound_where_the_mark_cannot_be_seen(rig: StereoCamera) -> None:
+def test_there_is_no_bound_if_the_marker_is_not_visible(rig: StereoCamera) -> None:
     for place, said in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
         with pytest.raises(BoundError, match=said):
             fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)

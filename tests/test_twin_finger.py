@@ -82,7 +82,7 @@ def test_position_is_continuous_and_velocity_is_its_slope(
         assert np.allclose(slope, motion.at(time_s).velocity, atol=1e-3)
 
 
-def test_a_path_given_in_mid_motion_takes_over_without_a_step() -> None:
+def test_a_path_given_in_mid_motion_starts_without_a_step() -> None:
     first = motion_along([0.0, 1.0], [[0.0, 0.0, 0.1], [0.1, 0.0, 0.05]], wander_m=1e-3)
     at_s = path_time(first, 0.5)
     second = first.followed_by(
@@ -127,7 +127,7 @@ def test_speed_stays_below_the_paths_own() -> None:
         ([0.0, 0.01], [[0.0, 0, 0], [0.1, 0, 0]], r"speed 10 m/s after times_s\[0\]"),
     ],
 )
-def test_paths_that_cannot_be_followed_are_refused(
+def test_paths_that_cannot_be_followed_are_rejected(
     times: list[float], points: list[list[float]], said: str
 ) -> None:
     with pytest.raises(FingerPathError, match=said):
@@ -219,7 +219,7 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "a path needs two"),
     ],
 )
-def test_a_bad_recording_is_refused(tmp_path: Path, scene: Scene, text: str, said: str) -> None:
+def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, said: str) -> None:
     with pytest.raises(FingerPathError, match=said):
         recorded_path(write_recording(tmp_path / "hand.csv", text), scene)
     with pytest.raises(FingerPathError, match="cannot be read"):
@@ -257,7 +257,7 @@ def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("speed_m_per_s", [0.0, 0.1, 1.5])
-def test_the_marks_light_is_centred_on_the_fingertip(
+def test_the_markers_light_is_centred_on_the_fingertip(
     camera: TwinCamera, speed_m_per_s: float
 ) -> None:
     """The light is compared with the marker over black ground."""
@@ -279,7 +279,7 @@ def test_the_marks_light_is_centred_on_the_fingertip(
             assert np.abs(centre - eye.see(tip)[0]).max() < 0.02
 
 
-def test_noise_is_new_in_each_picture_and_as_large_as_stated(camera: TwinCamera) -> None:
+def test_noise_is_new_in_each_image_and_as_large_as_stated(camera: TwinCamera) -> None:
     def still(_: float) -> Floats:
         return np.array([0.0, 0.0, 0.02])
 
@@ -291,7 +291,7 @@ def test_noise_is_new_in_each_picture_and_as_large_as_stated(camera: TwinCamera)
     assert len({picture.tobytes() for picture in pictures}) == len(pictures)
 
 
-def test_the_background_is_textured_and_darker_than_any_mark(camera: TwinCamera) -> None:
+def test_the_background_is_textured_and_darker_than_any_marker(camera: TwinCamera) -> None:
     left, right = camera.picture(lambda _: np.array([0.0, 0.0, 5.0]), exposure_s=0.004)
     for image in (left, right):
         assert image.shape == (480, 640)

@@ -147,13 +147,13 @@ def test_what_a_node_did_live_it_does_again_to_the_last_bit(bag: Path, name: str
     assert result.topics[output].compared >= FRAMES // 2
 
 
-def test_pictures_are_drawn_again_to_the_last_pixel(bag: Path) -> None:
+def test_images_are_drawn_again_to_the_last_pixel(bag: Path) -> None:
     result = verify(bag, "renderer")
     assert result.repeatable, result
     assert result.topics["frame"].replayed > 3
 
 
-def test_without_the_nodes_word_the_recorders_order_is_another(bag: Path, tmp_path: Path) -> None:
+def test_without_the_execution_log_the_recorders_order_differs(bag: Path, tmp_path: Path) -> None:
     old = rewritten(bag, tmp_path / "old.mcap", log=False)
     result = verify(old, "planner")
     assert result.same_bytes
@@ -189,7 +189,7 @@ def rewritten(
         ("recorder", "wrote this bag"),
     ],
 )
-def test_nodes_that_cannot_be_stepped_say_why(bag: Path, name: str, why: str) -> None:
+def test_nodes_that_cannot_be_replayed_give_a_reason(bag: Path, name: str, why: str) -> None:
     with pytest.raises(BagError, match=f"{name} is not replayed: .*{why}"):
         verify(bag, name)
 

@@ -81,7 +81,7 @@ def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
 
 
 @pytest.mark.parametrize("lag_s", [-0.007, 0.0, 0.012])
-def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
+def test_the_lag_of_marker_sheet_and_indentation_is_reported(lag_s: float) -> None:
     pictures = stroke.DrawnFrames([], [], [])
     for light_s in np.arange(0.1, 12.0, 1 / 15):
         pictures.add(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
@@ -91,7 +91,7 @@ def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
     assert told["object"] == pytest.approx(20.0)
 
 
-def test_too_few_pictures_tell_no_lag() -> None:
+def test_too_few_images_give_no_lag() -> None:
     pictures = stroke.DrawnFrames([], [], [])
     pictures.add(frame(3.0, 0.0, 0.0, 0.0))
     pictures.add(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))
