@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import queue
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from flexsheet.messages.base import Header, Message
+from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.scene import Lens, Scene
-from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.camera.node import Camera, CameraParameters
+from tests.node_harness import NodeHarness
 from tests.waiting import until
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -54,7 +53,7 @@ def picture(number: int, side: int, width: int = WIDTH) -> Image:
     return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
 
 
-def told(image: Image) -> int:
+def read_number(image: Image) -> int:
     return round((float(image.mean()) - 20) / 20)
 
 
@@ -69,36 +68,32 @@ def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
     return path
 
 
-class Bench:
-    """A camera node that runs, and what it publishes."""
+class CameraHarness(NodeHarness[Camera, Clock]):
+    """Running camera node and its messages."""
+
+    until = staticmethod(until)
 
     def __init__(self, clock: Clock | None = None, **parameters: Any) -> None:
-        self.sent: list[tuple[StereoPair, Header]] = []
-        self.changed = asyncio.Event()
-        self.node = Camera(
+        super().__init__(
+            Camera,
             CameraParameters.model_validate(parameters),
+            clock or SystemClock(),
             name="camera",
-            clock=clock or SystemClock(),
-            send=self.keep,
         )
 
-    def keep(self, topic: Topic, message: Message, header: Header) -> None:
-        assert isinstance(message, StereoPair)
-        self.sent.append((message, header))
-        self.changed.set()
-
-    async def until(self, true: Callable[[], bool]) -> None:
-        await until(true)
+    @property
+    def sent(self) -> list[tuple[StereoPair, Header]]:
+        return self.messages(StereoPair)
 
     def numbers(self) -> list[tuple[int, int]]:
-        return [(told(pair.left), told(pair.right) - 5) for pair, _ in self.sent]
+        return [(read_number(pair.left), read_number(pair.right) - 5) for pair, _ in self.sent]
 
 
 @asynccontextmanager
 async def running(
     scene: Scene, *, clock: Clock | None = None, **parameters: Any
-) -> AsyncIterator[Bench]:
-    bench = Bench(clock, **parameters)
+) -> AsyncIterator[CameraHarness]:
+    bench = CameraHarness(clock, **parameters)
     await bench.node.setup()
     await bench.node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
     try:

@@ -14,11 +14,11 @@ from camera_bench import (
     FRAMES,
     HEIGHT,
     WIDTH,
-    Bench,
+    CameraHarness,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
     write_video,
 )
 from pydantic import ValidationError
@@ -97,7 +97,7 @@ async def test_a_video_starts_again_when_it_loops(scene: Scene, videos: tuple[Pa
 def test_images_come_in_the_order_of_their_names(scene: Scene, images: dict[str, str]) -> None:
     reader = open_reader(ImagesSource(kind="images", **images), scene.camera, lambda: 0)
     pairs = list(iter(reader.read, None))
-    assert [(told(pair.left), told(pair.right) - 5) for pair in pairs] == IN_ORDER
+    assert [(read_number(pair.left), read_number(pair.right) - 5) for pair in pairs] == IN_ORDER
 
 
 async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, str]) -> None:
@@ -117,7 +117,7 @@ async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side
     """OpenCV opens a file like a camera; its end is like an unplugged camera."""
     source = {"kind": "opencv", "left": str(side_by_side)}
     async with running(scene, source=source, retry_s=0.01) as bench:
-        # A file cannot be told an exposure, and has a rate of its own: both are told once.
+        # A file has no exposure control and its own rate: both are reported once.
         await bench.until(lambda: bench.node.errors >= 4 and len(bench.sent) > 2)
         assert len(bench.node.warned) == 2
         assert "gives no more pictures" in bench.node.last_error
@@ -177,7 +177,7 @@ async def test_the_twins_images_are_left_alone_by_a_real_camera(
     pair = StereoPair(
         device="t", exposure_s=0, dropped_frames=0, left=picture(0, 0), right=picture(0, 1)
     )
-    bench = Bench(source={"kind": "images", **images})
+    bench = CameraHarness(source={"kind": "images", **images})
     await bench.node.step("twin__stereo", pair, Header(1, 1, 1, "virtual", "twin", 1))
     assert bench.sent == []
 

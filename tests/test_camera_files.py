@@ -14,8 +14,8 @@ from camera_bench import (
     Image,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
     write_video,
 )
 from hypothesis import HealthCheck, given, settings
@@ -79,7 +79,7 @@ def times_ms(pictures: list[ImagePair]) -> list[float]:
 
 
 def numbers(pictures: list[ImagePair]) -> list[tuple[int, int]]:
-    return [(told(pair.left), told(pair.right) - 5) for pair in pictures]
+    return [(read_number(pair.left), read_number(pair.right) - 5) for pair in pictures]
 
 
 def both(frames: list[int]) -> list[Image]:
@@ -112,7 +112,7 @@ async def test_the_published_stamps_follow_the_files_time(scene: Scene, tmp_path
     path = write_timed_video(tmp_path / "v.mkv", both([*range(FRAMES)]), UNEVEN_MS)
     async with running(scene, source={"kind": "video", "left": path}) as bench:
         await bench.until(lambda: "ended" in bench.node.note)
-    shown = [(told(pair.left), header.source_ns) for pair, header in bench.sent]
+    shown = [(read_number(pair.left), header.source_ns) for pair, header in bench.sent]
     begin_ns = shown[0][1]
     assert shown[0][0] == 0
     for number, source_ns in shown:

@@ -21,8 +21,8 @@ from camera_bench import (
     FakeCamera,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -93,7 +93,7 @@ def test_the_drivers_stamp_gives_the_exposure(
     assert pictures.skew_s == pytest.approx(3e-3, abs=1e-6)
     assert pictures.exposure_s == pytest.approx(4e-3)
     assert "stamped by the driver" in pictures.notes
-    assert (told(pictures.left), told(pictures.right) - 5) == (1, 1)
+    assert (read_number(pictures.left), read_number(pictures.right) - 5) == (1, 1)
 
 
 def test_a_driver_that_stamps_the_beginning_of_the_exposure(
@@ -119,7 +119,7 @@ def test_stamps_of_another_clock_are_replaced_by_the_arrival(
     assert "stamped on arrival" in pictures.notes
     newest_ns = bag.base_ns + (MAX_IMPLAUSIBLE - 1) * PERIOD_NS
     assert pictures.exposure_ns == newest_ns + 8 * MS - 2 * MS
-    assert told(pictures.left) == told(pictures.right) - 5 == MAX_IMPLAUSIBLE - 1
+    assert read_number(pictures.left) == read_number(pictures.right) - 5 == MAX_IMPLAUSIBLE - 1
 
 
 def test_a_stated_delay_from_exposure_to_arrival(
@@ -252,7 +252,7 @@ def test_a_side_by_side_camera_has_one_exposure(bag: CameraBag, scene: Scene) ->
         camera.shoot(50 * MS, image=np.hstack([picture(2, 0), picture(3, 1)]))
         pictures = read(reader)
         assert camera.properties[cv2.CAP_PROP_FRAME_WIDTH] == 2 * WIDTH
-    assert (told(pictures.left), told(pictures.right) - 5) == (2, 3)
+    assert (read_number(pictures.left), read_number(pictures.right) - 5) == (2, 3)
     assert pictures.skew_s == 0.0
     assert pictures.exposure_ns == pytest.approx(bag.base_ns + 48 * MS, abs=1000)
 
@@ -275,7 +275,7 @@ def test_settings_are_made_in_the_devices_units(
                 WIDTH,
                 HEIGHT,
             )
-            # A device without auto focus is not told to leave it.
+            # A device without auto focus gets no command for it.
             assert (cv2.CAP_PROP_AUTOFOCUS, 0.0) not in fake.calls
         assert reader.warnings == ()
 
