@@ -120,7 +120,7 @@ async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side
         # A file has no exposure control and its own rate: both are reported once.
         await bench.until(lambda: bench.node.errors >= 4 and len(bench.sent) > 2)
         assert len(bench.node.warned) == 2
-        assert "gives no more pictures" in bench.node.last_error
+        assert "delivers no more images" in bench.node.last_error
         assert all(left == right for left, right in bench.numbers())
 
 

@@ -318,7 +318,7 @@ def test_with_automatic_exposure_the_exposure_is_unknown(
     for fake in cameras:
         fake.fixed |= {cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}
     with reading(bag, scene) as reader:
-        assert "0: auto exposure: requested 1 (by hand), the device has 3" in reader.warnings
+        assert "0: auto exposure: requested 1 (manual), the device has 3" in reader.warnings
         for fake in cameras:
             fake.shoot(0)
         assert read(reader).exposure_s == scene.camera.exposure_s
@@ -423,7 +423,7 @@ def test_two_cameras_without_pairs_are_reported(
     scene: Scene,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(live, "FIRST_S", 0.01)
+    monkeypatch.setattr(live, "FIRST_FRAME_S", 0.01)
     with reading(bag, scene, silence_s=1.0) as reader:
         told_of: list[str] = []
 

@@ -41,7 +41,7 @@ def test_a_resting_arm_has_not_followed() -> None:
 def test_a_bag_without_a_stroke_is_no_proof(tmp_path: Path) -> None:
     bag = tmp_path / "nothing.mcap"
     BagWriter(bag).close()
-    with pytest.raises(ValueError, match="no stroke is in it"):
+    with pytest.raises(ValueError, match="contains no stroke"):
         evaluate_stroke(bag)
 
 

@@ -233,7 +233,7 @@ async def test_images_of_another_camera_are_rejected_by_name(
             "webcam",
             full,
             (0, 0),
-            'images of device "webcam"; the scene\'s camera is "twin-bumblebee"',
+            'images of device "webcam"; expected the scene\'s camera "twin-bumblebee"',
         ),
         ("twin-bumblebee", wide, (0, 0), "left image of 752x480 px at column 0, row 0"),
         ("twin-bumblebee", full, (0, 8), "left image of 640x480 px at column 0, row 8"),

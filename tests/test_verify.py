@@ -186,7 +186,7 @@ def rewritten(
         ("arm_left_bridge", "commands an arm"),
         ("twin_arms", "over TCP"),
         ("twin_finger", "takes images by its own clock"),
-        ("recorder", "wrote this bag"),
+        ("recorder", "recorded this bag"),
     ],
 )
 def test_nodes_that_cannot_be_replayed_give_a_reason(bag: Path, name: str, why: str) -> None:
