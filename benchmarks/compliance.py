@@ -157,9 +157,9 @@ def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Presented against wanted force.")
-    parser.add_argument("--table", action="store_true", help="plan with a table of the membrane")
-    parser.add_argument("--depth-mm", type=float, default=50.0, help="deepest push")
+    parser = argparse.ArgumentParser(description="Compare the rendered with the true force.")
+    parser.add_argument("--table", action="store_true", help="use a table of finite elements")
+    parser.add_argument("--depth-mm", type=float, default=50.0, help="maximum depth, mm")
     asked = parser.parse_args()
     scene = load_scene(SCENE_FILE)
     law = make_force_model(scene.sheet)

@@ -87,7 +87,9 @@ def steps(text: str) -> Iterator[Step]:
         elif inside:
             found = PROMPT.fullmatch(line)
             if found is None:
-                raise ValueError(f"line {number} has no prompt (each$, {'$, '.join(HOSTS)}$)")
+                raise ValueError(
+                    f"line {number} has no prompt: expected each$, {'$, '.join(HOSTS)}$"
+                )
             code = EXIT_CODE.search(found[2])
             hosts = HOSTS if found[1] == "each" else (found[1],)
             yield Step(number, hosts, found[2], int(code[1]) if code else 0)
@@ -303,8 +305,8 @@ def prepare(folder: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--until", type=int, default=10**9, metavar="LINE", help="of the page")
-    parser.add_argument("--keep", action="store_true", help="the folder of the three computers")
+    parser.add_argument("--until", type=int, default=10**9, metavar="LINE", help="last line to run")
+    parser.add_argument("--keep", action="store_true", help="do not delete the folder")
     given = parser.parse_args()
     if why := missing():
         print(f"skipped: {why}", file=sys.stderr)

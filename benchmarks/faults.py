@@ -35,7 +35,7 @@ class Span:
         self.begun_s = self.over_s = time.monotonic()
 
     def begin(self) -> None:
-        """Restart the fault's time after a preparation; until `end`, its end is the same."""
+        """Set the fault's start, and its preliminary end, to the present time."""
         self.begun_s = self.over_s = time.monotonic()
 
     def end(self) -> None:
@@ -248,7 +248,7 @@ def rows(
 def table(cases: list[dict[str, Any]]) -> str:
     """Return the rows of the table in docs/limits.md."""
     lines = [
-        "| trouble | neither follows after | both again | both followed, of the time until then "
+        "| fault | neither follows after | both again | both followed, of the time until then "
         "| sheet off by, p50 / p95 | missing in the bag | faults |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -272,14 +272,14 @@ def table(cases: list[dict[str, Any]]) -> str:
 async def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--only", default="", metavar="WORD", help="troubles with this in the name")
-    parser.add_argument("--light", action="store_true", help="without soft body and picture")
-    parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges")
-    parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges")
-    parser.add_argument("--random", action="store_true", help="faults that are drawn, always light")
-    parser.add_argument("--minutes", type=float, default=60.0, help="with --random: for how long")
-    parser.add_argument("--every", type=float, default=10.0, metavar="S", help="with --random")
-    parser.add_argument("--seed", type=int, default=1, help="with --random")
+    parser.add_argument("--only", default="", metavar="WORD", help="part of the faults' names")
+    parser.add_argument("--light", action="store_true", help="without soft body and renderer")
+    parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges, s")
+    parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges, s")
+    parser.add_argument("--random", action="store_true", help="random faults, implies --light")
+    parser.add_argument("--minutes", type=float, default=60.0, help="duration of --random, min")
+    parser.add_argument("--every", type=float, default=10.0, metavar="S", help="period of --random")
+    parser.add_argument("--seed", type=int, default=1, help="seed of --random")
     given = parser.parse_args()
     if why := missing():
         print(f"skipped: {why}", file=sys.stderr)

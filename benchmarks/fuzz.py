@@ -118,7 +118,7 @@ def fuzz_in_process(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=", ".join(TARGETS))
-    parser.add_argument("--seconds", type=float, default=300.0, help="for each target")
+    parser.add_argument("--seconds", type=float, default=300.0, help="duration per target, s")
     parser.add_argument("--corpus", type=Path, default=Path("runs/fuzz"))
     parser.add_argument("--again", type=Path, metavar="FILE", help="run one input of the target")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)

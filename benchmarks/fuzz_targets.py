@@ -138,7 +138,7 @@ class Target:
 def refuse_long(error: Exception, most: int) -> None:
     """Raise Finding unless the error text has a reasonable length."""
     if not 0 < len(str(error)) <= most:
-        raise Finding(f"a refusal of {len(str(error))} characters")
+        raise Finding(f"error text of {len(str(error))} characters")
 
 
 # Mutations of bytes and trees.

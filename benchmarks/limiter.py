@@ -148,7 +148,7 @@ def compute_flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
 
 
 def points_on_tool(joints_rad: Floats, tool: Floats) -> Floats:
-    """Return the tool's points (n, points, 3) in the base, from (points, 3) in the flange."""
+    """Transform the tool's points (points, 3) from the flange to the base, (n, points, 3)."""
     turns, places = compute_flange_poses(joints_rad)
     found: Floats = np.einsum("nij,pj->npi", turns, tool) + places[:, None, :]
     return found
@@ -417,7 +417,7 @@ def check_commands(
     velocities: tuple[Floats, Floats],
     step_s: float,
 ) -> None:
-    """Judge commands (n, 6) after `held` ones, with the velocities (n, 6) of both steps."""
+    """Check commands (n, 6) that follow `held`, with the velocities (n, 6) of both steps."""
     limits, fastest = geometry.joint_limits, geometry.max_tool_speed
     old, new = velocities
     beyond = np.maximum(limits.min_rad - now, now - limits.max_rad).max(axis=1)

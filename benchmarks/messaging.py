@@ -182,7 +182,7 @@ def flexsheet_uvloop(topic: Topic, endpoint: str, arrived: Callable[[int, int], 
 
 
 DESIGNS = (
-    Design(FLOOR, "raw, blocking recv in a thread of its own: the floor", False, blocking),
+    Design(FLOOR, "raw, blocking recv in a separate thread: the floor", False, blocking),
     Design("zmq.asyncio", "raw, await recv_multipart()", False, zmq_asyncio),
     Design("descriptor", "raw, add_reader on the socket's descriptor", False, descriptor),
     Design("descriptor uvloop", "the same on uvloop", False, descriptor_uvloop),
@@ -340,7 +340,7 @@ class Sender:
         patience_ends = time.monotonic() + PATIENCE_S
         while not self.results.poll(0.01):
             if not self._child.is_alive() or time.monotonic() > patience_ends:
-                raise RuntimeError(f"{self.design.name}: nothing arrives")
+                raise RuntimeError(f"{self.design.name}: no message arrives")
             self.send(WARM_UP)
         time.sleep(0.05)
         while self.results.poll(0):
@@ -578,8 +578,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=2.0, help="per design and round")
     parser.add_argument("--transport", choices=["ipc", "tcp"], default="ipc")
-    parser.add_argument("--json", type=Path, help="also write the figures there")
-    parser.add_argument("--markdown", type=Path, help="also write them there for people")
+    parser.add_argument("--json", type=Path, help="JSON file to write")
+    parser.add_argument("--markdown", type=Path, help="Markdown file to write")
     options = parser.parse_args()
     rounds, seconds = (2, 1.0) if options.quick else (options.rounds, options.seconds)
     words = Console(stderr=True)

@@ -201,7 +201,7 @@ def measure_over(
         prepare = None
         if over == "veth":
             prepare = partial(enter_network, stack.enter_context(second_network()))
-            ring = stack.enter_context(keys.ring_of_two(folder))
+            ring = stack.enter_context(keys.create_two_rings(folder))
             loop = keys.Loop()
             stack.callback(loop.close)
 
@@ -272,8 +272,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=1.5, help="per library and round")
     parser.add_argument("--over", nargs="+", choices=list(OVER), default=list(OVER))
-    parser.add_argument("--json", type=Path, help="also write the figures there")
-    parser.add_argument("--markdown", type=Path, help="also write them there for people")
+    parser.add_argument("--json", type=Path, help="JSON file to write")
+    parser.add_argument("--markdown", type=Path, help="Markdown file to write")
     options = parser.parse_args()
     if options.quick:
         options.rounds, options.seconds = 2, 1.0

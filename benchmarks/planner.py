@@ -175,7 +175,7 @@ def normal_error_deg(
     speed: float,
     compliance: ComplianceController,
 ) -> float:
-    """Return the maximum error along a stroke of `WAY_M` with that peak speed."""
+    """Return the maximum error of the normal along a stroke with that peak speed, deg."""
     step_m = 2e-4
     points, normals = sample_geodesic(shape, heading, step_m, round(WAY_M / step_m))
     count = max(8, round(1.875 * WAY_M / speed / STEP_S))

@@ -715,9 +715,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--window-minutes", type=float, default=5.0)
-    parser.add_argument("--busy", type=int, default=0, metavar="N", help="other processes")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="number of busy processes")
     parser.add_argument("--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE")
-    parser.add_argument("--output", type=Path, help="a new folder; default runs/TIME-soak")
+    parser.add_argument("--output", type=Path, help="new folder; default: runs/TIME-soak")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     if given.output is None:

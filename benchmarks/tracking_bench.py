@@ -167,7 +167,7 @@ def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Float
     """Return the covariance (3, 3) m^2 of all fingertips by the calibration's uncertainty."""
     uncertainty = load_calibration(file).uncertainty
     if uncertainty is None:
-        raise ValueError(f"{file}: uncertainty: null; calibrate again, so that it is known")
+        raise ValueError(f"{file}: uncertainty: null; calibrate again to estimate it")
     across = 0.5 * uncertainty.lateral_std_m**2
     world_from_left = rotation_from_rpy(scene.camera.world_from_left.rpy_rad)
     in_left = np.diag([across, across, uncertainty.depth_std_m**2])

@@ -1,6 +1,6 @@
-"""One computer of a test, several nodes in a process: `python -m tests.arm_computer CONFIG...`.
+"""Run several nodes in a process as one computer: `python -m tests.arm_computer CONFIG...`.
 
-Each argument is a `NodeConfig` as JSON.  Ends with SIGTERM.
+Each argument is a `NodeConfig` as JSON. The process ends with SIGTERM.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class StrokerParameters(NodeParameters):
 
 
 class Stroker(Node):
-    """In the planner's place: the sheet leans to and fro for ever."""
+    """Substitute for the planner: a sheet that tilts back and forth endlessly."""
 
     parameters: StrokerParameters
     scene: Output[Scene]

@@ -12,7 +12,7 @@ from flexsheet.nodes.arm_bridge.state_machine import Event
 
 
 def arm_state(side: str, **changes: Any) -> ArmState:
-    """An arm's state; `changes` are fields of it."""
+    """Make an arm's state; `changes` are fields of it."""
     values: dict[str, Any] = {
         "side": side,
         "mode": "follow",

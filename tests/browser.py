@@ -1,4 +1,4 @@
-"""What browser tests share: where Chromium is, and how it draws without a graphics card."""
+"""Provide the path of Chromium and its options for software rendering, for browser tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DRAWN_WITHOUT_GPU = (
     "--ignore-gpu-blocklist",
 )
 TWO_FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-"""The page finds out what lies under the mouse when it draws."""
+"""Script that waits for two frames, after which the page knows the object under the pointer."""
 
 BROWSER_MARKS = [
     pytest.mark.timeout(300),

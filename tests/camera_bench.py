@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import queue
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from flexsheet.messages.base import Header, Message
+from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.scene import Lens, Scene
-from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.camera.node import Camera, CameraParameters
+from tests.node_harness import NodeHarness
 from tests.waiting import until
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -31,7 +30,7 @@ Image = NDArray[np.uint8]
 
 
 def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
-    """The paper's scene with a small camera, its optics scaled with it."""
+    """Load the paper's scene with a small camera and scaled optics."""
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     size = {"width_px": width_px, "height_px": height_px}
     scale = width_px / scene.camera.width_px
@@ -50,11 +49,11 @@ def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
 
 
 def picture(number: int, side: int, width: int = WIDTH) -> Image:
-    """An even picture whose level tells its number and side, as compression leaves it."""
+    """Make a uniform image whose level encodes its number and side."""
     return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
 
 
-def told(image: Image) -> int:
+def read_number(image: Image) -> int:
     return round((float(image.mean()) - 20) / 20)
 
 
@@ -69,36 +68,32 @@ def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
     return path
 
 
-class Bench:
-    """A camera node that runs, and what it publishes."""
+class CameraHarness(NodeHarness[Camera, Clock]):
+    """Running camera node and its messages."""
+
+    until = staticmethod(until)
 
     def __init__(self, clock: Clock | None = None, **parameters: Any) -> None:
-        self.sent: list[tuple[StereoPair, Header]] = []
-        self.changed = asyncio.Event()
-        self.node = Camera(
+        super().__init__(
+            Camera,
             CameraParameters.model_validate(parameters),
+            clock or SystemClock(),
             name="camera",
-            clock=clock or SystemClock(),
-            send=self.keep,
         )
 
-    def keep(self, topic: Topic, message: Message, header: Header) -> None:
-        assert isinstance(message, StereoPair)
-        self.sent.append((message, header))
-        self.changed.set()
-
-    async def until(self, true: Callable[[], bool]) -> None:
-        await until(true)
+    @property
+    def sent(self) -> list[tuple[StereoPair, Header]]:
+        return self.messages(StereoPair)
 
     def numbers(self) -> list[tuple[int, int]]:
-        return [(told(pair.left), told(pair.right) - 5) for pair, _ in self.sent]
+        return [(read_number(pair.left), read_number(pair.right) - 5) for pair, _ in self.sent]
 
 
 @asynccontextmanager
 async def running(
     scene: Scene, *, clock: Clock | None = None, **parameters: Any
-) -> AsyncIterator[Bench]:
-    bench = Bench(clock, **parameters)
+) -> AsyncIterator[CameraHarness]:
+    bench = CameraHarness(clock, **parameters)
     await bench.node.setup()
     await bench.node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
     try:
@@ -109,7 +104,7 @@ async def running(
 
 @dataclass
 class Shot:
-    """What a fake camera delivers: when it arrives and what its driver stamps it with, ns."""
+    """Frame of a fake camera: image, arrival time and driver's stamp, ns."""
 
     image: Image
     arrival_ns: int
@@ -117,7 +112,7 @@ class Shot:
 
 
 class FakeCamera:
-    """A device that can be plugged in, unplugged, and refuses or bends what it is told."""
+    """Fake camera that can be unplugged, and that rejects or clips settings."""
 
     def __init__(self, bag: CameraBag) -> None:
         self.bag = bag
@@ -138,7 +133,8 @@ class FakeCamera:
         stamp_ns: int | None = None,
         image: Image | None = None,
     ) -> None:
-        """A frame that the driver stamps `at_ns` (or otherwise) and that arrives 8 ms later."""
+        """Deliver a frame with the driver's stamp `at_ns` (or `stamp_ns`) that arrives 8 ms
+        later."""
         pixels = picture(number, side) if image is None else image
         stamp = self.bag.base_ns + at_ns if stamp_ns is None else stamp_ns
         self.shots.put(Shot(pixels, self.bag.base_ns + at_ns + 8_000_000, stamp))
@@ -149,7 +145,7 @@ class FakeCamera:
 
 
 class FakeCapture:
-    """In the place of cv2.VideoCapture."""
+    """Substitute for cv2.VideoCapture."""
 
     def __init__(self, camera: FakeCamera | None) -> None:
         self.camera = camera
@@ -195,7 +191,7 @@ class FakeCapture:
 
 
 class CameraBag:
-    """All fake cameras, and a clock that each of their threads reads at its frame's arrival."""
+    """All fake cameras, with a clock that each reader thread reads at its frame's arrival."""
 
     def __init__(self) -> None:
         self.base_ns = time.monotonic_ns()
@@ -207,7 +203,7 @@ class CameraBag:
         return getattr(self.arrived, "ns", time.monotonic_ns())
 
     def plug(self, device: int | str, **properties: float) -> FakeCamera:
-        """A UVC camera as V4L2 shows it; properties: by the names of OpenCV, less CAP_PROP_."""
+        """Plug in a UVC camera as V4L2 reports it; properties: OpenCV's names without CAP_PROP_."""
         camera = self.cameras[device] = FakeCamera(self)
         usual = {
             "BUFFERSIZE": 4,
@@ -234,7 +230,7 @@ class CameraBag:
         return capture
 
     def empty(self) -> None:
-        """Let every grab that still waits come to its end."""
+        """Let every grab that still waits end."""
         for camera in self.cameras.values():
             for _ in camera.captures:
                 camera.shots.put(None)

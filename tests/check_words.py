@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 EXEMPT = {"CHANGELOG.md", "messages/migrations.py", "launch/plans/renamed_keys.py"}
-"""They name what names were before."""
+"""Files that list old names."""
 
 BANNED = {
     r"\b_?(LEAST|MOST|LARGEST|SMALLEST|FURTHEST|FARTHEST|LONGEST|SHORTEST|FEWEST|FINEST)_":

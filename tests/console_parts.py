@@ -1,4 +1,4 @@
-"""What the tests of the console share: a scene, messages as a source holds them, and as frames."""
+"""Provide a scene, and messages as values and as frames, for the tests of the console."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def cylinder() -> Scene:
-    """The first scene of the demo."""
+    """Load the first scene of the demo."""
     text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
     return Scene.model_validate(YAML(typ="safe").load(text))
 
 
 class Shelf:
-    """A source that holds what the test puts on it."""
+    """Source whose messages the test sets."""
 
     def __init__(self, **messages: Message) -> None:
         self.held = {

@@ -1,4 +1,4 @@
-"""The documentation as data: its pages, their blocks of code, headings and links."""
+"""Parse the documentation: pages, code blocks, headings and links."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CODE_SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block; `not_run` is the reason that the page itself gives for not running it."""
+    """Fenced block; `not_run` is the page's reason for not running it, or empty."""
 
     page: Path
     line: int
@@ -52,17 +52,17 @@ def name(page: Path) -> str:
 
 
 def site_pages() -> list[Path]:
-    """Those that the site consists of."""
+    """Return the pages of the site."""
     return sorted(DOCS.rglob("*.md"))
 
 
 def pages() -> list[Path]:
-    """All pages for people."""
+    """Return all pages for users."""
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *site_pages()]
 
 
 def nav_pages() -> list[str]:
-    """Files of the site's navigation, in its order."""
+    """Return the files of the site's navigation, in order."""
 
     def walk(entry: Any) -> Iterator[str]:
         match entry:
@@ -79,7 +79,8 @@ def nav_pages() -> list[str]:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Fenced blocks, also those in lists; a comment before one says why it is not run."""
+    """Yield the fenced blocks, also those in lists, with the reason of a preceding comment not to
+    run one."""
     found: list[Block] = []
     indent, language, begun, inside = "", "", 0, None
     comment: str | None = None
@@ -103,7 +104,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def prose(page: Path) -> list[tuple[int, str]]:
-    """Lines outside of blocks, with their numbers."""
+    """Yield the lines outside of blocks, with their numbers."""
     lines, inside = [], False
     for number, line in enumerate(page.read_text().splitlines(), start=1):
         if FENCE.match(line):
@@ -114,7 +115,7 @@ def prose(page: Path) -> list[tuple[int, str]]:
 
 
 def links(page: Path) -> list[Link]:
-    """Links and pictures, outside of code."""
+    """Yield the links and images outside of code."""
     return [
         Link(page, number, match[2], is_picture=bool(match[1]))
         for number, line in prose(page)
@@ -123,7 +124,7 @@ def links(page: Path) -> list[Link]:
 
 
 def code_spans(page: Path) -> list[tuple[int, str]]:
-    """Code within lines of text."""
+    """Yield the code spans within lines of text."""
     return [(number, span) for number, line in prose(page) for span in CODE_SPAN.findall(line)]
 
 
@@ -132,9 +133,9 @@ def headings(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of the headings that hosts of repositories and the site's generator both make.
+    """Return the anchors of headings that both repository hosts and the site's generator make.
 
-    Of two headings with one name the second has another anchor in each, so only the first counts.
+    Only the first of several headings with one name counts, since the others' anchors differ.
     """
     found = set()
     for heading in headings(page):

@@ -1,4 +1,4 @@
-"""Helpers of the image tests: deformed objects and pushed sheets."""
+"""Deform objects and sheets for image tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose:
-    """Return the scene's sheet, stretched a little, its middle at a pose (4, 4)."""
+    """Return the scene's sheet, slightly stretched, with its middle at a pose (4, 4)."""
     sheet = estimate_sheet(
         *edge_poses(pose, 1.05 * scene.sheet.width_m),
         height_m=scene.sheet.height_m,
@@ -51,7 +51,8 @@ def body_of(displacement: Floats) -> SoftBody:
 
 
 def dent(stage: SceneRenderer, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return a displacement (vertices, 3) of the surface, pushed from the front; its back stays."""
+    """Return a displacement (vertices, 3) of the surface pushed from the front, with a fixed
+    back."""
     points = stage._surface.rest_world_m
     away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
     facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)

@@ -20,16 +20,17 @@ from flexsheet.nodes.fem_solver.mesh import EDGES
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Field = Callable[[Floats], Floats]
-"""Points (k, 3) to vectors (k, 3), or to gradients (k, 3, 3) with the derivative last."""
+"""Function from points (k, 3) to vectors (k, 3), or to gradients (k, 3, 3) with the derivative
+last."""
 
 MAX_ITERATIONS = 40
 SYMMETRIC = {"SymmetricMode": True}
 SETTLED = 1e-9
-"""Newton's last step over the displacement."""
+"""Maximum ratio of Newton's last step to the displacement."""
 
 
 def lame(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
-    """Lame's constants (lambda, mu)."""
+    """Return Lame's constants (lambda, mu)."""
     e, nu = young_modulus_pa, poisson_ratio
     return e * nu / ((1 + nu) * (1 - 2 * nu)), e / (2 * (1 + nu))
 
@@ -40,7 +41,8 @@ def dofs_of(nodes: Ints) -> Ints:
 
 
 def tetrahedron_rule(order: int) -> tuple[Floats, Floats]:
-    """Points (q, 3) and weights (q,) on the unit tetrahedron, exact to degree 2 order - 1."""
+    """Return points (q, 3) and weights (q,) on the unit tetrahedron, exact to degree 2 order -
+    1."""
     (a, wa), (b, wb), (c, wc) = (_rule(order, power) for power in (2, 1, 0))
     u, v, w = (g.ravel() for g in np.meshgrid(a, b, c, indexing="ij"))
     points = np.column_stack([u, v * (1 - u), w * (1 - u) * (1 - v)])
@@ -48,7 +50,7 @@ def tetrahedron_rule(order: int) -> tuple[Floats, Floats]:
 
 
 def triangle_rule(order: int) -> tuple[Floats, Floats]:
-    """Points (q, 2) and weights (q,) on the unit triangle, exact to degree 2 order - 1."""
+    """Return points (q, 2) and weights (q,) on the unit triangle, exact to degree 2 order - 1."""
     (a, wa), (b, wb) = (_rule(order, power) for power in (1, 0))
     u, v = (g.ravel() for g in np.meshgrid(a, b, indexing="ij"))
     return np.column_stack([u, v * (1 - u)]), np.outer(wa, wb).ravel()
@@ -60,12 +62,12 @@ def _rule(order: int, power: int) -> tuple[Floats, Floats]:
 
 
 def solid_shapes(points: Floats) -> tuple[Floats, Floats]:
-    """Values (q, 10) and gradients (q, 10, 3) of the shape functions at points (q, 3)."""
+    """Return values (q, 10) and gradients (q, 10, 3) of the shape functions at points (q, 3)."""
     return _quadratic(points, EDGES)
 
 
 def face_shapes(points: Floats) -> tuple[Floats, Floats]:
-    """Values (q, 6) and gradients (q, 6, 2) on a six-node triangle at points (q, 2)."""
+    """Return values (q, 6) and gradients (q, 6, 2) on a six-node triangle at points (q, 2)."""
     return _quadratic(points, np.array([[0, 1], [1, 2], [2, 0]]))
 
 
@@ -80,7 +82,7 @@ def _quadratic(points: Floats, edges: Ints) -> tuple[Floats, Floats]:
 
 
 def body_loads(nodes: Floats, elements: Ints, force: Field, order: int = 4) -> Floats:
-    """Nodal loads (3n,) of a force per volume."""
+    """Integrate the nodal loads (3n,) of a force per volume."""
     points, weights = tetrahedron_rule(order)
     values, slopes = solid_shapes(points)
     places = np.einsum("qa,eai->eqi", values, nodes[elements])
@@ -92,7 +94,7 @@ def body_loads(nodes: Floats, elements: Ints, force: Field, order: int = 4) -> F
 
 
 def stress_loads(nodes: Floats, elements: Ints, stress: Field, order: int = 4) -> Floats:
-    """Nodal loads (3n,) that hold a stress field in balance: its work on each shape function."""
+    """Integrate the nodal loads (3n,) in equilibrium with a stress field."""
     points, weights = tetrahedron_rule(order)
     values, slopes = solid_shapes(points)
     jacobian = np.einsum("qak,eai->eqik", slopes, nodes[elements])
@@ -108,7 +110,8 @@ def stress_loads(nodes: Floats, elements: Ints, stress: Field, order: int = 4) -
 def surface_loads(
     nodes: Floats, faces: Ints, traction: Callable[[Floats, Floats], Floats], order: int = 4
 ) -> Floats:
-    """Nodal loads (3n,) of tractions (k, 3), Pa, at points (k, 3) with unit normals (k, 3)."""
+    """Integrate the nodal loads (3n,) of tractions (k, 3), Pa, at points (k, 3) with normals (k,
+    3)."""
     points, weights = triangle_rule(order)
     values, slopes = face_shapes(points)
     places = np.einsum("qa,fai->fqi", values, nodes[faces])
@@ -125,7 +128,7 @@ def surface_loads(
 
 
 def pressure_loads(nodes: Floats, faces: Ints, pressure: float) -> Floats:
-    """Nodal loads (3n,) of a pressure on outward faces."""
+    """Integrate the nodal loads (3n,) of a pressure on outward faces."""
     return surface_loads(nodes, faces, lambda _, normals: -pressure * normals)
 
 
@@ -136,9 +139,9 @@ def relative_errors(
     exact_gradient: Field,
     material: tuple[float, float],
 ) -> tuple[float, float]:
-    """Errors in the L2 norm and in that of the (linear elastic) energy, over the exact field's.
+    """Return the relative errors in the L2 norm and in that of the (linear elastic) energy.
 
-    solid: nodes (n, 3), elements (e, 10).  displacement (n, 3).  material: Lame's constants.
+    solid: nodes (n, 3), elements (e, 10). displacement (n, 3). material: Lame's constants.
     """
     nodes, elements = solid
     points, weights = tetrahedron_rule(5)
@@ -168,8 +171,7 @@ def relative_errors(
 
 
 def rate(sizes: list[float], errors: list[float]) -> float:
-    """Return the power with which errors fall with the elements' size: a line's slope through
-    all."""
+    """Return the convergence rate: the slope of a line through all points, in logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
 
 

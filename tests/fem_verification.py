@@ -1,11 +1,10 @@
-"""Record what the soft body was verified against, and print the table of the findings.
+"""Record the verification of the soft body, and print the table of the results.
 
-    OPENBLAS_NUM_THREADS=1 python -m tests.fem_verification
+OPENBLAS_NUM_THREADS=1 python -m tests.fem_verification
 
-runs tests/test_fem_verify_*.py and prints a Markdown table, a row for each finding;
-docs/soft-body-verification.md holds it. A test records its measurements with `at_most`, `between`
-or `near`, which also assert them. It names its source in the last paragraph of its docstring, after
-"Source:".
+This runs tests/test_fem_verify_*.py and prints a Markdown table with one row per result, for
+docs/soft-body-verification.md. A test records its measurements with `at_most`, `between` or `near`,
+which also assert them. The last paragraph of its docstring names the source after "Source:".
 """
 
 from __future__ import annotations
@@ -36,14 +35,15 @@ def between(record: Record, what: str, measured: float, low: float, high: float)
 
 
 def near(record: Record, what: str, measured: float, wanted: float, relative: float) -> None:
-    """Record a value beside the expected one."""
+    """Record a value with the expected one. Raises AssertionError unless it is within
+    `relative`."""
     record(KEY, (what, f"{measured:.5g}", f"{wanted:.5g} ± {100 * relative:.2g} %"))
     error = abs(measured / wanted - 1.0)
     assert error <= relative, f"{what}: {measured:.6g}, wanted {wanted:.6g}, off by {error:.3g}"
 
 
 class _Table:
-    """Rows of the findings of a pytest run."""
+    """Rows of the results of a pytest run."""
 
     def __init__(self) -> None:
         self.rows: list[str] = []

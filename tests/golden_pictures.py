@@ -35,14 +35,14 @@ SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 SHAPES = ("box", "cylinder", "ellipsoid", "organ", "plane", "sphere")
 MODES: tuple[StereoMode, ...] = ("side_by_side", "top_bottom", "frame_sequential", "anaglyph")
 SHARE = 0.4
-"""Fraction of the projector's pixels per side."""
+"""Scale of the projector's width and height."""
 
 TILTED = transform(rotation_from_vector([0.35, -0.25, 0.0]), np.array([0.0, 0.005, 0.0]))
 TIP = (TILTED @ [0.015, -0.01, -0.025, 1.0])[:3]
 
 
 def small_scene(name: str, **appearance: object) -> Scene:
-    """A scene with fewer pixels and perhaps another appearance."""
+    """Make a scene with fewer pixels and optionally another appearance."""
     scene = load_scene(SCENES / f"{name}.yaml")
     projector, lens = scene.projector, scene.projector.lens
     sizes = {key: SHARE * getattr(lens, key) for key in ("fx_px", "fy_px")}
@@ -65,7 +65,7 @@ def small_scene(name: str, **appearance: object) -> Scene:
 def draw(
     context: moderngl.Context, scene: Scene, display: Display, sheet: SheetPose | None = None
 ) -> Image:
-    """A dented object with both its marks."""
+    """Render a deformed object with both its marks."""
     sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
     dented = display.correction == "two_pass" and sheet.pushed_point is not None
     stage = SceneRenderer(scene, context, spacing_m=0.004, basis=few_dents() if dented else None)
@@ -116,7 +116,7 @@ def _texture(**appearance: object) -> Case:
 
 
 def _test_card() -> Image:
-    """Four colours and a white frame."""
+    """Draw four colours and a white frame."""
     image = np.full((64, 96, 3), 255, np.uint8)
     image[4:32, 4:48], image[4:32, 48:92] = (200, 40, 40), (40, 160, 60)
     image[32:60, 4:48], image[32:60, 48:92] = (50, 70, 200), (220, 190, 50)

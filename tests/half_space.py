@@ -1,4 +1,4 @@
-"""A piece of a half-space, its elements small about the origin of its surface, for tests."""
+"""Mesh a piece of a half-space with small elements at the origin of its surface, for tests."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ Ints = NDArray[np.int64]
 def half_space(
     *, half_width: float, smallest: float, fine_radius: float, growth: float, whole: bool
 ) -> tuple[Floats, Ints]:
-    """Nodes and elements of a block, `half_width` to each side and deep, its top at z = 0: edges
-    of `smallest` within `fine_radius` of the origin, then in proportion to the distance.
+    """Return nodes and elements of a block of `half_width` to each side and in depth, with its top
+    at z = 0.
 
-    growth: longest edge over the distance from the origin.  whole: all four quarters about the z
-    axis, or the one with x, y >= 0 only.
+    The edge length is `smallest` within `fine_radius` of the origin, then proportional to the
+    distance.
+
+    growth: longest edge over the distance from the origin.
+
+    whole: all four quarters about the z axis, instead of x, y >= 0 only.
     """
     vertices, tetrahedra = make_lattice((1, 1, 1))
     inside = vertices[:, 2] <= 0

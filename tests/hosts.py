@@ -1,4 +1,4 @@
-"""Hosts with keys, for tests: their secret files and rings in a folder."""
+"""Create hosts with keys for tests: secret files and rings in a folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexsheet.messages.security import (
 
 
 class Hosts:
-    """Key pairs of named hosts; `ring` is what a host's processes have, `stranger` is in none."""
+    """Key pairs of named hosts; `ring` is that of a host's processes, `stranger` is in no ring."""
 
     def __init__(self, folder: Path, *names: str) -> None:
         self.folder, self.names = folder, names
@@ -39,8 +39,7 @@ class Hosts:
         return public
 
     def write_ring(self, name: str) -> Path:
-        """What a host's processes read.  A stranger stands in his own beside the others, not in
-        theirs."""
+        """Write the ring of a host's processes; a stranger's ring also contains its own key."""
         file = self.folder / f"keys-{name}.json"
         public = (
             self.public
@@ -56,7 +55,7 @@ class Hosts:
 
 @contextmanager
 def hosts(*names: str) -> Iterator[Hosts]:
-    """Hosts in a folder with a short path."""
+    """Create hosts in a folder with a short path."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     try:
         yield Hosts(folder, *names)

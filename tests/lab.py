@@ -1,7 +1,8 @@
-"""A lab of three computers: namespaces at a bad switch, each with its own launcher and keys.
+"""Simulate a lab of three computers: network namespaces at a faulty switch, with launchers and
+keys.
 
-What runs is `launch/three.yaml` by the `flexsheet` command, as in a lab; the test looks on through
-the launchers' ipc sockets, which lie in this file system, and reads the bags afterwards.
+The `flexsheet` command runs `launch/three.yaml`. The test monitors it by the launchers' ipc
+sockets, which are in this file system, and reads the bags afterwards.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ SETTINGS = ROOT / "launch" / "systemd" / "90-flexsheet.conf"
 HOSTS = ("main", "left", "right")
 ADDRESS = {name: f"10.77.0.{number}" for number, name in enumerate(HOSTS, start=1)}
 LIGHT = ("fem_solver", "renderer")
-"""What is seen is not what these tests are about; a busy computer is better off without."""
+"""Nodes that these tests omit, to reduce the load of a busy computer."""
 
 FINGER_PATH = "twin/finger_path"
 STROKES = "strokes"
 STROKE_S = 3.0
-"""Each way, 60 degrees.  Arms that hear of one another late part the further the faster it is: at
-half of this time, on bad cables, by more than their sheet may be twisted, and that is a fault."""
+"""Duration of a stroke over 60 degrees. With delayed messages the arms' distance error grows with
+speed; half of this time on bad cables would exceed the allowed twist of the sheet."""
 STROKE_POINTS_HZ = 25
 
 
 def missing() -> str | None:
-    """Why there can be no such lab here, or None."""
+    """Return the reason why such a lab cannot run here, or None."""
     name = f"fs{os.getpid()}-try"
     try:
         _ip("netns", "add", name)
@@ -68,7 +69,8 @@ def missing() -> str | None:
 
 
 class Network:
-    """Namespaces named after computers, at a switch whose cables can be spoilt; while entered.
+    """Network namespaces named after computers, at a switch with configurable cables; a context
+    manager.
 
     addresses: of each computer, in one /24.
     """
@@ -106,7 +108,7 @@ class Network:
             _ip("netns", "del", self.space(name))
 
     async def cable(self, host: str, **values: Any) -> None:
-        """Set what the cable of a computer does to frames; nothing: it is a good one."""
+        """Set delay, loss and cut of a computer's cable; none for a good cable."""
         assert self._switch.stdin is not None
         assert self._switch.stdout is not None
         self._switch.stdin.write(json.dumps({self.space(host): values}).encode() + b"\n")
@@ -115,7 +117,8 @@ class Network:
 
 
 def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
-    """Strokes around the scene's cylinder, back and forth without a rest; they end at the top."""
+    """Make strokes around the scene's cylinder, back and forth without a rest, ending at the
+    top."""
     times = np.linspace(0.0, count * STROKE_S, round(count * STROKE_S * STROKE_POINTS_HZ) + 1)
     angles = 0.5 * STROKE_ANGLE_RAD * (1.0 - np.cos(np.pi * times / STROKE_S))
     radius = require_cylinder(scene).radius_m
@@ -131,10 +134,9 @@ def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
 
 
 class Lab:
-    """Use as an async context manager; skips the test where it cannot be.
+    """Lab of three computers; an async context manager that skips the test if it cannot run.
 
-    without: nodes that are left out.  arming, bridge: parameters of both bridges.
-    watchdog_s: of both arms.
+    without: nodes to omit. arming, bridge: parameters of both bridges. watchdog_s: of both arms.
     """
 
     def __init__(
@@ -224,7 +226,7 @@ class Lab:
         return ["ip", "netns", "exec", self.network.space(host), *flexsheet, *arguments]
 
     def start(self, *hosts: str, launch_file: Path | None = None) -> None:
-        """`flexsheet launch` on those hosts, by default of the lab's own file."""
+        """Run `flexsheet launch` on those hosts, by default with the lab's launch file."""
         for host in hosts:
             log = (self.folder / f"{host}.log").open("ab")
             self.launchers[host] = subprocess.Popen(
@@ -234,7 +236,7 @@ class Lab:
             log.close()
 
     async def run(self, host: str, *arguments: str) -> tuple[int, str]:
-        """Run a command there; its exit code and words."""
+        """Run a command on a host; return its exit code and output."""
         process = await asyncio.create_subprocess_exec(
             *self.command(host, *arguments), env=self._environment(host), cwd=self.folder,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -244,7 +246,7 @@ class Lab:
         return process.returncode, output.decode()
 
     async def cable(self, host: str, **values: Any) -> None:
-        """See `Network`."""
+        """Set the cable of a host, see `Network`."""
         await self.network.cable(host, **values)
 
     def run_directory(self, host: str) -> Path | None:
@@ -258,7 +260,7 @@ class Lab:
         return load_graph(self.launch_file)
 
     async def watch(self, host: str, *topics: str) -> None:
-        """Take what a host's own writers of these topics say, as soon as its launcher runs."""
+        """Subscribe to a host's writers of these topics, as soon as its launcher runs."""
         process = self.launchers[host]
         known = self._subscribers.pop(host, [])
         for subscriber in known:
@@ -302,7 +304,7 @@ class Lab:
                 subscriber.close()
 
     async def start_all(self) -> None:
-        """All three up, and both arms with their bridges heard of."""
+        """Start all three hosts, and wait for the states of both arms."""
         self.start(*HOSTS)
         for host in HOSTS:
             await self.watch_usual(host)
@@ -312,13 +314,13 @@ class Lab:
         await self.watch(host, "host", *arm)
 
     def stroke(self) -> None:
-        """From now on the finger strokes, whatever is killed and started again."""
+        """Make the finger stroke continuously from now on, also after restarts."""
         self._stroking = asyncio.create_task(self._stroke(), name="strokes")
 
     async def _stroke(self) -> None:
-        """Tell it so in each run of the main computer, and whenever it is through.
+        """Send the path in each run of the main computer, and after each end.
 
-        A twin that is restarted within a run takes the path again by itself, which is latched.
+        A simulator that is restarted within a run receives the latched path again.
         """
         plan = self.plan()
         scene = plan.scene_message()
@@ -346,7 +348,7 @@ class Lab:
                 writer.close()
 
     def strokes(self) -> bool:
-        """Return whether the true finger is under way."""
+        """Return whether the true finger moves."""
         finger = self.newest.get("twin/finger")
         return (
             isinstance(finger, TwinFinger)
@@ -360,7 +362,7 @@ class Lab:
         return found if isinstance(found, HostStatus) else None
 
     def pid_of(self, host: str, node: str) -> int:
-        """A node's process: its command line names its configuration, in the run's directory."""
+        """Return the process ID of a node, by its configuration's path in the command line."""
         directory = self.run_directory(host)
         assert directory is not None
         wanted = str(directory / f"{node}.json").encode()
@@ -373,7 +375,7 @@ class Lab:
         raise AssertionError(f"{node} does not run on {host}")
 
     def restarts(self, host: str, node: str) -> int:
-        """How often it has been restarted; -1 while it is not ready."""
+        """Return the number of restarts of a node; -1 while it is not ready."""
         status = self.status(host)
         found = [one for one in status.nodes if one.name == node] if status else []
         return found[0].restarts if found and found[0].state == "ready" else -1
@@ -413,7 +415,8 @@ def _only_data(folder: str, names: list[str]) -> list[str]:
 
 
 async def _ends(process: subprocess.Popen[bytes]) -> bool:
-    """Whether a process ends by itself; it is killed after DEADLINE_S, and its nodes follow it."""
+    """Wait for a process to end; return False if it was killed, with its nodes, after
+    DEADLINE_S."""
     try:
         await asyncio.to_thread(process.wait, DEADLINE_S)
     except subprocess.TimeoutExpired:

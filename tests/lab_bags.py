@@ -1,6 +1,6 @@
-"""What the bags of a lab tell: true joints, what bridges said, what was wanted, what is lost.
+"""Read the bags of a lab: true joints, bridge states, targets and missing messages.
 
-All stamps are of one clock, that of the computer whose namespaces play a lab.
+All stamps are of one clock, that of the computer with the namespaces.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 Span = tuple[int, int]
-"""Begin and end, ns."""
+"""Start and end, ns."""
 
 SILENT_NS = 100_000_000
-"""Who says nothing for so long follows nothing, and nobody knows where his arm is."""
+"""Maximum age of a state of a bridge that counts as following."""
 SPEED_OVER_S = 0.05
-"""Commands are compared over so long: single ones are stamped when the computer comes to it."""
+"""Interval over which commands are compared, since a busy computer stamps single ones late."""
 MOMENT_NS = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """An arm by its own computer's bags.
+    """Records of an arm in the bags of its computer.
 
-    times_ns (n,), joints_rad (n, 6), edges_world_m (n, 3): the truth, its epochs (n,) those of the
-    twin's starts.  said_ns (m,), modes (m,): what the bridge said.  sent_ns (m,), commanded_rad
-    (m, 6): what it told the arm last.
+    times_ns (n,), joints_rad (n, 6), edges_world_m (n, 3): truth, with its epochs (n,) of the
+    simulator's starts. said_ns (m,), modes (m,): published by the bridge. sent_ns (m,),
+    commanded_rad (m, 6): last command to the arm.
     """
 
     times_ns: Times
@@ -50,16 +50,16 @@ class Arm:
     commanded_rad: Floats
 
     def between(self, span: Span) -> Floats:
-        """The true joints (k, 6) in a time."""
+        """Return the true joints (k, 6) in a time span."""
         return self.joints_rad[(self.times_ns >= span[0]) & (self.times_ns <= span[1])]
 
     def turned_rad(self, span: Span) -> float:
-        """How far that joint turned which turned most; 0 where the truth is not known."""
+        """Return the maximum rotation of a joint in a time span, rad; 0 if the truth is unknown."""
         joints = self.between(span)
         return float(np.ptp(joints, axis=0).max()) if len(joints) else 0.0
 
     def spans(self, mode: str) -> list[Span]:
-        """When it was in a mode, from each first word of it to the last without a silence."""
+        """Return the time spans of a mode, without silent periods."""
         spans = []
         begin: int | None = None
         for i, (at_ns, said) in enumerate(zip(self.said_ns, self.modes, strict=True)):
@@ -72,13 +72,13 @@ class Arm:
         return spans if begin is None else [*spans, (begin, int(self.said_ns[-1]))]
 
     def follows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Return whether its bridge said so, and not too long ago."""
+        """Return whether the bridge reported following, within SILENT_NS."""
         newest = np.searchsorted(self.said_ns, times_ns, side="right") - 1
         fresh = (newest >= 0) & (times_ns - self.said_ns[newest] <= SILENT_NS)
         return np.asarray(fresh & (self.modes[newest] == "follow"), dtype=np.bool_)
 
     def knows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Return whether the truth is on record, just before and just after."""
+        """Return whether the truth is recorded just before and just after these times."""
         after = np.searchsorted(self.times_ns, times_ns)
         inside = (after > 0) & (after < len(self.times_ns))
         after = after.clip(1, len(self.times_ns) - 1)
@@ -86,15 +86,15 @@ class Arm:
         return np.asarray(inside & near, dtype=np.bool_)
 
     def edge_at(self, times_ns: Times) -> Floats:
-        """The middle of its edge of the sheet (k, 3)."""
+        """Return the middle of the arm's edge of the sheet (k, 3)."""
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
         return np.column_stack([np.interp(x, xp, column) for column in self.edges_world_m.T])
 
     def fastest(self) -> float:
-        """The largest share of the maker's speeds, of the true joints and of the commands.
+        """Return the maximum ratio to the manufacturer's speeds, of true joints and of commands.
 
-        From one start of the twin to the next no arm has moved, another one was put there.
+        Motions across a restart of the simulator are excluded.
         """
         steps_s = np.diff(self.times_ns) * 1e-9
         same = (np.diff(self.epochs) == 0) & (steps_s > 0)
@@ -115,13 +115,13 @@ class Arm:
         return float((speeds[steps_s < 2 * SPEED_OVER_S] / SPEED_RAD_PER_S).max(initial=0.0))
 
     def leaves_range(self) -> bool:
-        """Return whether a joint was ever where the maker allows none."""
+        """Return whether a joint was ever outside its range."""
         low, high = RANGE_RAD.T
         return bool(((self.joints_rad < low) | (self.joints_rad > high)).any())
 
 
 def bags(folder: Path, host: str) -> list[Path]:
-    """A host's bags, in the order of their making."""
+    """Return a host's bags, in the order of creation."""
     return sorted(folder.glob(f"{host}*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
 
 
@@ -132,7 +132,7 @@ def _all(folder: Path, host: str, *topics: str) -> Iterator[tuple[str, Message, 
 
 
 def read_arm(folder: Path, side: str, scene: Scene) -> Arm:
-    """All that a lab's bags have of an arm."""
+    """Read the records of an arm from a lab's bags."""
     mount = (scene.arms.left if side == "left" else scene.arms.right).flange_from_edge
     flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
     truth: list[tuple[int, Floats, Floats, int]] = []
@@ -163,7 +163,8 @@ def read_arm(folder: Path, side: str, scene: Scene) -> Arm:
 
 
 def wanted(folder: Path) -> tuple[Times, Floats]:
-    """When (n,) and where (n, 3) the sheet's centre was to be, by the main computer's bags."""
+    """Return the times (n,) and positions (n, 3) of the sheet's target from the main computer's
+    bags."""
     found = [
         (message.valid_at_ns, message.world_from_sheet[:3, 3])
         for _, message, _ in _all(folder, "main", "sheet_target")
@@ -175,10 +176,10 @@ def wanted(folder: Path) -> tuple[Times, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """How the sheet was held in a time.
+    """Positioning of the sheet in a time span.
 
-    errors_m (k,): from where its centre was wanted to where the true arms had it, at each target of
-    that time whether they followed or not.  followed: share of the time in which both did.
+    errors_m (k,): distance of the true sheet centre from each target. followed: fraction of the
+    time in which both arms followed.
     """
 
     errors_m: Floats
@@ -189,7 +190,7 @@ class Held:
 
 
 def held(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> Held:
-    """See `Held`."""
+    """Compute the positioning of the sheet in a time span."""
     left, right = arms
     times, centres = targets
     keep = (times >= span[0]) & (times <= span[1]) & left.knows(times) & right.knows(times)
@@ -204,9 +205,9 @@ def held(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> He
 
 @dataclass(frozen=True, slots=True, order=True)
 class Gap:
-    """Messages of one writer that are missing in the main computer's bags, by their numbers.
+    """Gap in one writer's messages in the main computer's bags, by sequence numbers.
 
-    from_ns, to_ns: when the last before and the first after them were published.
+    from_ns, to_ns: publication of the last message before and of the first after it.
     """
 
     seconds: float
@@ -217,7 +218,7 @@ class Gap:
 
 
 def gaps(folder: Path) -> list[Gap]:
-    """What a writer did not say because it had been killed is not missing."""
+    """Find the gaps; a restart of a killed writer is none."""
     last: dict[tuple[str, str, str, int], Header] = {}
     found = []
     for topic, _, header in _all(folder, "main"):

@@ -1,4 +1,4 @@
-"""Tiny nodes for the tests of launcher and command line; named "tests.launch_nodes:Class"."""
+"""Define small nodes for the tests of launcher and command line, "tests.launch_nodes:Class"."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BeaconParameters(NodeParameters):
 
 
 class FingertipSource(Node):
-    """Publishes a fingertip at rest, 50 times a second."""
+    """Publish a fingertip at rest at 50 Hz."""
 
     parameters: BeaconParameters
     fingertip: Output[Fingertip]
@@ -40,7 +40,7 @@ class FingertipSource(Node):
 
 
 class Beacon(Node):
-    """Publishes a finger that counts; told how to misbehave by its parameters."""
+    """Publish a numbered finger; parameters select a misbehaviour."""
 
     parameters: BeaconParameters
     twin__finger: Output[TwinFinger]
@@ -82,7 +82,7 @@ class RelayParameters(NodeParameters):
 
 
 class Relay(Node):
-    """Publishes at its rate how old the newest finger is, and whether chance has a say."""
+    """Publish the age of the newest finger at a rate, and optionally random values."""
 
     parameters: RelayParameters
     twin__finger: Input[TwinFinger]
@@ -96,7 +96,7 @@ class Relay(Node):
 
 
 class Listener(Node):
-    """Says an e-stop, once, when the finger has come far enough."""
+    """Publish one e-stop when the finger has reached a distance."""
 
     parameters: NodeParameters
     twin__finger: Input[TwinFinger]
@@ -117,7 +117,7 @@ class StandInBridgeParameters(NodeParameters):
 
 
 class StandInBridge(Node):
-    """Publishes an arm that follows until it is stopped; hangs while a file exists."""
+    """Publish an arm that follows until it is stopped; hang while a file exists."""
 
     opens_devices: ClassVar[bool] = True
     parameters: StandInBridgeParameters

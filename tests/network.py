@@ -1,4 +1,4 @@
-"""Cables that can be cut: a TCP relay on the loopback, and computers at a switch."""
+"""Simulate cables that can be cut: a TCP relay on loopback, and computers at a switch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 class Cut:
-    """Relays every connection to a port; `half_open` swallows what is sent, both ways."""
+    """TCP relay to a port; `half_open` discards data in both directions."""
 
     def __init__(self, target_port: int) -> None:
         self.half_open = False
@@ -33,7 +33,7 @@ class Cut:
         await self._server.wait_closed()
 
     def close_all(self) -> None:
-        """Reset every connection, as when a plug is drawn at a switch."""
+        """Reset every connection."""
         for writer in self._writers:
             writer.transport.abort()
 
@@ -59,9 +59,10 @@ class Cut:
 
 
 class Computers:
-    """Computers at one switch: network namespaces of this machine, whose cables can be drawn.
+    """Network namespaces as computers at one switch, whose cables can be unplugged.
 
-    Needs the right to make such namespaces; `missing` says what is not there, or None.
+    This requires permission to create namespaces; `missing` returns the reason if it fails, or
+    None.
     """
 
     def __init__(self, *names: str) -> None:
@@ -105,7 +106,7 @@ class Computers:
         _ip("-n", space, "link", "set", "eth", "up")
 
     def power_cut(self, name: str, *processes: subprocess.Popen[bytes]) -> None:
-        """All that a computer has and does is gone at once, and nobody is told."""
+        """Remove a computer with its processes without notice to the others."""
         self.plug(name, into_switch=False)
         for process in processes:
             process.kill()
@@ -114,15 +115,15 @@ class Computers:
         _ip("netns", "del", self._space(name))
 
     def boot(self, name: str) -> None:
-        """The computer is up again after a power cut, at its cable and address."""
+        """Restart a computer after a power cut, with its cable and address."""
         self._set_up(name)
 
     def plug(self, name: str, *, into_switch: bool) -> None:
-        """Draw a computer's cable, or put it in again."""
+        """Unplug a computer's cable, or plug it in again."""
         _ip("-n", self._switch, "link", "set", name, "up" if into_switch else "down")
 
     def start(self, name: str, *arguments: str, ahead_s: int = 0) -> subprocess.Popen[bytes]:
-        """Run this Python with those arguments on a computer, whose clock is that much ahead."""
+        """Run this Python with those arguments on a computer, whose clock is ahead by `ahead_s`."""
         command = ["ip", "netns", "exec", self._space(name)]
         if ahead_s:
             # Of a process of its own, which is why `end` speaks to a group of them.
@@ -136,7 +137,7 @@ class Computers:
 
     @staticmethod
     def end(process: subprocess.Popen[bytes]) -> None:
-        """Ask what runs on a computer to end."""
+        """Terminate a process on a computer, and wait for its end."""
         os.killpg(process.pid, signal.SIGTERM)
 
     def _space(self, name: str) -> str:

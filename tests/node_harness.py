@@ -15,7 +15,7 @@ C = TypeVar("C", bound=Clock)
 
 
 class NodeHarness(Generic[N, C]):
-    """Hold a node, its clock, and what it published: (topic, message, header), in order."""
+    """Node with its clock and its published messages: (topic, message, header), in order."""
 
     def __init__(
         self,

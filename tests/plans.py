@@ -1,4 +1,4 @@
-"""A plan fed by hand at the camera's rate, over any object, for tests of what the sheet does."""
+"""Run a planner step by step at the camera's rate, over any object, for tests of the sheet."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def scene_with(
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
-    """The paper's scene with another object, by default in the world's own frame."""
+    """Return the paper's scene with another object, by default in the world frame."""
     text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
     values: dict[str, Any] = YAML(typ="safe").load(text)
     values["object"] |= {
@@ -41,7 +41,7 @@ def scene_with(
 
 
 class Desk:
-    """A plan about a scene's object; fingers and answers in the object's frame."""
+    """Planner for a scene's object; fingers and results are in the object's frame."""
 
     def __init__(self, scene: Scene, **parameters: float) -> None:
         self.given = PlannerParameters(**parameters)
@@ -54,7 +54,7 @@ class Desk:
         self.home = self.plan.motion
 
     def see(self, finger: Floats, velocity: Floats = STILL) -> PlannedStep:
-        """The sheet's next step for a finger (3,) with a velocity (3,)."""
+        """Return the next step for a finger (3,) with a velocity (3,)."""
         planned = self.plan.follow_finger(
             apply(self.world_from_object, finger),
             self.world_from_object[:3, :3] @ velocity,
@@ -65,28 +65,29 @@ class Desk:
         return planned
 
     def lose(self) -> PlannedStep:
-        """The next step when nothing is known of the finger."""
+        """Return the next step without a finger."""
         planned = self.plan.hold("fingertip_invalid", STEP_S)
         self.seen.append(planned)
         return planned
 
     def rest(self, finger: Floats, steps: int = 150) -> PlannedStep:
-        """The finger still there for so many steps."""
+        """Keep the finger at a position for a number of steps."""
         for _ in range(steps):
             planned = self.see(finger)
         return planned
 
     def follow(self, fingers: Floats) -> list[PlannedStep]:
-        """Along fingers (n, 3), one a step, that move evenly enough for their differences."""
+        """Follow fingers (n, 3), one per step, with velocities from their differences."""
         velocities = np.gradient(fingers, STEP_S, axis=0)
         return [self.see(*one) for one in zip(fingers, velocities, strict=True)]
 
     def object_from_sheet(self, planned: PlannedStep) -> Floats:
-        """Where the sheet is planned to be, (4, 4)."""
+        """Return the planned pose of the sheet, (4, 4)."""
         return np.asarray(inverse(self.world_from_object) @ planned.motion.world_from_sheet)
 
     def assert_bounded(self) -> None:
-        """No step so far was faster, sharper or jerkier than the parameters allow."""
+        """Assert that all steps were within the parameters' limits of speed, acceleration and
+        jerk."""
         sheets = [self.home, self.home, self.home, *(planned.motion for planned in self.seen)]
         rates = np.array(
             [

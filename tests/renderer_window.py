@@ -171,7 +171,7 @@ async def test_a_closed_window_leaves_the_renderer_drawing_unseen(bench: WindowB
     assert CLOSED in bench.node.note
 
 
-async def test_a_lost_context_is_made_anew(bench: WindowBench, display: VirtualDisplay) -> None:
+async def test_a_lost_context_is_created_again(bench: WindowBench, display: VirtualDisplay) -> None:
     await bench.draw("mono")
     screen = bench.node._output
     assert isinstance(screen, ProjectorWindow)
@@ -220,7 +220,7 @@ async def test_a_monitor_that_is_not_there_is_named_with_those_that_are(
     await bench.node.close()
 
 
-def test_without_a_display_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_the_error_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     glfw.terminate()
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -1,4 +1,4 @@
-"""The mesh of every shape that a scene can have, coarse, for tests."""
+"""Mesh every shape of a scene coarsely, for tests."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from flexsheet.nodes.fem_solver.mesh import SolidMesh, mesh_scene
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = {"plane": 0.0075}
-"""Between skin nodes; 0.006 of other shapes."""
+"""Spacing of skin nodes; 0.006 for other shapes."""
 SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
 
 
 def geometry(shape: str) -> dict[str, Any]:
-    """An object of this shape, a hand's size or less."""
+    """Return an object of this shape, of a hand's size or smaller."""
     match shape:
         case "cylinder":
             return {"shape": shape, "radius_m": 0.0353553, "length_m": 0.06}

@@ -1,4 +1,4 @@
-"""A short session as a bag, for the tests of reports: a stroke, and what can go wrong beside it."""
+"""Write a short session as a bag for the tests of reports: a stroke with several events."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ START_NS = 7_000_000_000_000
 RATE_HZ = 50
 STROKE_S = 1.0
 OFF_M, TURNED_RAD = 2e-4, 3e-3
-"""By so much the sheet is wrong, all the time."""
+"""Constant position and rotation error of the sheet."""
 
 LATENCY_S = 0.008
 FAULT_S, ESTOP_S, SILENCE_S, BOOKMARK_S = 2.0, 2.1, (1.0, 1.8), 1.5
@@ -69,7 +69,7 @@ def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetT
 
 
 def sheet_at(angle_rad: float) -> Floats:
-    """The tangent plane at that angle around the cylinder, a little off and turned."""
+    """Return the tangent plane at that angle around the cylinder, with the error."""
     solid = SCENE.object
     pose = solid.world_from_object
     turn = rotation_from_vector(np.array([-angle_rad - TURNED_RAD, 0.0, 0.0]))
@@ -94,20 +94,20 @@ def finger_at(angle_rad: float) -> Floats:
 
 
 class Desk:
-    """Writes messages with their headers."""
+    """Writer of messages with their headers."""
 
     def __init__(self, writer: BagWriter, leave_out: Collection[str]) -> None:
         self._writer, self._leave_out = writer, leave_out
         self._sequences: dict[str, int] = {}
 
     def skip(self, topic: str) -> None:
-        """A message that never reached the recorder."""
+        """Skip the sequence number of a message that never reached the recorder."""
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
 
     def write(
         self, topic: str, message: Message, seconds: float, *, age_s: float = 0.0, writer: str = "n"
     ) -> None:
-        """Recorded at `seconds`, of something that was `age_s` before."""
+        """Write a message at `seconds`, with a source stamp `age_s` before."""
         self.skip(topic)
         if topic in self._leave_out:
             return
@@ -118,7 +118,8 @@ class Desk:
 
 
 def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
-    """Three seconds: a stroke of one, and after it a fault, an e-stop, a marked moment, a gap."""
+    """Write three seconds: a stroke of one second, then a fault, an e-stop, a bookmark and a
+    gap."""
     begin_s, finish_s = stroke_window_s(STROKE_S)
     recording = {"clock_id": "clock", "started": "2026-11-22T10:00:00+00:00",
                  "started_ns": str(START_NS)}  # fmt: skip

@@ -1,8 +1,8 @@
-"""A switch that delays, loses and reorders: `python -m tests.switch NAMESPACE...`.
+"""Simulate a switch that delays, loses and reorders frames: `python -m tests.switch NAMESPACE...`.
 
 Each namespace gets a TAP device "eth" whose frames pass through this process, so that the kernel's
-own TCP meets what a bad network does to it; the kernel's netem is not everywhere.  A line of JSON
-on stdin, {namespace: {"delay_s", "jitter_s", "loss", "cut"}}, sets its cable from then on.
+TCP experiences a bad network. The kernel's netem is not always available. A line of JSON on stdin,
+{namespace: {"delay_s", "jitter_s", "loss", "cut"}}, sets its cable from then on.
 """
 
 from __future__ import annotations
@@ -27,8 +27,11 @@ FRAME_BYTES = 65_536
 
 @dataclass(frozen=True, slots=True)
 class Cable:
-    """delay_s: one way.  jitter_s: standard deviation of it, per frame, so that frames overtake
-    one another.  loss: share.  cut: nothing passes, and neither end is told."""
+    """Properties of a cable.
+
+    delay_s: one way. jitter_s: standard deviation per frame, so that frames are reordered. loss:
+        fraction. cut: all frames are lost without notice.
+    """
 
     delay_s: float = 0.0
     jitter_s: float = 0.0
@@ -36,14 +39,14 @@ class Cable:
     cut: bool = False
 
     def passes(self, chance: random.Random) -> float | None:
-        """How long a frame takes; None for one that is lost."""
+        """Return the delay of a frame, s; None for a lost one."""
         if self.cut or chance.random() < self.loss:
             return None
         return max(0.0, chance.gauss(self.delay_s, self.jitter_s))
 
 
 def open_tap(namespace: str) -> int:
-    """A TAP device "eth" in a network namespace; this process is in it afterwards."""
+    """Open a TAP device "eth" in a network namespace, which this process enters."""
     space = os.open(f"/run/netns/{namespace}", os.O_RDONLY)
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.setns(space, CLONE_NEWNET) != 0:
@@ -55,7 +58,7 @@ def open_tap(namespace: str) -> int:
 
 
 class Switch:
-    """Passes frames between taps, each when it is due."""
+    """Forwarder of frames between TAP devices after their delays."""
 
     def __init__(self, taps: dict[str, int]) -> None:
         self._taps = taps
@@ -85,7 +88,7 @@ class Switch:
         heapq.heappush(self._waiting, (due_s, self._number, tap, frame))
 
     def hand_out(self) -> float | None:
-        """Deliver what is due; returns the seconds until more is, None: nothing waits."""
+        """Deliver due frames; return the time until the next one, s, or None."""
         while self._waiting:
             ahead_s = self._waiting[0][0] - time.monotonic()
             if ahead_s > 0.0:

@@ -125,7 +125,7 @@ def test_the_first_command_is_the_measured_pose() -> None:
     assert (arms[0].command.joints_rad == before).all()
 
 
-def test_before_the_arm_answers_it_is_told_to_be_idle() -> None:
+def test_before_the_arm_answers_its_command_is_idle() -> None:
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     geometry = ArmGeometry(SCENE, "left")
     command = control.step(geometry, on_time(HOME), None, STEP_S)
@@ -401,7 +401,7 @@ def test_only_the_typed_watchdog_fault_restarts_the_arm(monkeypatch: pytest.Monk
         assert (arms[0].control.faults == ()) == (fault is ArmFault.WATCHDOG)
 
 
-def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_anew() -> None:
+def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_again() -> None:
     arms = pair()
     run(arms, on_time(HOME), 10)
     arms[0].control.on_measurement(arms[0].joints, (ArmFault.WATCHDOG,))
@@ -508,8 +508,8 @@ def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
     assert control.estop_reason is None
 
 
-def test_last_words_of_several_writers_may_come_in_any_order() -> None:
-    """For a restarted bridge the newest stop counts, not the one received last."""
+def test_latched_messages_of_several_writers_may_come_in_any_order() -> None:
+    """For a restarted bridge the newest stop counts, independent of the order of reception."""
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
     assert control.on_estop(stop, 30, 100) is None
@@ -569,7 +569,7 @@ def test_a_new_scene_under_a_motion_brings_both_arms_to_rest_first() -> None:
         assert arm.edge == pytest.approx(edge, abs=1e-6)
 
 
-def test_joints_on_another_branch_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_joints_on_another_branch_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     arms = pair()
     run(arms, on_time(HOME), 60)
     monkeypatch.setattr(
@@ -581,7 +581,7 @@ def test_joints_on_another_branch_are_refused(monkeypatch: pytest.MonkeyPatch) -
     assert "jump" in arms[0].control.faults[0]
 
 
-def test_when_somebody_has_stopped_the_other_arm_this_one_stands_and_lets_nothing_go() -> None:
+def test_when_the_other_arm_was_stopped_this_one_rests_and_keeps_the_sheet() -> None:
     arms = pair(sheet_at(stretch=1.06))
     run(arms, on_time(sheet_at(stretch=1.06)), 30)
     arms[0].control.engage_estop("button")
@@ -604,7 +604,7 @@ def test_an_age_that_is_no_number_stops() -> None:
         assert arms[0].control.mode == "idle"
 
 
-def test_another_arm_that_says_it_is_nowhere_is_not_moved_with() -> None:
+def test_an_other_arm_with_an_invalid_pose_prevents_motion() -> None:
     arms = pair()
     run(arms, on_time(HOME), 60)
     other = arms[1].as_other()
@@ -679,7 +679,7 @@ def test_poses_that_are_kept_for_a_cycle_are_those_of_the_joints_asked_for() -> 
     assert np.isfinite(geometry.world_from_flange(joints)).all()
 
 
-def test_a_slack_sheet_is_held_as_told_until_the_flanges_come_too_near() -> None:
+def test_a_slack_sheet_is_held_until_the_flanges_come_too_near() -> None:
     arms = pair()
     run(arms, on_time(sheet_at(stretch=0.97)), 400)
     assert {arm.control.mode for arm in arms} == {"follow"}
@@ -732,7 +732,7 @@ def lifted(y: float, aside_rad: float) -> SheetMotion:
     ("aside_rad", "through", "ends"),
     [(0.0, True, ""), (0.005, True, ""), (0.02, False, "jump"), (0.05, False, "")],
 )
-def test_past_the_wrists_singularity_both_go_on_together_or_both_stop(
+def test_past_the_wrists_singularity_both_continue_together_or_both_stop(
     aside_rad: float, *, through: bool, ends: str
 ) -> None:
     """J5 passes zero, or passes near it, without a fast joint or a twisted sheet."""

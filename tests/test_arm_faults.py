@@ -44,7 +44,7 @@ STOPPED = {"stopping", "relax", "idle", "fault"}
 
 @dataclass
 class Stroke:
-    """Hold a running stroke that reverses until the test ends."""
+    """Stroke in the background that reverses until the test ends."""
 
     rig: Rig
     nodes: dict[str, Any]
@@ -95,7 +95,7 @@ def to_and_fro(radius: float, seconds: float) -> Path3:
 
 
 class FalseStatus(Cut):
-    """Repeat a part of the arm's status by a proxy, with a valid CRC and echo."""
+    """Proxy that repeats a part of the arm's status with a valid CRC and echo."""
 
     REPLY_BYTES, BLOCK_AT = 61, 9
     JOINTS, COUNTERS = slice(20, 44), slice(8, 16)
@@ -213,7 +213,7 @@ async def test_an_arm_without_a_sound_answer_is_lost_and_the_other_stops(
         await stroke.goes_on()
 
 
-async def test_a_frozen_arm_is_a_fault_of_it_until_somebody_resets_it() -> None:
+async def test_a_frozen_arm_is_a_fault_until_a_reset() -> None:
     async with mid_stroke(max_tracking_error_rad=0.06) as stroke:
         stroke.suffer("frozen")
         await until(lambda: bool(stroke.reasons()))
@@ -270,7 +270,7 @@ async def test_a_connection_that_is_reset_once_is_forgiven() -> None:
         await stroke.goes_on()
 
 
-async def test_a_cable_that_swallows_everything_stops_both_and_the_arm_by_itself() -> None:
+async def test_a_cable_that_loses_everything_stops_both_arms() -> None:
     async with mid_stroke() as stroke:
         controller = stroke.nodes["twin"].servers["left"].controller
         stroke.cut.half_open = True
@@ -300,7 +300,7 @@ def without(listeners: Listeners, topics: tuple[str, ...], keep: int) -> Listene
 
 
 @pytest.mark.parametrize("topics", [("sheet_target",), ("sheet_target", "arm_left", "arm_right")])
-async def test_a_network_cut_between_the_computers_holds_then_stops_then_goes_on(
+async def test_a_network_cut_between_the_computers_holds_then_stops_then_continues(
     topics: tuple[str, ...],
 ) -> None:
     async with mid_stroke() as stroke:

@@ -1,4 +1,4 @@
-"""Planner, both bridges and the twin's arms in one loop, over real sockets on the loopback."""
+"""Test planner, both bridges and the simulated arms in one loop, over real loopback sockets."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.alone
 Floats = NDArray[np.float64]
 PATIENT: dict[str, Any] = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}
-"""A busy machine pauses for longer than an arm's computer may."""
+"""Watchdog for a busy machine, which pauses longer than an arm's computer."""
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 
 
@@ -49,7 +49,7 @@ def finger_at(position: Floats, velocity: Floats, *, valid: bool = True) -> Fing
 
 @dataclass
 class Sample:
-    """What stood at one instant: true sheet between the measured edges, and the finger."""
+    """Sample at one instant: true sheet between the measured edges, and the finger."""
 
     at_ns: int
     world_from_sheet: Floats
@@ -58,7 +58,7 @@ class Sample:
 
 @dataclass
 class Rig:
-    """All nodes of the arm's side, wired by hand; messages arrive as soon as they are sent."""
+    """All nodes of the arms, connected directly; messages arrive immediately."""
 
     scene: Scene
     clock: SystemClock = field(default_factory=SystemClock)
@@ -105,7 +105,7 @@ class Rig:
 async def running_rig(
     twin_parameters: dict[str, Any] | None = None, **bridge_parameters: Any
 ) -> AsyncIterator[tuple[Rig, dict[str, Any]]]:
-    """The planner, two bridges and the twin's arms, cycling; yields the rig and the nodes."""
+    """Run the planner, two bridges and the simulated arms; yield the rig and the nodes."""
     rig = Rig(paper_scene())
     twin = TwinArmsNode(
         TwinArmsParameters(left_port=0, right_port=0, **(PATIENT_TWIN | (twin_parameters or {}))),
@@ -172,7 +172,7 @@ async def play_finger(
     noise_m: float = 0.0,
     latency_s: float = 0.008,
 ) -> None:
-    """Feed the planner 60 fingertips a second; each is handed over `latency_s` after exposure."""
+    """Pass 60 fingertips per second to the planner, each `latency_s` after its exposure."""
     random = np.random.default_rng(5)
     loop = asyncio.get_running_loop()
     begin_s, begin_ns = loop.time(), rig.clock.now_ns()
@@ -200,7 +200,8 @@ def still(position: Floats) -> Path3:
 
 
 def stroke_path(radius: float, depth: float, seconds: float) -> Path3:
-    """From the front of the cylinder to 60 degrees in `seconds`, eased, `depth` in its skin."""
+    """Make a stroke from the front of the cylinder to 60 degrees, smoothed, `depth` within its
+    skin."""
 
     def path(at_s: float) -> Floats:
         share = min(max(at_s / seconds, 0.0), 1.0)
@@ -213,7 +214,7 @@ def stroke_path(radius: float, depth: float, seconds: float) -> Path3:
 
 @asynccontextmanager
 async def pointing(rig: Rig, planner: Planner, position: Floats) -> AsyncIterator[None]:
-    """Hold the finger there as long as the context lasts."""
+    """Keep the finger at a position until the context ends."""
     task = asyncio.create_task(play_finger(rig, planner, still(position), DEADLINE_S))
     try:
         yield
@@ -224,7 +225,7 @@ async def pointing(rig: Rig, planner: Planner, position: Floats) -> AsyncIterato
 
 
 async def both_follow(rig: Rig, planner: Planner, position: Floats) -> None:
-    """Bring the sheet to a still finger and wait until both arms follow."""
+    """Bring the sheet to a resting finger, and wait until both arms follow."""
 
     def following() -> bool:
         return all(
@@ -241,10 +242,10 @@ AT_FRONT = np.array([0.0, 0.0, -0.001])
 
 
 def presented_errors(rig: Rig, path: Path3, begin_ns: int) -> tuple[Floats, Floats]:
-    """Position (m) and angle (rad) of the sheet's presented point against the finger's, per sample.
+    """Return position (m) and angle (rad) errors of the rendered contact point per sample.
 
-    The point presented is where the measured sheet's plane touches the cylinder; the finger is
-    taken at the same instant, projected on the cylinder.
+    The contact point is where the measured sheet's plane is tangent to the cylinder; the finger at
+    the same instant is projected on the cylinder.
     """
     radius = rig.scene.object.geometry.radius_m
     distances, angles = [], []
@@ -327,7 +328,7 @@ async def test_a_fault_relaxes_the_sheet_on_both_arms() -> None:
         assert rig.newest("right").faults == ()
 
 
-async def test_a_bridge_that_ends_tells_its_arm_to_stop() -> None:
+async def test_a_bridge_that_ends_commands_its_arm_to_stop() -> None:
     async with running_rig() as (rig, nodes):
         await both_follow(rig, nodes["planner"], AT_FRONT)
         controllers = [server.controller for server in nodes["twin"].servers.values()]

@@ -199,7 +199,7 @@ def test_no_arm_leaps_by_a_false_measurement(reading: Callable[[ServoArm], Readi
     assert {arm.control.mode for arm in arms} == {"follow"}, [arm.control.reason for arm in arms]
 
 
-def test_a_frozen_measurement_is_a_fault_that_says_so() -> None:
+def test_a_frozen_measurement_is_a_named_fault() -> None:
     arms = servo_pair()
     time_s = stroke(arms, 1.2)
     arms[0].reading = frozen(arms[0])
@@ -289,7 +289,7 @@ def test_counters_of_answers_that_came_late_are_not_stalled() -> None:
         assert found == Freshness.FRESH
 
 
-def test_counters_that_go_on_are_fresh_also_over_their_end() -> None:
+def test_counters_that_continue_are_fresh_also_over_their_end() -> None:
     monitor, found = CounterMonitor(), []
     for number in range(6):
         counters = ((2**32 - 30_000 + 10_000 * number) % 2**32, number)
@@ -307,7 +307,7 @@ def test_counters_that_stand_still_are_repeated_then_stalled() -> None:
         assert classify(monitor, (9, 9), late_ns + MS, may_restart=True) == Freshness.FRESH
 
 
-def test_a_measurement_time_that_goes_on_without_cycles_is_stalled_too() -> None:
+def test_a_measurement_time_that_continues_without_cycles_is_stalled_too() -> None:
     monitor = CounterMonitor()
     found = [
         classify(monitor, (number, 3), number * 10 * MS, may_restart=False) for number in range(8)

@@ -35,7 +35,7 @@ MAX_LENGTH_M = 0.24 * 1.09
 
 @dataclass
 class Watch:
-    """Hold the states that both bridges publish."""
+    """States that both bridges publish."""
 
     states: dict[str, list[ArmState]] = field(default_factory=lambda: {side: [] for side in SIDES})
     clocks: dict[str, tuple[Clocks, str]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Test that an arm moves only after a person arms it, again after each stop."""
+"""Test that an arm moves only after the user enables it, and again after each stop."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def assert_stands(arms: Arms, goal: Goal | None = GOAL, cycles: int = 250) -> No
         assert (arm.joints == place).all()
 
 
-def test_nothing_moves_before_somebody_says_so() -> None:
+def test_nothing_moves_before_arming() -> None:
     arms = unready()
     assert_stands(arms, on_time(sheet_at(0.03)))
     assert {arm.control.reason for arm in arms} == {"not ready"}
@@ -80,7 +80,7 @@ def test_without_targets_both_stop_let_go_and_stay_when_they_come_again() -> Non
     assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
 
 
-def test_a_target_that_is_missing_for_a_moment_costs_no_tension_but_the_word() -> None:
+def test_a_short_gap_of_targets_keeps_tension_but_disarms() -> None:
     arms = following()
     run(arms, NO_TARGET, round(0.5 * RELAX_DELAY_S / STEP_S))
     run(arms, GOAL, 2)
@@ -124,7 +124,7 @@ def test_an_arm_that_was_away_comes_back_standing(trouble: Callable[[Arm], None]
     assert {arm.control.mode for arm in arms} == {"follow"}
 
 
-def test_clocks_in_doubt_take_the_word_back_too() -> None:
+def test_uncertain_clocks_disarm_too() -> None:
     arms = following()
     for arm, other in (arms, arms[::-1]):
         arm.control.step(arm.geometry, GOAL, other.as_other(), STEP_S, "clocks: 9 ms apart")
@@ -150,7 +150,7 @@ def test_a_reset_alone_moves_nothing() -> None:
         assert {arm.control.mode for arm in arms} == {"follow"}
 
 
-def test_the_word_is_refused_where_it_cannot_be_meant() -> None:
+def test_arming_is_rejected_in_an_unsuitable_state() -> None:
     arms = unready()
     assert say_go(arms) == ["waiting for the arm to answer", "waiting for the arm to answer"]
     run(arms, None, 3)
@@ -184,7 +184,7 @@ def test_one_arm_alone_is_not_ready_for_long() -> None:
     assert {arm.control.mode for arm in arms} == {"idle"}
 
 
-def test_told_to_stand_down_both_stop_and_let_go() -> None:
+def test_disabled_arms_stop_and_relax_the_sheet() -> None:
     for arms in (following(), pair(sheet_at(stretch=1.06))):
         run(arms, GOAL, 60)
         for arm in arms:
@@ -203,8 +203,8 @@ EVENTS = ("no target", "silent", "lost", "watchdog", "estop", "reset", "fault", 
 
 @examples(8)
 @given(st.lists(st.sampled_from(EVENTS), min_size=1, max_size=12))
-def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list[str]) -> None:
-    """Once at rest with a slack sheet or isolated, it rests until it is armed."""
+def test_an_arm_that_is_not_ready_starts_no_motion_after_any_events(events: list[str]) -> None:
+    """At rest with a slack sheet or isolated, an arm rests until it is armed."""
     arms = following()
     goal = on_time(HOME)
     for event in events:
@@ -247,7 +247,7 @@ class CountingLink:
         self.modes.append("closed")
 
 
-async def test_an_arm_that_nobody_made_ready_hears_less_until_something_happens() -> None:
+async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -> None:
     clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
     node = ArmBridge(
         ArmBridgeParameters(side="left"),
@@ -280,7 +280,7 @@ async def test_an_arm_that_nobody_made_ready_hears_less_until_something_happens(
     await node.close()
 
 
-async def test_the_node_hears_the_word_and_says_what_it_is() -> None:
+async def test_the_node_receives_arming_and_reports_its_state() -> None:
     clock, said = VirtualClock(10**9, clock_id="here"), []
     node = ArmBridge(
         ArmBridgeParameters(side="left"),
@@ -295,7 +295,7 @@ async def test_the_node_hears_the_word_and_says_what_it_is() -> None:
     await node.close()
 
 
-def test_real_arms_need_the_word_and_the_demos_do_not() -> None:
+def test_real_arms_need_arming_and_the_demos_do_not() -> None:
     folder = SCENE_FILE.parent.parent
     for name, expected in (("lab.yaml", "manual"), ("demo.yaml", "auto")):
         nodes = load_graph(folder / name).nodes.values()

@@ -1,4 +1,4 @@
-"""`flexsheet arms stop` whatever other tools hold, and whoever does not answer."""
+"""Test `flexsheet arms stop` while other tools use the endpoint, or a process does not respond."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @dataclass
 class Graph:
-    """A launcher with two bridges that stand in for real ones."""
+    """Launcher with two substitute bridges."""
 
     launcher: subprocess.Popen[str]
     run: runs.Run
@@ -85,7 +85,7 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
 
 @pytest.fixture
 def holder(graph: Graph) -> Iterator[subprocess.Popen[bytes]]:
-    """A tool that holds the endpoint of the tools' e-stops, and stands still."""
+    """Start a tool that occupies the endpoint of the tools' e-stops and then hangs."""
     code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); "
     code += "s.listen(); print(flush=True); time.sleep(1000)"
     endpoint = graph.run.directory / "tools.estop"
@@ -124,7 +124,7 @@ def test_a_tool_that_holds_the_endpoint_does_not_hinder_a_stop(graph: Graph) -> 
 
 
 @pytest.mark.usefixtures("holder")
-def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
+def test_a_suspended_launcher_receives_a_stop(graph: Graph) -> None:
     graph.launcher.send_signal(signal.SIGSTOP)
     code, answer = stop_by_command()
     assert code == 0
@@ -133,7 +133,7 @@ def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
 
 
 @pytest.mark.usefixtures("holder")
-def test_a_bridge_that_hangs_is_stopped_when_it_goes_on(graph: Graph) -> None:
+def test_a_bridge_that_hangs_is_stopped_when_it_resumes(graph: Graph) -> None:
     graph.hangs.touch()
     code, answer = stop_by_command()
     assert code == 0
@@ -151,7 +151,7 @@ def test_without_a_graph_there_is_nothing_to_stop() -> None:
 
 
 class Sockets:
-    """Stop sockets of this process, whose loop runs while `stop_arms` is in a thread."""
+    """Stop sockets of this process, whose loop runs while `stop_arms` runs in a thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -201,7 +201,7 @@ async def test_another_user_stops_nothing(
         one.close()
 
 
-async def test_what_is_no_stop_stops_nothing_and_keeps_nobody_waiting(sockets: Sockets) -> None:
+async def test_an_invalid_request_stops_nothing_and_is_answered(sockets: Sockets) -> None:
     sockets.open("launcher", "launch")
     (file,) = sockets.folder.iterdir()
     held = []
@@ -253,7 +253,7 @@ def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path
         bridge.communicate()
 
 
-def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) -> None:
+def test_without_an_answer_the_senders_of_targets_are_killed(runs_root: Path) -> None:
     port = {"topic": "sheet_target"}
     plan = {"nodes": {"planner": {"outputs": [port]}, "camera": {"outputs": []}}}
     (runs_root / "plan.json").write_text(json.dumps(plan))
@@ -290,7 +290,7 @@ def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) 
 def test_a_stop_is_sent_before_the_command_line_is_imported(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], sent: tuple[str, str] | None
 ) -> None:
-    """With the command's own options; all else is for the command line to refuse or to explain."""
+    """The fast path handles its own options; the command line handles all others."""
     calls: list[tuple[str, str]] = []
 
     def record(directories: list[Path], reason: str) -> list[StopAttempt]:

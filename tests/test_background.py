@@ -1,4 +1,4 @@
-"""Priority of worker processes."""
+"""Test the priority of worker processes."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from flexsheet.nodes.fem_solver.precompute_table import local_processes
 
 
 def priority_in(workers: Executor) -> tuple[int, int]:
-    """Return niceness and scheduling class of a worker, which need not import this file for it.
-
-    At its priority an import takes a minute beside other tests.
-    """
+    """Return niceness and scheduling class of a worker, in a program that imports nothing of this
+    file."""
     niceness = workers.submit(os.getpriority, os.PRIO_PROCESS, 0)
     scheduling = workers.submit(os.sched_getscheduler, 0)
     return niceness.result(), scheduling.result()
 
 
-def test_a_background_process_gives_way_to_all_others() -> None:
+def test_a_background_process_has_the_lowest_priority() -> None:
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=enter_background) as workers:
         assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
 

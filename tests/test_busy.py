@@ -1,4 +1,4 @@
-"""How long nodes wait for a processor, and what is said of a computer that is busy."""
+"""Test the measured waiting time for a processor, and the reports of a busy computer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Kernel:
-    """Counters of processes as the kernel shows them in a folder, and a clock."""
+    """Counters of processes in a folder, in the kernel's format, and a clock."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.now_s = folder, 100.0
@@ -26,7 +26,7 @@ class Kernel:
         (folder / "pressure").mkdir()
 
     def let(self, name: str, pid: int, *, wait_s: float = 0.0, run_s: float = 0.0) -> None:
-        """Let a process wait and run for so long."""
+        """Let a process wait and run for some time."""
         self._waited_s[pid] = self._waited_s.get(pid, 0.0) + wait_s
         self._used_s[pid] = self._used_s.get(pid, 0.0) + run_s
         folder = self.folder / str(pid)
@@ -46,7 +46,7 @@ ARMS = {"left": 11, "right": 12}
 
 
 def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
-    """Let both arms' nodes wait for so long in each second."""
+    """Let both arms' nodes wait for some time in each second."""
     found = None
     for _ in range(seconds):
         kernel.let("python", 11, wait_s=left_s, run_s=0.3)
@@ -57,7 +57,7 @@ def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPr
     return found
 
 
-def test_the_first_look_says_nothing(kernel: Kernel) -> None:
+def test_the_first_sample_reports_nothing(kernel: Kernel) -> None:
     assert run(kernel, 1, left_s=0.9, right_s=0.9) is None
 
 
@@ -85,7 +85,7 @@ def test_what_is_long_past_does_not_count(kernel: Kernel) -> None:
     assert not found.busy
 
 
-def test_a_process_that_is_started_again_begins_anew(kernel: Kernel) -> None:
+def test_a_restarted_process_starts_from_zero(kernel: Kernel) -> None:
     run(kernel, 5, left_s=0.01, right_s=0.01)
     kernel.now_s += 1.0
     found = kernel.watch.update({"left": 11, "right": 99})
@@ -128,6 +128,6 @@ def test_where_waiting_is_not_measured_the_load_decides() -> None:
     )
 
 
-def test_a_load_of_programs_that_give_way_makes_no_computer_busy() -> None:
+def test_a_load_of_low_priority_programs_makes_no_computer_busy() -> None:
     cpu = CpuPressure(busy=False, wait_ratio=0.1, node="planner")
     assert not is_busy(host(load_ratio=8.0, cpu=cpu))

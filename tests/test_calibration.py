@@ -1,4 +1,4 @@
-"""Stereo calibration: on boards rendered here, on real pairs, and on pictures that will not do."""
+"""Test the stereo calibration with rendered boards, real pairs, and unusable images."""
 
 from __future__ import annotations
 
@@ -47,21 +47,21 @@ RIGHT_FROM_LEFT = rigid.transform(
 
 
 def rays_of(matrix: Floats) -> Floats:
-    """Where a distorted camera's pixels look."""
+    """Return the rays of a distorted camera's pixels."""
     y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float64)
     seen = camera.normalize(np.stack([x, y], axis=-1), matrix, DISTORTION)
     return np.concatenate([seen, np.ones((*seen.shape[:2], 1))], axis=-1)
 
 
 def wave(squares: Floats, square_px: Floats) -> Floats:
-    """Alternates between -1 and 1 from square to square, with ramps of a pixel in between."""
+    """Alternate between -1 and 1 from square to square, with ramps of a pixel between."""
     line = np.rint(squares)
     flipped = np.where(line % 2 == 0, 1.0, -1.0)
     return np.asarray(flipped * np.clip(2.0 * square_px * (squares - line), -1.0, 1.0))
 
 
 def render(left_from_board: Floats, rays: Floats, camera_from_left: Floats) -> NDArray[np.uint8]:
-    """A chessboard with a white rim on grey, as a camera sees it."""
+    """Render a chessboard with a white margin on grey."""
     board_from_camera = rigid.inverse(camera_from_left @ left_from_board)
     directions = rays @ board_from_camera[:3, :3].T
     origin = board_from_camera[:3, 3]
@@ -80,7 +80,8 @@ def render(left_from_board: Floats, rays: Floats, camera_from_left: Floats) -> N
 
 
 def pose(number: int) -> Floats:
-    """left_from_board number so-and-so: the board's middle in view, tilted in all directions."""
+    """Return pose `number` of left_from_board: the board's middle in view, tilted in all
+    directions."""
     generator = np.random.default_rng(number)
     tilt = generator.uniform(-0.5, 0.5, 3) * [1.0, 1.0, 0.4]
     rotation = rigid.rotation_from_rpy(tilt)
@@ -97,7 +98,7 @@ class Pictures:
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
-    """Twelve pairs of a board that was never made."""
+    """Render twelve pairs of a virtual board."""
     folder = tmp_path_factory.mktemp("boards")
     pictures = Pictures([], [])
     left_rays, right_rays = rays_of(LEFT_MATRIX), rays_of(RIGHT_MATRIX)
@@ -187,7 +188,7 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
         check_stereo(calibration, [blank], [blank], board=BOARD)
 
 
-def test_unusable_pictures_are_named(
+def test_unusable_images_are_named(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
     text, small = tmp_path / "text.png", tmp_path / "small.png"
@@ -262,7 +263,7 @@ def without(key: str) -> Callable[[str], str]:
     ],
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
 )
-def test_a_spoilt_file_is_refused(
+def test_a_spoilt_file_is_rejected(
     tmp_path: Path, calibration: StereoCalibration, spoil: Callable[[str], str], said: str
 ) -> None:
     path = tmp_path / "rig.yaml"
@@ -316,7 +317,7 @@ def test_the_joint_fit_is_the_least_squares_that_opencv_finds(rendered: Pictures
 def test_outlying_corners_are_left_out(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
-    """Three corners are painted over, so that they are found a pixel or more away."""
+    """Three corners are painted over, so that they are detected a pixel or more away."""
     image = cv2.imread(str(rendered.left[2]), cv2.IMREAD_GRAYSCALE)
     pair = found(rendered)[2]
     for x, y in np.rint(pair.left.pixels[[8, 16, 24]]).astype(int):
@@ -330,7 +331,7 @@ def test_outlying_corners_are_left_out(
     assert result.left.fx_px == pytest.approx(calibration.left.fx_px, rel=1e-3)
 
 
-def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
+def test_an_image_given_twice_counts_once(rendered: Pictures) -> None:
     order = [0, 1, 2, 3, 4, 5, 0, 1, 2]
     calibration = calibrate([rendered.left[i] for i in order], [rendered.right[i] for i in order])
     assert [pair.used for pair in calibration.pairs] == [True] * 6 + [False] * 3
@@ -340,7 +341,7 @@ def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
 
 
 def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
-    """Straight on, focal length and distance cannot be told from each other."""
+    """With frontal boards only, focal length and distance are not observable."""
     pictures = Pictures([], [])
     middle = board_points(BOARD).mean(axis=0)
     for number in range(6):
@@ -356,7 +357,7 @@ def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
         calibrate(pictures.left, pictures.right)
 
 
-def test_check_names_pictures_used_for_the_calibration(
+def test_check_names_images_used_for_the_calibration(
     rendered: Pictures, calibration: StereoCalibration
 ) -> None:
     result = check_stereo(calibration, rendered.left[7:11], rendered.right[7:11], board=BOARD)
@@ -378,7 +379,7 @@ def test_every_pair_is_left_out_once(rendered: Pictures) -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
 def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
-    """OpenCV's plain calibration of these pairs leaves 0.56 mm on pairs it has not seen."""
+    """OpenCV's calibration of these pairs has an error of 0.56 mm on other pairs."""
     left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
     board = Board(columns=9, rows=6, square_m=0.02423)
     calibration = calibrate_stereo(left[::2], right[::2], board=board, device="real").calibration
@@ -396,7 +397,7 @@ def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
 def test_real_halves_differ_by_what_they_state() -> None:
-    """Two calibrations of one rig, from different pictures, place fingertips differently."""
+    """Two calibrations of one rig from different images give different fingertips."""
     left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
     board = Board(columns=9, rows=6, square_m=0.02423)
     halves = [

@@ -1,4 +1,4 @@
-"""Boards of both kinds, printed and seen; live capture; and the commands around them."""
+"""Test both kinds of boards, live capture, and their commands."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ BOARDS = [CHESSBOARD, CHARUCO]
 
 
 def small_scene() -> dict[str, Any]:
-    """The paper's scene with a camera of a quarter of the pixels."""
+    """Return the paper's scene with a camera of a quarter of the pixels."""
     scene: dict[str, Any] = YAML(typ="safe").load(
         (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
     )
@@ -126,7 +126,7 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
         ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 contains 50"),
     ],
 )
-def test_impossible_charuco_boards_are_refused(change: dict[str, Any], said: str) -> None:
+def test_impossible_charuco_boards_are_rejected(change: dict[str, Any], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         CornerFinder(CHARUCO.model_copy(update=change))
 
@@ -183,7 +183,7 @@ def test_the_same_corner_has_the_same_number_in_both_views(camera: StereoCamera)
 
 
 def posed(turn: list[float]) -> Floats:
-    """The pose (6,) of a board so turned, its middle straight ahead."""
+    """Return the pose (6,) of a rotated board with its middle straight ahead."""
     middle = board_points(CHESSBOARD).mean(axis=0)
     rotation = rigid.rotation_from_vector(turn)
     return pose_vector(rigid.transform(rotation, np.array([0.0, 0.0, 0.5]) - rotation @ middle))
@@ -228,7 +228,7 @@ def watching(camera: StereoCamera, *, pairs: int, still_images: int) -> Capture:
     )
 
 
-def test_pair_is_taken_when_the_board_rests_at_a_new_place(camera: StereoCamera) -> None:
+def test_pair_is_taken_when_the_board_rests_at_a_new_position(camera: StereoCamera) -> None:
     first, second = shown(CHESSBOARD, camera, 2, seed=6)
     blank = (np.full_like(first[0], 60), np.full_like(first[1], 60))
     capture = watching(camera, pairs=8, still_images=3)
@@ -283,7 +283,7 @@ def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:
     console.file.close()
 
 
-def test_ctrl_c_keeps_the_pictures_taken(camera: StereoCamera, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_images_taken(camera: StereoCamera, tmp_path: Path) -> None:
     pictures = shown(CHESSBOARD, camera, 3, seed=6)
 
     def until_interrupted() -> Iterator[tuple[Image, Image]]:
@@ -305,7 +305,7 @@ Flexsheet = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flexsheet:
-    """Runs the command in this process: exit code, stdout, stderr."""
+    """Return a function that runs the command in this process: exit code, stdout, stderr."""
 
     def run(*words: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, words)])
@@ -324,7 +324,7 @@ GIVEN = ("--board", "7x5", "--square-mm", "30")
 def test_the_twin_is_calibrated_by_the_command(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
-    """From live capture to the file, the report, and a check on pictures taken otherwise."""
+    """The test covers live capture, the file, the report, and a check with other images."""
     taken, report, output = tmp_path / "taken", tmp_path / "report", tmp_path / "rig.yaml"
     code, out, err = flexsheet(
         "calibrate", "stereo", "--twin", scene_file, *GIVEN, "--pairs", 8, "--pictures", taken,
@@ -378,10 +378,10 @@ def test_the_twin_is_calibrated_by_the_command(
     assert "rigid_fit_rms_mm" in out
 
 
-def test_pictures_are_taken_from_the_camera_source(
+def test_images_are_taken_from_the_camera_source(
     flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
-    """Image files stand in for cameras; each picture comes four times, as of a board held still."""
+    """Image files replace the cameras; each image is repeated four times, as of a resting board."""
     for number, views in enumerate(shown(CHESSBOARD, camera, 6, seed=3)):
         for again in range(4):
             for side, picture in zip(("l", "r"), views, strict=True):

@@ -1,4 +1,4 @@
-"""What a calibration says of its own error: slopes, covariance, jackknife, and is it true?"""
+"""Test the estimated error of a calibration: derivatives, covariance, jackknife and its truth."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SHIPPED = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 BOARD = Board(columns=9, rows=6, square_m=0.025)
 POINTS = board_points(BOARD)
 COARSE = Board(columns=6, rows=4, square_m=0.035)
-"""For small pictures."""
+"""Board for small images."""
 
 
 @cache
@@ -64,7 +64,7 @@ def half(lens: Lens) -> Lens:
 
 @cache
 def small_camera() -> StereoCamera:
-    """The true rig with half as many pixels each way: four times as quick to draw."""
+    """Return the true rig with half the pixels in each direction, for speed."""
     camera = make_true_camera(scene_camera())
     return camera.model_copy(
         update={
@@ -87,7 +87,7 @@ def numbers_of(camera: StereoCamera | StereoCalibration) -> Floats:
 def calibrated(
     camera: StereoCamera, board: Board, *, seed: int, count: int, distance_m: float
 ) -> tuple[bundle.RigFit, Uncertainty]:
-    """A calibration from the twin's pictures of a board."""
+    """Calibrate from simulated images of a board."""
     twin, finder = TwinBoard(camera, board, seed=seed), CornerFinder(board)
     pairs = []
     for left_from_board in twin.poses(count):
@@ -105,7 +105,7 @@ def calibrated(
 
 @cache
 def exact_corners(count: int) -> tuple[tuple[Floats, Floats], ...]:
-    """Corners of the board in many poses, without any noise."""
+    """Return corners of the board in many poses, without noise."""
     board = TwinBoard(make_true_camera(scene_camera()), BOARD, seed=5)
     return tuple(board.corners(pose) for pose in board.poses(count))
 
@@ -143,7 +143,7 @@ def test_derivatives_of_corners_equal_differences() -> None:
 
 
 def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floats:
-    """The points (n, 3) whose pixels in both views are nearest to those seen."""
+    """Return the points (n, 3) whose pixels in both views are nearest to the observed ones."""
 
     def misses(point: Floats, number: int) -> Floats:
         seen = drawn(rig, point[None])
@@ -176,7 +176,7 @@ def test_derivatives_of_positions_equal_differences() -> None:
 
 
 def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Pixels of points (n, 3) of the left camera's frame in both views."""
+    """Project points (n, 3) of the left camera's frame to both views."""
     still = np.zeros(3)
     left = cv2.projectPoints(points, still, still, *bundle.lens_arrays(rig[:8]))[0][:, 0]
     right = cv2.projectPoints(points, rig[16:19], rig[19:], *bundle.lens_arrays(rig[8:16]))[0]
@@ -184,7 +184,7 @@ def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 
 def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
-    """Corners with independent noise: the errors of 40 fits scatter as each of them states."""
+    """For independent noise, the errors of 40 fits scatter as each fit estimates."""
     true = numbers_of(make_true_camera(scene_camera()))
     slopes = compute_position_jacobian(true, sample_working_plane(true, (640, 480), 0.5))
     scores, shifts, stated = [], [], []
@@ -220,7 +220,7 @@ def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
 
 
 def test_only_the_jackknife_detects_bent_boards() -> None:
-    """Corners that err together: the fit believes in many small errors, refits tell better."""
+    """For correlated corner errors the jackknife is better than the fit's covariance."""
     camera = make_true_camera(scene_camera())
     true = numbers_of(camera)
     random = np.random.default_rng(8)
@@ -246,7 +246,8 @@ def test_only_the_jackknife_detects_bent_boards() -> None:
 
 
 def test_fingertip_errors_agree_with_the_stated_uncertainty() -> None:
-    """Six calibrations from pictures, each of other poses and noise, judged by the true rig."""
+    """Six calibrations from images with different poses and noise are compared with the true
+    rig."""
     camera = small_camera()
     true = numbers_of(camera)
     points = sample_working_plane(true, (320, 240), 0.5)
@@ -276,8 +277,8 @@ def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
     assert np.linalg.norm(errors, axis=1).max() < 2.5e-4
 
 
-def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
-    """Fewer pairs, other poses, other noise."""
+def test_the_twin_calibrated_again_agrees_with_the_shipped_file() -> None:
+    """This calibration has fewer pairs, other poses and other noise."""
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
     distance_m = shipped.uncertainty.working_distance_m

@@ -1,4 +1,4 @@
-"""The camera node: it plays, retries, refuses, cuts and tells; files are read by real decoders."""
+"""Test the camera node with real decoders: replay, retries, rejections, crops and reports."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from camera_bench import (
     FRAMES,
     HEIGHT,
     WIDTH,
-    Bench,
+    CameraHarness,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
     write_video,
 )
 from pydantic import ValidationError
@@ -97,7 +97,7 @@ async def test_a_video_starts_again_when_it_loops(scene: Scene, videos: tuple[Pa
 def test_images_come_in_the_order_of_their_names(scene: Scene, images: dict[str, str]) -> None:
     reader = open_reader(ImagesSource(kind="images", **images), scene.camera, lambda: 0)
     pairs = list(iter(reader.read, None))
-    assert [(told(pair.left), told(pair.right) - 5) for pair in pairs] == IN_ORDER
+    assert [(read_number(pair.left), read_number(pair.right) - 5) for pair in pairs] == IN_ORDER
 
 
 async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, str]) -> None:
@@ -114,13 +114,13 @@ async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, st
 
 
 async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side: Path) -> None:
-    """OpenCV opens a file as it opens a camera; at its end it is a camera that was unplugged."""
+    """OpenCV opens a file like a camera; its end is like an unplugged camera."""
     source = {"kind": "opencv", "left": str(side_by_side)}
     async with running(scene, source=source, retry_s=0.01) as bench:
-        # A file cannot be told an exposure, and has a rate of its own: both are told once.
+        # A file has no exposure control and its own rate: both are reported once.
         await bench.until(lambda: bench.node.errors >= 4 and len(bench.sent) > 2)
         assert len(bench.node.warned) == 2
-        assert "gives no more pictures" in bench.node.last_error
+        assert "delivers no more images" in bench.node.last_error
         assert all(left == right for left, right in bench.numbers())
 
 
@@ -136,7 +136,7 @@ async def test_a_camera_that_is_not_there_is_tried_again(scene: Scene, tmp_path:
         await bench.until(lambda: len(bench.sent) > 0)
 
 
-async def test_pictures_of_another_size_are_an_error(scene: Scene, tmp_path: Path) -> None:
+async def test_images_of_another_size_are_an_error(scene: Scene, tmp_path: Path) -> None:
     wide = write_video(tmp_path / "w.avi", [picture(n, 0, 2 * WIDTH) for n in range(3)])
     source = {"kind": "video", "left": wide, "right": wide}
     async with running(scene, source=source, retry_s=0.01) as bench:
@@ -146,7 +146,7 @@ async def test_pictures_of_another_size_are_an_error(scene: Scene, tmp_path: Pat
         assert bench.sent == []
 
 
-async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
+async def test_the_twins_images_pass_with_their_time(scene: Scene) -> None:
     async with running(scene, source="twin") as bench:
         pair = StereoPair(
             device="twin-bumblebee",
@@ -171,13 +171,13 @@ async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
         assert bench.node.reader is None
 
 
-async def test_the_twins_pictures_are_left_alone_by_a_real_camera(
+async def test_the_twins_images_are_left_alone_by_a_real_camera(
     scene: Scene, images: dict[str, str]
 ) -> None:
     pair = StereoPair(
         device="t", exposure_s=0, dropped_frames=0, left=picture(0, 0), right=picture(0, 1)
     )
-    bench = Bench(source={"kind": "images", **images})
+    bench = CameraHarness(source={"kind": "images", **images})
     await bench.node.step("twin__stereo", pair, Header(1, 1, 1, "virtual", "twin", 1))
     assert bench.sent == []
 
@@ -217,13 +217,13 @@ def test_an_unreadable_image_is_named(scene: Scene, tmp_path: Path) -> None:
         open_reader(source, scene.camera, lambda: 0).read()
 
 
-def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
+def test_a_side_by_side_image_of_odd_width_is_rejected() -> None:
     with pytest.raises(DeviceError, match="camera: side-by-side image of odd width 161"):
         split_side_by_side(picture(0, 0, 161), "camera")
 
 
 class StutteringReader:
-    """Frames at 60 Hz, but for three that never came."""
+    """Reader at 60 Hz without three of its frames."""
 
     paced = False
     rate_hz: float | None = 60.0
@@ -239,10 +239,10 @@ class StutteringReader:
         return ImagePair(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
 
     def interrupt(self) -> None:
-        """It does not wait."""
+        """Do nothing, since `read` does not wait."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
 
 def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
@@ -266,7 +266,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
 
 
 class BrokenReader(StutteringReader):
-    """OpenCV itself fails on what the device sends."""
+    """Reader with an error of OpenCV."""
 
     def read(self) -> ImagePair | None:
         raise cv2.error("no such colour")
@@ -306,6 +306,6 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
         {"kind": "twin", "x": 1},
     ],
 )
-def test_a_wrong_source_is_refused(source: object) -> None:
+def test_a_wrong_source_is_rejected(source: object) -> None:
     with pytest.raises(ValidationError):
         CameraParameters.model_validate({"source": source})

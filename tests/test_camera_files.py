@@ -1,4 +1,4 @@
-"""Video and image files keep their own time, through the real decoders."""
+"""Test that video and image files keep their times, with the real decoders."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from camera_bench import (
     Image,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
     write_video,
 )
 from hypothesis import HealthCheck, given, settings
@@ -38,7 +38,8 @@ def scene() -> Scene:
 
 
 def write_timed_video(path: Path, frames: list[Image], times_ms: list[int]) -> Path:
-    """A video of variable frame rate: motion JPEG in a container that keeps each frame's time."""
+    """Write a motion JPEG video of variable frame rate in a container with the time of each
+    frame."""
     codec = cv2.VideoWriter.fourcc(*"MJPG")
     height, width = frames[0].shape
     raw = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1]
@@ -78,7 +79,7 @@ def times_ms(pictures: list[ImagePair]) -> list[float]:
 
 
 def numbers(pictures: list[ImagePair]) -> list[tuple[int, int]]:
-    return [(told(pair.left), told(pair.right) - 5) for pair in pictures]
+    return [(read_number(pair.left), read_number(pair.right) - 5) for pair in pictures]
 
 
 def both(frames: list[int]) -> list[Image]:
@@ -111,7 +112,7 @@ async def test_the_published_stamps_follow_the_files_time(scene: Scene, tmp_path
     path = write_timed_video(tmp_path / "v.mkv", both([*range(FRAMES)]), UNEVEN_MS)
     async with running(scene, source={"kind": "video", "left": path}) as bench:
         await bench.until(lambda: "ended" in bench.node.note)
-    shown = [(told(pair.left), header.source_ns) for pair, header in bench.sent]
+    shown = [(read_number(pair.left), header.source_ns) for pair, header in bench.sent]
     begin_ns = shown[0][1]
     assert shown[0][0] == 0
     for number, source_ns in shown:
@@ -119,7 +120,7 @@ async def test_the_published_stamps_follow_the_files_time(scene: Scene, tmp_path
 
 
 def test_two_videos_are_paired_by_their_times(scene: Scene, tmp_path: Path) -> None:
-    """The right camera's recording lacks a frame and lies 3 ms behind from the second on."""
+    """The right video lacks a frame and is 3 ms late from the second frame on."""
     left = write_timed_video(
         tmp_path / "l.mkv", [picture(n, 0) for n in range(6)], [0, 20, 40, 60, 80, 100]
     )
@@ -149,10 +150,10 @@ def test_time_runs_on_when_a_video_begins_again(scene: Scene, tmp_path: Path) ->
 
 
 class TimelessVideo:
-    """A decoder that knows no frame times, as of a bare stream without a container."""
+    """Decoder without frame times, as for a raw stream."""
 
     def __init__(self, path: str, api: int) -> None:
-        """Nothing is opened."""
+        """Do nothing."""
 
     def isOpened(self) -> bool:
         return True
@@ -164,7 +165,7 @@ class TimelessVideo:
         return 0.0
 
     def release(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
 
 def test_a_video_without_frame_times_needs_a_rate(
@@ -222,7 +223,7 @@ def test_wrong_times_are_named(tmp_path: Path, text: str, said: str) -> None:
         read_times(path, 2)
 
 
-def test_absent_times_and_times_beside_a_rate_are_refused(scene: Scene, tmp_path: Path) -> None:
+def test_absent_times_and_times_beside_a_rate_are_rejected(scene: Scene, tmp_path: Path) -> None:
     patterns = write_images(tmp_path, 1)
     absent = ImagesSource(kind="images", times=tmp_path / "absent.csv", **patterns)
     with pytest.raises(DeviceError, match=r"absent\.csv: file not found"):
@@ -253,15 +254,15 @@ def test_a_side_by_side_video_has_the_scenes_size(scene: Scene, tmp_path: Path) 
     assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH)
 
 
-def test_times_that_are_no_text_are_told_as_such(tmp_path: Path) -> None:
+def test_times_that_are_not_text_are_reported(tmp_path: Path) -> None:
     times = tmp_path / "times.csv"
     times.write_text("t_s\n0.0\n0.1\n", encoding="utf-16")
     with pytest.raises(DeviceError, match=r"times\.csv: cannot be read as UTF-8 CSV"):
         read_times(times, 2)
 
 
-def test_whatever_goes_wrong_while_reading_is_told() -> None:
-    """A thread that died without a word would leave a node that looks well and gives nothing."""
+def test_all_errors_of_a_reader_are_reported() -> None:
+    """A thread that ends without a report would leave a node that seems healthy."""
     errors: list[DeviceError] = []
 
     def spoilt() -> Reader:

@@ -1,6 +1,6 @@
-"""Live cameras: stamps, pairs and their skew, settings, regions, unplugging, hanging.
+"""Test live cameras: stamps, pairs and skew, settings, regions, unplugged and hanging devices.
 
-The devices are fakes in the place of cv2.VideoCapture; the threads are the real ones.
+The devices are substitutes for cv2.VideoCapture; the threads are real.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from camera_bench import (
     FakeCamera,
     load_scene,
     picture,
+    read_number,
     running,
-    told,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -62,7 +62,7 @@ def cameras(bag: CameraBag) -> tuple[FakeCamera, FakeCamera]:
 def reading(
     bag: CameraBag, scene: Scene, wanted: Regions | None = None, **source: Any
 ) -> Iterator[CameraReader]:
-    """A reader of both cameras, which is closed whatever happens."""
+    """Open a reader of both cameras, and close it at the end."""
     description = OpenCvSource.model_validate({**PAIR, **source})
     reader = CameraReader(description, scene.camera, bag.now_ns, wanted)
     try:
@@ -78,7 +78,7 @@ def read(reader: CameraReader) -> ImagePair:
     return pictures
 
 
-def test_the_drivers_stamp_tells_the_exposure(
+def test_the_drivers_stamp_gives_the_exposure(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -91,7 +91,7 @@ def test_the_drivers_stamp_tells_the_exposure(
     assert pictures.skew_s == pytest.approx(3e-3, abs=1e-6)
     assert pictures.exposure_s == pytest.approx(4e-3)
     assert "stamped by the driver" in pictures.notes
-    assert (told(pictures.left), told(pictures.right) - 5) == (1, 1)
+    assert (read_number(pictures.left), read_number(pictures.right) - 5) == (1, 1)
 
 
 def test_a_driver_that_stamps_the_beginning_of_the_exposure(
@@ -104,7 +104,7 @@ def test_a_driver_that_stamps_the_beginning_of_the_exposure(
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 1_790_000_000 * 10**9], ids=["none", "time of day"])
-def test_stamps_of_another_clock_give_way_to_the_arrival(
+def test_stamps_of_another_clock_are_replaced_by_the_arrival(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene, stamp_ns: int
 ) -> None:
     """Check one camera alone, since the two are compared by one kind of stamp."""
@@ -117,13 +117,13 @@ def test_stamps_of_another_clock_give_way_to_the_arrival(
     assert "stamped on arrival" in pictures.notes
     newest_ns = bag.base_ns + (MAX_IMPLAUSIBLE - 1) * PERIOD_NS
     assert pictures.exposure_ns == newest_ns + 8 * MS - 2 * MS
-    assert told(pictures.left) == told(pictures.right) - 5 == MAX_IMPLAUSIBLE - 1
+    assert read_number(pictures.left) == read_number(pictures.right) - 5 == MAX_IMPLAUSIBLE - 1
 
 
 def test_a_stated_delay_from_exposure_to_arrival(
     bag: CameraBag, scene: Scene, cameras: tuple[FakeCamera, FakeCamera]
 ) -> None:
-    """OpenCV knows no clock of a stream's: its stamps are not requested."""
+    """OpenCV has no driver stamps of a stream: they are not requested."""
     bag.cameras = {"rtsp://left": cameras[0], "rtsp://right": cameras[1]}
     source = {"left": "rtsp://left", "right": "rtsp://right", "exposure_to_grab_s": 0.020}
     with reading(bag, scene, **source) as reader:
@@ -174,7 +174,7 @@ def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
 def test_frames_meet_their_own_partner(
     phase: float, lost_left: set[int], lost_right: set[int], jitter: list[float]
 ) -> None:
-    """Two cameras that run freely, lose frames, and whose frames arrive in any order."""
+    """Two free-running cameras lose frames, and their frames arrive in any order."""
     moments = {
         ("left", n): round((n + jitter[n]) * PERIOD_NS) for n in range(40) if n not in lost_left
     } | {
@@ -200,7 +200,7 @@ def test_frames_meet_their_own_partner(
         assert [(left[1], right[1]) for left, right in pairs] == [(n, n) for n in sorted(kept)]
 
 
-async def test_the_skew_is_published_and_too_much_is_refused(
+async def test_the_skew_is_published_and_too_much_is_rejected(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -250,7 +250,7 @@ def test_a_side_by_side_camera_has_one_exposure(bag: CameraBag, scene: Scene) ->
         camera.shoot(50 * MS, image=np.hstack([picture(2, 0), picture(3, 1)]))
         pictures = read(reader)
         assert camera.properties[cv2.CAP_PROP_FRAME_WIDTH] == 2 * WIDTH
-    assert (told(pictures.left), told(pictures.right) - 5) == (2, 3)
+    assert (read_number(pictures.left), read_number(pictures.right) - 5) == (2, 3)
     assert pictures.skew_s == 0.0
     assert pictures.exposure_ns == pytest.approx(bag.base_ns + 48 * MS, abs=1000)
 
@@ -273,12 +273,12 @@ def test_settings_are_made_in_the_devices_units(
                 WIDTH,
                 HEIGHT,
             )
-            # A device without auto focus is not told to leave it.
+            # A device without auto focus gets no command for it.
             assert (cv2.CAP_PROP_AUTOFOCUS, 0.0) not in fake.calls
         assert reader.warnings == ()
 
 
-async def test_what_a_device_does_not_take_is_told_once(
+async def test_a_rejected_setting_is_reported_once(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     left, right = cameras
@@ -310,13 +310,13 @@ async def test_what_a_device_does_not_take_is_told_once(
         bag.empty()
 
 
-def test_a_device_that_keeps_its_automatic_exposure_does_not_tell_it(
+def test_with_automatic_exposure_the_exposure_is_unknown(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     for fake in cameras:
         fake.fixed |= {cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}
     with reading(bag, scene) as reader:
-        assert "0: auto exposure: requested 1 (by hand), the device has 3" in reader.warnings
+        assert "0: auto exposure: requested 1 (manual), the device has 3" in reader.warnings
         for fake in cameras:
             fake.shoot(0)
         assert read(reader).exposure_s == scene.camera.exposure_s
@@ -417,13 +417,13 @@ def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
 
 
 @pytest.mark.alone
-def test_two_cameras_that_never_meet_are_told_of(
+def test_two_cameras_without_pairs_are_reported(
     bag: CameraBag,
     cameras: tuple[FakeCamera, FakeCamera],
     scene: Scene,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(live, "FIRST_S", 0.01)
+    monkeypatch.setattr(live, "FIRST_FRAME_S", 0.01)
     with reading(bag, scene, silence_s=1.0) as reader:
         told_of: list[str] = []
 

@@ -1,4 +1,4 @@
-"""Regions of the sensors: where a finger can be seen, cutting, and what is refused."""
+"""Test sensor regions: the visible finger volume, cropping, and rejected regions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RAMP = np.add.outer(np.arange(HEIGHT), 2 * np.arange(WIDTH)).astype(np.uint8)
 
 
 def moved(scene: Scene, position_m: tuple[float, float, float], tilt_rad: float) -> Scene:
-    """The scene with its camera elsewhere, tilted from where it looked."""
+    """Return the scene with the camera at another position, tilted from its direction."""
     pose = scene.camera.world_from_left
     there = Pose(position_m=position_m, rpy_rad=(pose.rpy_rad[0] + tilt_rad, *pose.rpy_rad[1:]))
     camera = scene.camera.model_copy(update={"world_from_left": there})
@@ -37,7 +37,7 @@ def moved(scene: Scene, position_m: tuple[float, float, float], tilt_rad: float)
 
 
 def drawn(points_world: np.ndarray, scene: Scene, side: int) -> np.ndarray:
-    """Pixels by OpenCV's own projection."""
+    """Project points with OpenCV."""
     camera = scene.camera
     pose = camera.world_from_left
     left_from_world = np.linalg.inv(rigid.transform_from_rpy(pose.position_m, pose.rpy_rad))
@@ -80,7 +80,8 @@ def test_every_finger_that_a_view_can_see_lies_in_its_region(
 
 
 def test_a_region_is_no_larger_than_it_need_be() -> None:
-    """A small volume half a metre away: its image, the finger's radius and the margin."""
+    """The region of a small volume half a metre away is its image, the finger's radius and the
+    margin."""
     finger = SCENE.finger.model_copy(
         update={"volume_min_m": (-0.02, -0.02, -0.02), "volume_max_m": (0.02, 0.02, 0.02)}
     )
@@ -92,8 +93,9 @@ def test_a_region_is_no_larger_than_it_need_be() -> None:
         assert region.row % 2 == 0
 
 
-def test_a_lens_that_folds_back_outside_the_picture_loses_nothing() -> None:
-    """k1 = -0.5 turns the image round at 0.8 of the focal length; the volume reaches far beyond."""
+def test_a_lens_that_folds_back_outside_the_image_loses_nothing() -> None:
+    """With k1 = -0.5 the distortion folds back at 0.8 of the focal length; the volume extends
+    further."""
     lens = Lens(fx_px=540, fy_px=540, cx_px=319.5, cy_px=239.5, distortion=(-0.5, 0, 0, 0, 0))
     line = np.stack([np.linspace(0.0, 3.0, 4000), np.zeros(4000), np.ones(4000)], axis=-1)
     region = find_visible_region(line, lens, WIDE, HIGH)
@@ -105,20 +107,20 @@ def test_a_lens_that_folds_back_outside_the_picture_loses_nothing() -> None:
     assert region.column + region.width >= min(WIDE, reached_px)
 
 
-def test_a_volume_round_the_camera_fills_the_picture() -> None:
+def test_a_volume_around_the_camera_fills_the_image() -> None:
     scene = moved(SCENE, (0.0, 0.0, 0.0), 0.0)
     whole = Region(0, 0, WIDE, HIGH)
     assert find_finger_regions(scene) == (whole, whole)
 
 
 @pytest.mark.parametrize("tilt_rad", [np.pi, 1.2], ids=["behind", "beside"])
-def test_a_camera_that_looks_elsewhere_is_told_of(tilt_rad: float) -> None:
+def test_a_camera_that_faces_elsewhere_is_reported(tilt_rad: float) -> None:
     scene = moved(SCENE, (0.0, 0.5, 0.9), tilt_rad)
     with pytest.raises(DeviceError, match=r"the left view does not show finger\.volume"):
         find_finger_regions(scene)
 
 
-def test_regions_beyond_the_sensor_are_refused() -> None:
+def test_regions_beyond_the_sensor_are_rejected() -> None:
     asked = ExplicitRegions(left=Region(0, 0, 64, 48), right=Region(600, 0, 64, 48))
     with pytest.raises(DeviceError, match=r"region\.right: 64x48 px at \(600, 0\) is outside"):
         resolve_regions(asked, SCENE)
@@ -134,7 +136,7 @@ def test_regions_beyond_the_sensor_are_refused() -> None:
         {"left": [0, 0, 10, 10], "right": [0, 0, 10]},
     ],
 )
-def test_a_wrong_region_is_refused(region: object) -> None:
+def test_a_wrong_region_is_rejected(region: object) -> None:
     with pytest.raises(ValidationError):
         CameraParameters.model_validate({"region": region})
 
@@ -163,14 +165,14 @@ def test_a_cut_shows_the_same_pixels_of_the_sensor(data: st.DataObject) -> None:
     assert result.exposure_ns == 7
 
 
-def test_a_cut_of_what_is_not_there_is_refused() -> None:
+def test_a_crop_outside_the_image_is_rejected() -> None:
     reads = Region(0, 0, 64, 40), Region(10, 0, 64, 40)
     pictures = ImagePair(RAMP[:40, :64], RAMP[:40, 10:74], 0, regions=reads)
     with pytest.raises(DeviceError, match=r"region\.right: 20x20 px at"):
         crop(pictures, (Region(0, 0, 20, 20), Region(0, 0, 20, 20)))
 
 
-def test_pictures_must_have_their_regions_size() -> None:
+def test_images_must_have_their_regions_size() -> None:
     camera = load_scene().camera
     reads = Region(0, 0, 64, 40), Region(10, 0, 64, 40)
     check_size(ImagePair(RAMP[:40, :64], RAMP[:40, :64], 0, regions=reads), camera, "camera")

@@ -1,4 +1,4 @@
-"""The `flexsheet` command: data on stdout, words on stderr, exit codes that mean something."""
+"""Test the `flexsheet` command: data on stdout, messages on stderr, exit codes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LISTENING: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a command left: exit code, stdout, stderr."""
+    """Result of a command: exit code, stdout, stderr."""
 
     code: int
     out: str
@@ -52,7 +52,7 @@ class Said:
 
 
 class Command:
-    """Runs the command in this process."""
+    """Runner of the command in this process."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         self._capsys, self._monkeypatch = capsys, monkeypatch
@@ -73,7 +73,7 @@ def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="module")
 def runs_root() -> Iterator[Path]:
-    """A directory of runs for this file's tests."""
+    """Create a directory of runs for this file's tests."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     before = os.environ.get(runs.ROOT_VARIABLE)
     os.environ[runs.ROOT_VARIABLE] = str(folder)
@@ -86,7 +86,7 @@ def runs_root() -> Iterator[Path]:
 
 
 class Launched:
-    """`flexsheet launch` in a process of its own, from ready to stop."""
+    """Process of `flexsheet launch`, from ready to stop."""
 
     def __init__(self, path: Path, *options: object) -> None:
         self.process = subprocess.Popen(
@@ -123,7 +123,7 @@ def write(folder: Path, graph: dict[str, Any]) -> Path:
 
 @pytest.fixture(scope="module")
 def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A tiny graph that runs, recording; gives its bag, which is whole after the tests."""
+    """Run and record a small graph; yield its bag, which is complete after the tests."""
     folder = tmp_path_factory.mktemp("graph")
     launched = Launched(write(folder, GRAPH), "--record", folder / "run.mcap")
     yield folder / "run.mcap"
@@ -131,7 +131,7 @@ def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def told_of_its_stop(bag: Path) -> bool:
-    """Return whether the bag has the listener's stop, and its word on what it took before."""
+    """Return whether the bag contains the listener's stop and its report."""
     stopped = False
     for topic, message, header, _ in BagReader(
         bag, {"estop", "status"} & set(BagReader(bag).topics)
@@ -144,7 +144,7 @@ def told_of_its_stop(bag: Path) -> bool:
 
 @pytest.fixture(scope="module")
 def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole bag of the tiny graph, all of it from the beginning."""
+    """Record a complete bag of the small graph."""
     folder = tmp_path_factory.mktemp("recorded")
     launched = Launched(
         write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=2.0"
@@ -259,7 +259,7 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("echo", "estop", "--run", "/nowhere"), 2, "does not contain plan.json"),
     ],
 )
-def test_wrong_words_to_topics(
+def test_wrong_arguments_of_topic_commands(
     flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, word: str
 ) -> None:
     said = flexsheet("topic", *arguments)
@@ -289,7 +289,7 @@ def test_a_message_of_any_size_is_taken_as_json(
         assert word in said.err
 
 
-def test_nobody_publishes_for_a_node(flexsheet: Command, running: Path) -> None:
+def test_a_tool_cannot_publish_for_a_node(flexsheet: Command, running: Path) -> None:
     finger = (
         "{path_label: '', path_done: true, path_time_s: 0, position_world_m: [0, 0, 0], "
         "velocity_world_m_per_s: [0, 0, 0]}"
@@ -307,7 +307,7 @@ def test_hz_goes_by_the_writers_stamps(flexsheet: Command, running: Path) -> Non
     assert "beacon" in flexsheet("topic", "hz", "status", "--duration", "2.5").out
 
 
-def test_info_knows_the_graph(flexsheet: Command, running: Path) -> None:
+def test_info_shows_the_graph(flexsheet: Command, running: Path) -> None:
     described = flexsheet("topic", "info", "twin/finger", "--json").json()
     assert described["writers"] == ["beacon"]
     assert described["readers"] == ["listener", "recorder"]
@@ -387,7 +387,7 @@ def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
     assert "Traceback" not in said.err
 
 
-def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
+def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     said = flexsheet("bag", "verify", "listner", recorded)
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
     said = flexsheet("bag", "verify", "recorder", recorded)
@@ -452,7 +452,7 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
     assert "an e-stop or its reset is not repeated" in said.err
 
 
-def test_without_a_graph_that_is_said(
+def test_a_missing_graph_is_reported(
     flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
@@ -477,7 +477,7 @@ def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> Non
         ({"-o": "/nowhere/c.yaml"}, "does not exist"),
     ],
 )
-def test_wrong_words_to_calibrate(
+def test_wrong_arguments_of_calibrate(
     flexsheet: Command, tmp_path: Path, options: dict[str, str], word: str
 ) -> None:
     (tmp_path / "left.png").touch()
@@ -494,7 +494,7 @@ def test_wrong_words_to_calibrate(
     assert word in said.err
 
 
-def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> None:
+def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> None:
     pictures = ROOT.parent / "shared/data/stereo"
     if not pictures.is_dir():
         pytest.skip("the real stereo pairs are not here")
@@ -515,7 +515,7 @@ def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> N
 
 
 def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
-    """All of it, for the quickest family: measured, drawn, written, printed."""
+    """The test measures, draws, writes and prints the fastest family."""
     said = flexsheet("chart", "triangulation", "--output", tmp_path)
     assert said.code == 0
     assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "dlt"]

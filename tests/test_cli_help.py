@@ -1,4 +1,4 @@
-"""Every command: its help has examples that parse, it can print JSON, it completes."""
+"""Test every command: its help has valid examples, it can print JSON, it completes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COMMANDS = dict(commands())
 
 
 def parse(line: str) -> str:
-    """Parse a line as the command line would, run nothing; the command that it calls."""
+    """Parse a line as the command line does without running it; return its command."""
     program, *arguments = shlex.split(line.removeprefix("sudo "))
     assert program == "flexsheet"
     command, words = get_command(cli.app), [program]
@@ -111,7 +111,7 @@ def test_json_has_no_nan_and_no_infinity(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_looking_into_a_graph_loads_little() -> None:
-    """What `topic echo` needs until it is subscribed: no YAML, no linear algebra, no supervisor."""
+    """`topic echo` loads no YAML, linear algebra or supervisor before it subscribes."""
     code = (
         "import json, sys\n"
         "from flexsheet.launch import cli\n"
@@ -185,8 +185,8 @@ def test_a_slip_is_answered_with_what_was_meant(
     assert said in err
 
 
-def test_colours_are_for_terminals_and_no_color_takes_them_away() -> None:
-    """The same words in a pseudo-terminal with NO_COLOR, without it, and into a pipe."""
+def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
+    """The text is the same in a pseudo-terminal with NO_COLOR, without it, and in a pipe."""
     code = "from flexsheet.launch.commands.output import words; words.print('[red]so[/]')"
 
     def said(terminal: bool, **more: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Clocks of several hosts: bounds that hold whatever the network does, stamps put into our own."""
+"""Test clocks of several hosts: guaranteed bounds, and conversion of stamps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MS = 1_000_000
 
 
 class Other:
-    """A clock that gains on the true one, whose seconds may come and go at a bounded rate."""
+    """Clock with a drift against the true one, of a bounded varying rate."""
 
     def __init__(self, offset_ns: int, drift: float, sway: float = 0.0) -> None:
         self.offset_ns, self.drift, self.sway = offset_ns, drift, sway
@@ -46,7 +46,8 @@ class Other:
 def measured(
     ours: Other, theirs: Other, delays: list[tuple[int, int]], *, max_drift: float, every_ns: int
 ) -> tuple[OtherClock, int]:
-    """After pings with (there, back) delays in ns; and the true moment of the last one."""
+    """Return the estimate after pings with (there, back) delays in ns, and the true time of the
+    last one."""
     clock, now = OtherClock(max_drift), 0
     for there, back in delays:
         now += every_ns
@@ -77,7 +78,7 @@ delays = st.lists(
 def test_the_true_offset_is_always_within_the_bounds(
     delays: list[tuple[int, int]], ours: Other, theirs: Other, every: int, later: int
 ) -> None:
-    """Any delays, any asymmetry, hours apart, rates that change: never outside."""
+    """The offset is within its bounds for any delays, asymmetry, age and varying rates."""
     clock, now = measured(ours, theirs, delays, max_drift=5e-4, every_ns=every)
     now += later
     found = clock.estimate(ours.at(now))
@@ -88,7 +89,7 @@ def test_the_true_offset_is_always_within_the_bounds(
 
 @pytest.mark.parametrize("asymmetric", [False, True])
 def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
-    """20 +- 10 ms of jitter over 60 s: as good as the shortest way, not as the mean one."""
+    """With 20 +- 10 ms of jitter over 60 s the error is that of the shortest delays."""
     chance = random.Random(3)
     base = 2 * MS
 
@@ -108,7 +109,7 @@ def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
     assert found.drift_ratio == pytest.approx(8e-5, abs=2e-5)
 
 
-def test_a_clock_that_was_stepped_is_measured_anew() -> None:
+def test_a_clock_that_was_stepped_is_measured_again() -> None:
     clock = OtherClock(5e-4)
     for number in range(20):
         clock.add(Sample(number * S, 7 * S, MS))
@@ -154,7 +155,8 @@ def offset(clock_id: str = "there", **keys: Any) -> ClockOffset:
 
 @given(st.integers(-60 * S, 60 * S), st.floats(-4e-4, 4e-4), st.integers(-(10**15), 10**15))
 def test_a_stamp_is_converted_with_the_drift(since: int, drift: float, apart: int) -> None:
-    """To the microsecond, a minute from the measurement, clocks eleven days apart."""
+    """The error is below a microsecond, a minute after the measurement, for clocks eleven days
+    apart."""
     table = ClockTable("here")
     table.update(clocks(a=offset(offset_ns=apart, drift_ratio=drift)))
     ours = 100 * S + since
@@ -192,7 +194,7 @@ def test_an_unknown_clock_s_message_counts_from_its_arrival_and_is_not_trusted()
 
 
 class Pair:
-    """Two clock nodes and what lies between: messages take their time, each way its own."""
+    """Two clock nodes with message delays in each direction."""
 
     def __init__(self, far_ns: int, **parameters: Any) -> None:
         self.true_ns, self.far_ns = S, far_ns
@@ -221,7 +223,7 @@ class Pair:
         self.clocks["far"].move_to(self.true_ns + self.far_ns)
 
     async def run(self, seconds: float, delay_ns: int = MS) -> dict[str, Clocks]:
-        """Both ping in turns; the newest `clocks` of each."""
+        """Exchange pings; return the newest `clocks` of each node."""
         newest: dict[str, Clocks] = {}
         for node in self.nodes.values():
             await node.setup() if not hasattr(node, "_heard") else None
@@ -267,7 +269,7 @@ async def test_a_clock_that_falls_silent_is_known_less_and_less_and_then_not_at_
 
 
 class Passing(Node):
-    """Passes a fingertip's stamp on, as every node does that works on the finger."""
+    """Node that forwards a fingertip's stamp, as all nodes do that process the finger."""
 
     parameters: NodeParameters
     fingertip: Input[Fingertip]
@@ -309,7 +311,7 @@ def bridge() -> ArmBridge:
     )
 
 
-async def test_a_reset_whose_moment_is_not_known_is_refused_a_stop_never() -> None:
+async def test_a_reset_with_an_unknown_time_is_rejected_but_never_a_stop() -> None:
     node = bridge()
     await node.setup()
     header = replace(SOME_HEADER, clock_id="there", source_ns=50_100 * S, publish_ns=50_100 * S)

@@ -1,4 +1,4 @@
-"""Whether the code counts as changed since its commit."""
+"""Test whether the code counts as changed since its commit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.launch.running.code_state import read_git_state
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """A repository with one commit of a package, a launch file and a page."""
+    """Create a repository with one commit of a package, a launch file and a page."""
     for name in ("nodes/twin/node.py", "launch/demo.yaml", "docs/index.md"):
         write(tmp_path, name)
     identity = ["-c", "user.name=tester", "-c", "user.email=tester@example.org"]

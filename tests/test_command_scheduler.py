@@ -1,4 +1,4 @@
-"""Test when an arm is sent its next command."""
+"""Test the times of commands to an arm."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_command_covers_no_less_than_its_least_distance_and_no_long_silence(
         assert step_s == since_ns * 1e-9
 
 
-def test_the_beat_goes_on_between_targets_and_without_any() -> None:
+def test_the_period_continues_between_targets_and_without_any() -> None:
     assert PACE.is_due(7 * MS, 1, 0)
     assert PACE.is_due(1, 0, 0), "nothing was sent yet"
     assert PACE.is_due(100 * MS, 90 * MS, 0), "targets have ceased"
@@ -43,7 +43,7 @@ def test_the_beat_makes_room_for_a_target_that_is_due() -> None:
     assert PACE.is_due(21 * MS, 14 * MS, 0), "it is late: the arm must hear"
 
 
-def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
+def test_in_steady_state_an_arm_gets_a_command_at_least_every_ten_milliseconds() -> None:
     sent = [1]
     for now_ns in range(0, 400 * MS, MS // 10):
         target_ns = now_ns - now_ns % 16_700_000
@@ -57,7 +57,7 @@ def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
 
 
 @given(beat_ms=st.floats(1.0, 14.0))
-def test_an_arm_that_rests_hears_often_enough_for_its_watchdog(beat_ms: float) -> None:
+def test_a_resting_arm_gets_commands_often_enough_for_its_watchdog(beat_ms: float) -> None:
     sent = [0]
     for now_ns in range(1, 2_000 * MS, round(beat_ms * MS)):
         if PACE.is_due_when_idle(now_ns, sent[-1]):

@@ -1,5 +1,5 @@
-"""What the sheet presents of an object: the whole curve, within the arms' pull, and what it says
-where it cannot; judged by the twin's membrane."""
+"""Test the rendered force over depth within the arms' tension limits, with the simulated
+membrane."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ RADIUS = SCENE.finger.radius_m
 
 
 def soft_curve(scale: float, deepest: float = 0.05) -> ObjectCurve:
-    """Like the soft cylinder's: Hertz's power at first, then a straight line; 47 N/m at 1."""
+    """Return a force-depth curve similar to the soft cylinder's: Hertz's power, then linear; 47 N/m
+    at 1."""
     depths = deepest * np.linspace(0.0, 1.0, 40) ** 1.5
     forces = scale * 58.0 * (depths - 0.002 * -np.expm1(-depths / 0.002))
     return ObjectCurve(depths, forces)
@@ -87,7 +88,7 @@ def test_the_twins_sheet_answers_as_the_object(scale: float, place: tuple[float,
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
     st.sampled_from([0.01, 0.05]),
 )
-def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
+def test_the_retreat_is_smooth_and_bounded_for_any_object(
     scale: float, place: tuple[float, float], deepest: float
 ) -> None:
     shown = compliance(soft_curve(scale), deepest)
@@ -117,7 +118,7 @@ def test_what_fits_is_presented_exactly_by_the_law(scale: float) -> None:
     assert shown.rendered_force_n(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
 
 
-def test_between_the_nodes_of_the_places_the_law_still_holds() -> None:
+def test_between_the_sampled_positions_the_law_is_valid() -> None:
     curve = soft_curve(0.6)
     shown = compliance(curve)
     depths = np.array([0.006, 0.012, 0.03])
@@ -136,7 +137,7 @@ def test_a_soft_object_lets_the_sheet_follow_the_finger_and_a_stiff_one_brings_i
     assert 0.0 < stiff.centre.advance_per_depth <= MAX_ADVANCE_PER_DEPTH + 1e-9
 
 
-def test_a_stiffer_object_is_said_to_be_and_by_how_much() -> None:
+def test_a_stiffer_object_is_reported_with_the_ratio() -> None:
     shown = compliance(soft_curve(4.0))
     assert "stiffer than the sheet can present" in shown.note
     assert "15 to 22 %" in shown.note
@@ -155,14 +156,14 @@ def test_what_keeps_it_from_a_stiffer_object_is_named() -> None:
     assert "advance towards the finger" in eager.note
 
 
-def test_a_softer_object_than_the_sheet_is_sure_of_is_said_to_be() -> None:
+def test_a_softer_object_than_the_sheet_can_render_is_reported() -> None:
     shown = compliance(soft_curve(0.02), 0.01)
     assert "too soft for the position tolerance" in shown.note
     assert compute_force_uncertainty_ratio(shown.centre, 0.0005) > 0.15
     assert compute_force_uncertainty_ratio(shown.centre, 0.0) == 0.0
 
 
-def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> None:
+def test_the_edge_force_never_exceeds_the_reserve_at_any_depth() -> None:
     weak = SHEET.model_copy(update={"max_edge_force_n": 9.0})
     pull = make_stretch_limits(weak, LAW)
     assert pull.edge_force_n == pytest.approx(USABLE_FRACTION * 9.0)
@@ -175,7 +176,7 @@ def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> 
         assert shown.centre.edge_force_n.max() <= USABLE_FRACTION * 9.0 * (1.0 + 1e-3)
 
 
-def test_a_sheet_that_pulls_too_hard_already_gives_way_at_once() -> None:
+def test_a_sheet_with_too_high_tension_retreats_at_once() -> None:
     shown = render_force(
         soft_curve(1.0),
         LAW,
@@ -234,14 +235,14 @@ def test_a_curve_elsewhere_keeps_the_stretch() -> None:
         ([0.0, 0.01, 0.02], [0.0, 1.0, 0.5], "fall"),
     ],
 )
-def test_curves_that_are_none_are_refused(
+def test_curves_that_are_none_are_rejected(
     depths: list[float], forces: list[float], words: str
 ) -> None:
     with pytest.raises(UnfitCurveError, match=words):
         ObjectCurve(np.array(depths), np.array(forces))
 
 
-def test_a_curve_comes_from_the_soft_bodys_message_and_goes_on_straight() -> None:
+def test_a_curve_comes_from_the_soft_bodys_message_and_is_extended_linearly() -> None:
     field = SoftBody.model_fields["force_curve"]
     assert field.default_factory is not None
     rows = np.array([[0.0, 0.0], [0.01, 0.2], [0.02, 0.5]])
@@ -272,7 +273,7 @@ def test_a_calibrated_law_serves_as_well() -> None:
 
 
 @pytest.mark.parametrize(("scale", "code", "words"), [(0.8, 0, ""), (5.0, 1, "stiffer")])
-def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
+def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     monkeypatch: pytest.MonkeyPatch, scale: float, code: int, words: str
 ) -> None:
     curve = soft_curve(scale)

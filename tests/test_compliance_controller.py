@@ -1,4 +1,4 @@
-"""The sheet yields to a push as the object would: where it goes, how smoothly, and what it says."""
+"""Test that the sheet complies like the object: position, smoothness and reports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RADIUS = SCENE.finger.radius_m
 
 
 def object_force_n(depths: Floats, scale: float = 1.0) -> Floats:
-    """Like the demo's soft cylinder: soft at first, then some 58 N/m."""
+    """Return a force like the demo's soft cylinder's: soft at first, then some 58 N/m."""
     return np.asarray(scale * 58.0 * (depths + 0.002 * np.expm1(-depths / 0.002)))
 
 
@@ -53,13 +53,13 @@ def soft_body(scale: float = 1.0) -> SoftBody:
 
 
 def stands_behind_m(target: SheetTarget) -> float:
-    """How far the sheet's plane is behind the object's tangent plane at the contact."""
+    """Return the distance of the sheet's plane behind the object's tangent plane at the contact."""
     sheet = target.world_from_sheet
     return float((target.contact_world_m - sheet[:3, 3]) @ sheet[:3, 2])
 
 
 async def pressed(desk: Table, angle_deg: float, depth_m: float, scale: float = 1.0) -> SheetTarget:
-    """The finger comes, touches, and goes to a depth where it stays."""
+    """Let the finger approach, touch, and rest at a depth."""
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
     for height in (0.03, 0.0, -0.5 * depth_m):
         await desk.rest_at(in_world(on_cylinder(angle_deg, height)), 90)
@@ -93,7 +93,7 @@ async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -
 
 
 @pytest.mark.parametrize("depth_m", [0.0002, 0.0004])
-async def test_the_sheet_does_not_come_towards_a_finger_that_lies_on_a_stiff_object(
+async def test_the_sheet_does_not_move_towards_a_finger_on_a_stiff_object(
     depth_m: float,
 ) -> None:
     desk = await table()
@@ -106,7 +106,7 @@ async def test_the_sheet_does_not_come_towards_a_finger_that_lies_on_a_stiff_obj
 
 
 async def test_pushing_and_stroking_make_no_step_and_keep_the_bounds() -> None:
-    """The paper's open problem: the finger goes deep while it strokes, lifts and comes again."""
+    """The finger goes deep while it strokes, lifts and returns: the paper's open problem."""
     desk = await table()
     await desk.planner.step("soft_body", soft_body(), desk.header())
     given = desk.planner.parameters
@@ -175,7 +175,7 @@ async def test_in_touch_the_stretch_stays_and_the_retreat_makes_up_for_it() -> N
     assert compliance.stretch_ratio < before
 
 
-async def test_a_soft_body_that_tells_no_curve_leaves_all_as_it_is() -> None:
+async def test_a_soft_body_without_a_curve_changes_nothing() -> None:
     compliance = ComplianceController(SCENE, make_force_model(SCENE.sheet), "force_curve")
     untold = soft_body().model_copy(update={"force_curve": np.zeros((0, 2))})
     compliance.update(untold, in_contact=False)
@@ -193,7 +193,7 @@ async def test_a_soft_body_that_tells_no_curve_leaves_all_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(("scale", "words"), [(0.0005, "too soft for"), (30.0, "stiffer than")])
-async def test_what_the_sheet_cannot_present_is_said(scale: float, words: str) -> None:
+async def test_what_the_sheet_cannot_render_is_reported(scale: float, words: str) -> None:
     desk = await table()
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
     assert f"object is {words} the" in desk.planner.note

@@ -1,4 +1,4 @@
-"""The object's force over depth, as the soft body says it whether it is touched or not."""
+"""Test the object's force over depth from the soft body, with and without contact."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def test_the_curve_is_what_pushes_then_give(soft: SceneBody) -> None:
         assert np.array_equal(answer.force_curve, curve)
 
 
-def test_the_curve_is_said_in_the_air_and_changes_smoothly_along_the_skin(soft: SceneBody) -> None:
+def test_the_curve_is_published_in_the_air_and_changes_smoothly_along_the_skin(
+    soft: SceneBody,
+) -> None:
     place = np.array([0.0, 0.0, soft.front[2]])
     message = soft.message(soft.respond(np.array([0.0, 0.0, 0.05]), None)[0])
     assert message.force_curve == pytest.approx(soft.method.force_curve(place))

@@ -1,4 +1,4 @@
-"""What a finger felt, judged from a recording: a sheet of known place and stretch comes out so."""
+"""Test the evaluation of the rendered force from a recording, with a known sheet."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
 
 
 def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceRecording:
-    """The finger rests at a depth; the sheet stands so far behind the object's tangent plane."""
+    """Simulate a finger at rest at a depth, with the sheet at a distance behind the tangent
+    plane."""
     tip = press.surface - depth_m * press.normal
     y_axis = np.cross(press.normal, [1.0, 0.0, 0.0])
     axes = np.column_stack([[1.0, 0.0, 0.0], y_axis, press.normal])
@@ -63,7 +64,7 @@ def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceReco
 @pytest.mark.parametrize(
     ("depth_m", "normal_offset_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)]
 )
-def test_the_twins_sheet_says_what_was_felt(
+def test_the_simulated_sheet_gives_the_rendered_force(
     press: Press, depth_m: float, normal_offset_m: float
 ) -> None:
     felt = ForceReference(held(press, depth_m, normal_offset_m)).evaluate(500_000_000, press)
@@ -89,7 +90,7 @@ def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
     assert ForceSample(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0).error_ratio == pytest.approx(0.5)
 
 
-def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:
+def test_every_position_is_pressed_at_every_depth_and_evaluated_at_rest() -> None:
     *at_places, last = make_presses(SCENE)
     deepest_m = SCENE.working_range.push_depth_m
     for press in at_places:
@@ -110,7 +111,7 @@ def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:
     )
 
 
-def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
+def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
     bag = tmp_path / "bare.mcap"
     with BagWriter(bag):
         pass
@@ -118,7 +119,7 @@ def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
         read_bag(bag)
 
 
-def test_the_picture_shows_each_place(tmp_path: Path) -> None:
+def test_the_image_shows_each_position(tmp_path: Path) -> None:
     rows = [
         {"place": place, "depth_mm": depth, "wanted_n": 0.05 * depth, "presented_n": 0.052 * depth}
         for place in ("at 0, 0 mm", "at 25, 0 mm")

@@ -1,4 +1,4 @@
-"""Who may see the page."""
+"""Test the access control of the page."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
 
 
 class LogLines(logging.Handler):
-    """Keeps the lines that a handler would have written."""
+    """Handler that stores its lines."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -138,7 +138,7 @@ class LogLines(logging.Handler):
 
 @pytest.fixture(scope="module")
 def page_server() -> Iterator[tuple[int, LogLines]]:
-    """The port of a checked_servers page, and what its server logs."""
+    """Start a page; yield its port and its server's log."""
     lines = LogLines()
     for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.addHandler(lines)
@@ -150,7 +150,7 @@ def page_server() -> Iterator[tuple[int, LogLines]]:
 
 
 async def answer_to(port: int, sent: bytes) -> tuple[int, dict[str, str]]:
-    """Send bytes and return the status and the headers (lower case) of the answer."""
+    """Send bytes; return the status and the headers (lower case) of the answer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(sent)
     async with asyncio.timeout(DEADLINE_S):

@@ -1,4 +1,4 @@
-"""The page in Chromium without a graph: markup in names, a layout at rest, charts, frames."""
+"""Test the page in Chromium without a graph: markup in names, stable layout, charts, frames."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ INKED_POINTS = """() => {
         if (data[i] < 90 && Math.abs(data[i + 1] - 133) < 50 && data[i + 2] > 130) inked += 1;
     return inked / ratio;
 }"""
-"""How many pixels of the chart have about the first line's colour."""
+"""Script that returns the number of chart pixels with about the first line's colour."""
 
 
 @dataclass
 class Findings:
-    """What one visit to the page found."""
+    """Results of one visit to the page."""
 
     ran: list[Any] = field(default_factory=list)
     texts: dict[str, str] = field(default_factory=dict)
@@ -73,7 +73,7 @@ async def browser_tab() -> AsyncIterator[BrowserTab]:
 
 
 async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -> None:
-    """Put markup wherever the page shows a name or a text that others choose."""
+    """Put markup into every name and text that others define."""
     scene = cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
     page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.from_scene(scene))
@@ -106,7 +106,7 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
 
 
 async def measure_layout(page: Page, tab: BrowserTab, found: Findings) -> None:
-    """Note where a slider and the e-stop are while the texts change."""
+    """Record the positions of a slider and the e-stop while texts change."""
     await tab.get_by_role("tab", name="Touch").click()
     slider = tab.get_by_role("textbox", name="Stiffness, kPa")
     stop = tab.get_by_role("button", name="E-STOP")
@@ -151,7 +151,7 @@ async def draw_a_single_sample(page: Page, tab: BrowserTab, found: Findings) -> 
 
 
 class Framing(BaseHTTPRequestHandler):
-    """A page of another site that shows the console in a frame."""
+    """Page of another site that shows the console in a frame."""
 
     def __init__(self, inner: str, *arguments: Any) -> None:
         self._inner = inner
@@ -171,7 +171,7 @@ class Framing(BaseHTTPRequestHandler):
 
 
 async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
-    """Show the console inside pages of another origin, and note what it answers."""
+    """Open the console in pages of another origin, and record its answers."""
     site = ThreadingHTTPServer(("127.0.0.1", 0), partial(Framing, url))
     Thread(target=site.serve_forever, daemon=True).start()
     try:
@@ -218,7 +218,8 @@ def test_markup_in_names_is_shown_as_text_and_not_run(found: Findings) -> None:
 
 
 def test_nothing_moves_while_texts_change(found: Findings) -> None:
-    """ "unconfirmed" is shorter than a position, and the sliders below jumped while one dragged."""
+    """ "unconfirmed" is shorter than a position, which moved the sliders below while a user dragged
+    one."""
     assert len(found.slider_boxes) > 3
     assert len({str(box) for box in found.slider_boxes.values()}) == 1, found.slider_boxes
     assert len(found.stop_boxes) == 5

@@ -1,4 +1,4 @@
-"""What the console draws: arms, sheet, rays, and the picture of a moment."""
+"""Test the console's 3D view: arms, sheet, rays, and the image of a bookmark."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_rays_meet_the_flat_sheet_where_the_plane_is(x: float, y: float) -> None
 
 @pytest.mark.parametrize("tilt_rad", [-1.0, 0.0, 1.0])
 def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -> None:
-    """In one plane with a flat object, the sheet and the object were drawn in patches."""
+    """In one plane with a flat object, sheet and object were drawn in patches."""
     turned = transform(rotation_from_vector(np.array([tilt_rad, 0.0, 0.0])), (0.0, 0.0, 0.0))
     points = compute_sheet_points(
         *(turned @ edge for edge in edges()),
@@ -133,7 +133,7 @@ def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -
 
 
 def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
-    """The smooth normals of a shared vertex drew teeth along the edges of a plane and a box."""
+    """Smooth normals of shared vertices drew artefacts along the edges of a plane and a box."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     box = np.array(
         [
@@ -161,7 +161,7 @@ def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
     np.testing.assert_allclose(to_eye[0, 1], from_projector[0, 0])
 
 
-def test_a_picture_of_what_is_known(scene: Scene) -> None:
+def test_the_drawing_shows_the_received_messages(scene: Scene) -> None:
     nothing = compute_snapshot(scene, Shelf())
     assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
     left, right = edges()

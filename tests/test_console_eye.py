@@ -1,4 +1,4 @@
-"""Looking through the user's eye, and what is put back."""
+"""Test the view from the user's eye, and its reset."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
     assert len(sent) == 4, "a scene changes nothing of what another has set"
 
 
-def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
+def test_after_a_view_each_scene_has_its_own_correction_until_one_is_selected(
     scene: Scene, tmp_path: Path
 ) -> None:
     def corrected_by(correction: Correction | None) -> Scene:
@@ -125,8 +125,8 @@ def frame(label: str, *, pixels: bool = True) -> Frame:
     )
 
 
-def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
-    """On a busy computer each picture came after the next was asked for, and none was shown."""
+def test_a_slow_image_is_still_shown(scene: Scene) -> None:
+    """On a busy computer each image came after the next request, and none was shown."""
     sent: list[Message] = []
     eye_view = EyeViewRequester(sent.append, scene)
     eye_view.enabled = True
@@ -157,7 +157,7 @@ def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
     assert eye_view.state is EyeViewState.DRAWING
 
 
-def test_a_picture_that_never_comes_is_given_up(scene: Scene) -> None:
+def test_an_image_that_never_comes_is_abandoned(scene: Scene) -> None:
     eye_view = EyeViewRequester(lambda message: None, scene)
     eye_view.enabled = True
     eye_view.advance(1.0)
@@ -176,7 +176,7 @@ def test_a_picture_that_never_comes_is_given_up(scene: Scene) -> None:
         (EyeViewState.RESTING, None, "No frame or image"),
     ],
 )
-def test_the_eye_tab_says_what_it_waits_for(
+def test_the_eye_tab_shows_what_it_waits_for(
     state: EyeViewState, ago_s: float | None, expected: str
 ) -> None:
     html = panels.eye(possible=True, enabled=True, state=state, waited_s=7.0, ago_s=ago_s)

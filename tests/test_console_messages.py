@@ -1,4 +1,4 @@
-"""Messages are opened only when somebody looks."""
+"""Test that messages are decoded only for viewers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.console_parts import frames_of
 Floats = NDArray[np.float64]
 
 
-def test_only_what_is_looked_at_is_opened() -> None:
+def test_only_shown_messages_are_decoded() -> None:
     refused: list[tuple[Topic, WireError]] = []
     newest = LatestMessages(lambda topic, error: refused.append((topic, error)))
     assert newest.latest("estop", EStop) is None

@@ -1,4 +1,4 @@
-"""What the page shows agrees with what the node holds, whatever was asked for."""
+"""Test that the page agrees with the node's state after any request."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TICK_S = 0.04
 
 @dataclass
 class Bench:
-    """A page without a viewer, and what its node sent."""
+    """Page without a viewer, and the messages of its node."""
 
     operator: Operator
     bags: Path
@@ -59,7 +59,7 @@ class Bench:
         self.operator.refresh_tables(self.now_s)
 
     async def change_scene(self, name: str, value: float) -> None:
-        """Move one of the scene's sliders, and wait until the new object is known."""
+        """Move one of the scene's sliders, and wait until the new object is ready."""
         self.operator.handle_request("slide", name, value)
         self.run(2.0 * SETTLE_S)
         await self.know_object()
@@ -70,7 +70,7 @@ class Bench:
         await task
 
     def depth_m(self) -> float:
-        """How deep the finger is in the cylinder's side, along its path."""
+        """Return the depth of the finger in the cylinder's side, along its path."""
         tips = [one.positions_world_m[0] for one in self.sent if isinstance(one, FingerPath)]
         solid = self.operator.controller.scenes.scene.object
         away = (tips[-1] - solid.world_from_object.position_m)[1:]
@@ -146,7 +146,7 @@ async def test_lifted_the_finger_comes_down_where_the_sliders_are(bench: Bench) 
     bench.assert_agreement()
 
 
-async def test_after_a_refused_command_the_page_shows_what_holds(bench: Bench) -> None:
+async def test_after_a_rejected_command_the_page_shows_what_holds(bench: Bench) -> None:
     bench.operator.handle_request("push", 0.006)
     bench.touch._depth.value = 30.0
     bench.operator.handle_request("push", float("nan"))
@@ -181,7 +181,7 @@ def display(label: str) -> Display:
 async def test_own_display_messages_are_known_by_their_writer(
     bench: Bench, writer: str, restored: bool
 ) -> None:
-    """A label says nothing: another writer may use the console's words."""
+    """Labels do not identify messages: another writer can use the console's labels."""
     eye_view = bench.operator.controller.eye_view
     others = display("console 1")
     bench.operator.on_message(others, Header(1, 1, 1, "clock", writer, 1), 0.0)
@@ -192,7 +192,7 @@ async def test_own_display_messages_are_known_by_their_writer(
     assert (bench.sent[-1] is others) == restored
 
 
-async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench: Bench) -> None:
+async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench) -> None:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)

@@ -1,4 +1,4 @@
-"""The page in a browser: real clicks, drags and keys, judged by what the graph then did."""
+"""Test the page in a browser by real clicks, drags and keys, and the graph's reaction."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 OBJECT_PX = (244, 162)
-"""Where the object's middle is, behind the sheet, in the page of 860 x 420 pixels."""
+"""Position of the object's middle, behind the sheet, in the page of 860 x 420 pixels."""
 UNNAMED = """() => [...document.querySelectorAll(
     "button, input:not([type=hidden]), [role=button], [role=slider]"
 )].filter(one => one.checkVisibility() && !one.labels?.length && !one.textContent.trim()
     && !one.ariaLabel).map(one => one.outerHTML).join()"""
-"""Controls that a screen reader could not name."""
+"""Script that returns the controls without an accessible name."""
 
 pytestmark = BROWSER_MARKS
 
 
 @dataclass
 class Heard:
-    """What the graph said, by topic, in order."""
+    """Messages of the graph by topic, in order."""
 
     messages: dict[str, list[Any]] = field(default_factory=dict)
     fingers_on_first_object: int = 0
@@ -95,7 +95,7 @@ def free_port() -> int:
 
 @dataclass
 class Session:
-    """What one visit to the page left."""
+    """Results of one visit to the page."""
 
     heard: Heard
     bag: Path
@@ -105,7 +105,7 @@ class Session:
 
 
 async def refused(port: int, **headers: str) -> str:
-    """What a connection to the page's socket with such headers is answered."""
+    """Return the answer to a connection to the page's socket with such headers."""
     try:
         async with websockets.connect(
             f"ws://127.0.0.1:{port}", additional_headers=headers, open_timeout=DEADLINE_S
@@ -116,14 +116,14 @@ async def refused(port: int, **headers: str) -> str:
 
 
 async def slide(page: Page, label: str, value: str) -> None:
-    """Type into the number beside a slider, as a keyboard user would."""
+    """Enter the number beside a slider by keyboard."""
     box = page.get_by_role("textbox", name=label)
     await box.fill(value)
     await box.press("Enter")
 
 
 async def visit(page: Page, session: Session, port: int) -> None:
-    """Do with the page what a person would."""
+    """Use the page as a user does."""
     await page.goto(f"http://127.0.0.1:{port}/")
     await expect(page.get_by_role("button", name="E-STOP")).to_be_visible()
     await expect(page.get_by_role("combobox", name="Scene")).to_have_value("cylinder")
@@ -182,7 +182,7 @@ async def touch(page: Page, heard: Heard) -> None:
 
 
 async def push(page: Page, heard: Heard, depth_mm: float) -> None:
-    """Push by slider, and wait until the finger is as deep as that."""
+    """Push by slider, and wait until the finger has that depth."""
     await slide(page, "Push, mm", f"{depth_mm:g}")
     await heard.until(
         lambda: abs(1e3 * height_m(heard) + depth_mm) < 0.5, f"a finger {depth_mm:g} mm deep"
@@ -253,7 +253,7 @@ def engaged(heard: Heard) -> str | None:
 
 @pytest.fixture(scope="module")
 def session() -> Any:
-    """One visit for all tests: a browser takes its time to start."""
+    """Visit the page once for all tests, since a browser starts slowly."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(runs.ROOT_VARIABLE, str(folder / "runs"))

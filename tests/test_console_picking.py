@@ -1,4 +1,4 @@
-"""What the mouse means, and how the finger gets there."""
+"""Test the meaning of the pointer, and the path of the finger."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
 
 
 def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
-    """Where the finger (3,) is once it does not move any more; each step within its speed."""
+    """Return the finger (3,) after it has stopped; each step is within its speed."""
     for _ in range(200):
         count = len(sent)
         finger.advance(0.05, None)
@@ -93,13 +93,13 @@ def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
 
 
 def depth_m(scene: Scene, point: Floats) -> float:
-    """How deep a point is in the cylinder's side."""
+    """Return the depth of a point in the cylinder's side."""
     away = (point - scene.object.world_from_object.position_m)[1:]
     return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
 
 
-def test_what_is_wanted_of_the_finger_outlives_scenes_and_lifting(scene: Scene) -> None:
-    """The push was forgotten with each new scene, and by lifting the finger."""
+def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
+    """The push was lost with each new scene, and by lifting the finger."""
     sent: list[FingerPath] = []
     finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
     finger.use(SurfacePicker(scene))
@@ -139,7 +139,7 @@ commands = st.one_of(
 
 
 @given(st.lists(commands, max_size=12))
-def test_the_finger_depends_on_what_is_wanted_and_not_on_how_it_came_about(
+def test_the_finger_depends_only_on_the_present_request(
     steps: list[tuple[Any, ...]],
 ) -> None:
     finger = FingerController(lambda message: None, speed_m_per_s=1.0)
@@ -169,7 +169,7 @@ def test_the_finger_depends_on_what_is_wanted_and_not_on_how_it_came_about(
     np.testing.assert_allclose(finger._last_point, led)
 
 
-def test_a_finger_that_cannot_be_moved_says_why(scene: Scene) -> None:
+def test_a_finger_that_cannot_be_moved_has_a_reason(scene: Scene) -> None:
     finger = FingerController(lambda message: None, speed_m_per_s=0.1)
     finger.use(SurfacePicker(scene))
     for depth in (-0.001, np.nan, np.inf):

@@ -1,4 +1,4 @@
-"""What a plan makes of a console."""
+"""Test the plan of a console."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert [writer.name for writer in without.writers["scene"]] == ["launch"]
 
 
-def test_what_the_file_says_of_console_and_recorder_stays(graph: Path, tmp_path: Path) -> None:
+def test_the_files_console_and_recorder_remain(graph: Path, tmp_path: Path) -> None:
     text = graph.read_text()
     graph.write_text(text + "  page: {type: console, parameters: {page_port: 9}}\n")
     plan = load_graph(graph, console=True, record=tmp_path / "a.mcap")
@@ -76,7 +76,7 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
     assert always == replace(on_request, records_on_request=False)
 
 
-def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:
-    """On two busy cores the first picture of the Eye tab took a minute and a half."""
+def test_a_requested_image_has_the_priority_of_a_frame() -> None:
+    """On two busy cores the first image of the Eye tab took a minute and a half."""
     nodes = load_graph(ROOT / "launch" / "demo.yaml").nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice

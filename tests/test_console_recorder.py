@@ -1,4 +1,4 @@
-"""The recorder that waits for the console's word."""
+"""Test the recorder that waits for the console's request."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path)
     assert node.errors == 0
 
 
-async def test_a_recorder_that_cannot_begin_says_so_and_goes_on(tmp_path: Path) -> None:
+async def test_a_recorder_that_cannot_start_reports_it_and_continues(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     node = build_node(
         Recorder,

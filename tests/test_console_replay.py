@@ -1,4 +1,4 @@
-"""A bag that is shown in place of the running graph."""
+"""Test the display of a bag in place of the running graph."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def bag(tmp_path: Path, scene: Scene) -> Path:
-    """Ten seconds of a finger that moves 1 mm a second, with a moment at 4 s."""
+    """Write ten seconds of a finger that moves at 1 mm/s, with a bookmark at 4 s."""
     path = tmp_path / "sub" / "a.mcap"
     path.parent.mkdir()
     start_ns = 1_000_000_000_000
@@ -71,7 +71,7 @@ def test_a_bag_is_shown_as_it_was_at_any_moment(bag: Path) -> None:
     assert list_bags(bag.parent.parent) == ["sub/a.mcap"]
 
 
-def test_bags_that_cannot_be_shown_say_why(tmp_path: Path, bag: Path) -> None:
+def test_bags_that_cannot_be_shown_give_a_reason(tmp_path: Path, bag: Path) -> None:
     with pytest.raises(BagError, match="cannot be read"):
         Timeline(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("no bag")

@@ -1,4 +1,4 @@
-"""Scenes that are chosen, changed by sliders, and taken up again."""
+"""Test scenes that are selected, changed by sliders, and restored."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
         ("size_ratio", np.inf),
     ],
 )
-def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: float) -> None:
+def test_values_that_make_no_scene_are_rejected(scene: Scene, name: str, value: float) -> None:
     good = {"young_modulus_pa": 4e3, "stretch_ratio": 1.02, "size_ratio": 1.0}
     with pytest.raises(scenes.SceneChoiceError):
         scenes.edit_scene(scene, **good | {name: value})
@@ -83,7 +83,7 @@ def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: f
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
-    """At more than 8 % the arms of the demo stood still, and the scene's own limit was raised."""
+    """At more than 8 % the arms of the demo stopped, and the scene's own limit was raised."""
     scene = load_scene(path)
     limit = scenes.max_stretch_ratio(scene)
     tight = scenes.edit_scene(
@@ -117,7 +117,7 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     assert len(sent) == 2
 
 
-def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_path: Path) -> None:
+def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "plan.json").write_text(f'{{"scene": {scene.model_dump_json()}}}')
     other = scene.model_copy(update={"name": "other"})
     (tmp_path / "scenes").mkdir()

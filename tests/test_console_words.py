@@ -1,4 +1,4 @@
-"""What the page tells: tables, banner, latencies, in words and colours that can be read."""
+"""Test the page's texts: tables, banner, latencies, and readable colours."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def status(node: str, **changes: Any) -> Status:
     return Status(**values | changes)
 
 
-def test_tables_say_in_words_what_is_wrong() -> None:
+def test_tables_name_faults() -> None:
     statuses = {
         "camera": (status("camera", outputs=(port("stereo", rate_hz=3.0), port("eye"))), 0.5),
         "planner": (status("planner", inputs=(port("stereo", dropped=7, gaps=2, rejected=1),)), 0),
@@ -116,7 +116,7 @@ def test_the_banner_shows_the_most_urgent_state(
         assert "cylinder</b>, live. 8 jobs a core." in html, "the cause comes first"
 
 
-def test_the_banner_says_what_is_wrong_and_what_to_do() -> None:
+def test_the_banner_names_the_fault_and_the_remedy() -> None:
     follow = {"left": arm_state("left", edge_force_n=5.1), "right": arm_state("right")}
     assert "5.1 N" in rendered(arms=follow)
     fault = rendered(arms={"left": FAULTY_ARM})
@@ -152,7 +152,7 @@ def test_arms_that_start_are_no_fault() -> None:
 
 
 @pytest.mark.parametrize("auto", [True, False])
-def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
+def test_only_arms_that_wait_for_arming_are_shown_as_such(auto: bool) -> None:
     stopped = rendered(arms=arms_in(mode="estop", auto_arming=auto), estop_reason="why")
     faulty = rendered(arms=arms_in(mode="fault", faults=("x",), auto_arming=auto))
     idle = rendered(arms=arms_in(mode="idle", auto_arming=auto))
@@ -162,7 +162,7 @@ def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
         assert ("flexsheet arms enable" in html) != auto
 
 
-def test_under_the_banner_stands_why_nothing_happens() -> None:
+def test_the_reason_for_no_motion_is_below_the_banner() -> None:
     idle = {"left": arm_state("left", mode="idle", reason="not told <yet>")}
     assert "The left arm reports: not told &lt;yet&gt;." in rendered(arms=idle)
     assert "9 s left" in rendered(solver_note="precomputing the soft body: 9 s left")
@@ -186,7 +186,7 @@ def test_names_with_markup_are_shown_as_text() -> None:
         assert "<img" not in html
 
 
-def test_words_of_the_tabs() -> None:
+def test_texts_of_the_tabs() -> None:
     assert "No fingertip" in panels.finger(None)
     lost = fingertip(np.zeros(3)).model_copy(update={"valid": False, "reason": "no_marker"})
     assert "not tracked: no mark" in panels.finger(lost)
@@ -201,7 +201,7 @@ def test_words_of_the_tabs() -> None:
 
 
 def colors_of(scheme: str) -> dict[str, str]:
-    """The page's own colours by name, on a page that is "light" or "dark"."""
+    """Return the page's colours by name, in the scheme "light" or "dark"."""
     blocks = re.findall(r"^html:root(\S*) \{(.*?)^\}", PAGE_STYLE, re.MULTILINE | re.DOTALL)
     found: dict[str, str] = {}
     for where, block in blocks:
@@ -211,13 +211,13 @@ def colors_of(scheme: str) -> dict[str, str]:
 
 
 def contrast(one: str, other: str) -> float:
-    """WCAG's ratio of two colours, 1 to 21."""
+    """Return WCAG's contrast ratio of two colours, 1 to 21."""
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out_as_much_as_wcag_aa_asks(scheme: str) -> None:
+def test_text_has_the_contrast_of_wcag_aa(scheme: str) -> None:
     colors = colors_of(scheme)
     ground = colors["ground"]
     for name in ("text", "quiet", "good", "warn", "bad", "accent"):
@@ -229,7 +229,7 @@ def test_text_stands_out_as_much_as_wcag_aa_asks(scheme: str) -> None:
         assert contrast(color, ground) >= 3.0, color
 
 
-def test_white_stands_out_on_every_banner() -> None:
+def test_white_has_contrast_on_every_banner() -> None:
     grounds = re.findall(r"\.fs-ground-(\w+) \{\s*background: (#[0-9a-f]{6})", PAGE_STYLE)
     assert {name for name, _ in grounds} == {"good", "warn", "bad", "quiet"}
     assert all(contrast(color, "#ffffff") >= 4.5 for _, color in grounds)

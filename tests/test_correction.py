@@ -1,4 +1,4 @@
-"""Equations (1)-(6): what they promise, on planes, on the pushed sheet, and where they fail."""
+"""Test equations (1)-(6): their validity on planes and on the pushed sheet, and their limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def tilted(tilt_x: float, tilt_y: float, centre: np.ndarray) -> ScreenPlane:
 
 
 def seen_at(on_screen: np.ndarray, screen_point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Where the eye sees, on z = 0, the light sent through `on_screen` and caught by a plane."""
+    """Return the visible point on z = 0 of light sent through `on_screen` and reflected by a
+    plane."""
     ray = on_screen - PROJECTOR
     share = ((screen_point - PROJECTOR) @ normal) / (ray @ normal)
     return on_imaginary_screen(PROJECTOR + share[:, None] * ray, EYE)
@@ -135,7 +136,7 @@ def test_plane_edge_on_or_turned_away_is_masked(tilt_deg: float) -> None:
     assert not is_plane_usable(plane, EYE, PROJECTOR)
 
 
-def test_projector_edge_on_limit_is_where_the_geometry_says() -> None:
+def test_projector_edge_on_limit_agrees_with_the_geometry() -> None:
     sine_of_light = PROJECTOR / np.linalg.norm(PROJECTOR)
     limit = np.pi / 2 - np.arcsin(-sine_of_light[1]) - np.arcsin(GRAZING_SINE)
     assert is_plane_usable(tilted(limit - 1e-6, 0.0, np.zeros(3)), EYE, PROJECTOR)
@@ -159,7 +160,7 @@ def test_sheet_behind_the_eye_is_masked() -> None:
     assert not result.valid.any()
 
 
-def test_eye_behind_the_screen_is_refused() -> None:
+def test_eye_behind_the_screen_is_rejected() -> None:
     with pytest.raises(ValueError, match="not in front of the imaginary screen"):
         correct(np.zeros((1, 3)), eye=-EYE, projector=PROJECTOR, screen=make_flat_screen(FLAT))
     with pytest.raises(ValueError, match="not behind the imaginary screen"):

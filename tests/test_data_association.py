@@ -1,4 +1,4 @@
-"""Who is who among marks: known bystanders are not taken for the finger, which is found again."""
+"""Test data association: known clutter is not confused with the finger, which is found again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class Bench:
         self.time_s = 10.0
 
     def show(self, *markers: tuple[Place, Floats]) -> tuple[str, Floats | None]:
-        """One picture of marks with their looks: the reason, and the point that was chosen."""
+        """Process one image of markers with their appearances: return the reason and the selected
+        point."""
         self.time_s += FRAME_S
         at_ns = round(1e9 * self.time_s)
         candidates = [
@@ -93,12 +94,12 @@ def reasons(shown: Sequence[tuple[str, Floats | None]]) -> list[str]:
 
 
 def all_at(shown: Sequence[tuple[str, Floats | None]], place: Place, bench: Bench) -> bool:
-    """Return whether the last valid point is where that is now."""
+    """Return whether the last valid point is at the current position of that marker."""
     points = [point for reason, point in shown if reason == "ok" and point is not None]
     return bool(np.linalg.norm(points[-1] - place(bench.time_s)) < 1e-3)
 
 
-def test_a_known_bystander_is_not_taken_for_a_hidden_finger_which_then_comes_back() -> None:
+def test_tracked_clutter_is_not_confused_with_a_hidden_finger() -> None:
     bench = Bench()
     bench.run(0.2, (finger, SKIN))
     assert set(reasons(bench.run(0.5, (finger, SKIN), (bead, SKIN)))) == {"ok"}
@@ -108,7 +109,7 @@ def test_a_known_bystander_is_not_taken_for_a_hidden_finger_which_then_comes_bac
     assert all_at(again, finger, bench)
 
 
-def test_marks_that_pass_through_one_another_do_not_change_places() -> None:
+def test_markers_that_cross_are_not_swapped() -> None:
     bench = Bench()
 
     def passing(time_s: float) -> Floats:
@@ -124,12 +125,12 @@ def test_marks_that_pass_through_one_another_do_not_change_places() -> None:
     assert all_at(apart, finger, bench)
 
 
-def test_two_unknown_marks_are_one_too_many() -> None:
+def test_two_unknown_markers_are_ambiguous() -> None:
     bench = Bench()
     assert set(reasons(bench.run(2.0, (finger, SKIN), (bead, SKIN)))) == {"two_markers"}
 
 
-def test_of_two_unknown_marks_the_one_that_moves_is_the_finger() -> None:
+def test_of_two_unknown_markers_the_moving_one_is_the_finger() -> None:
     bench = Bench()
     shown = bench.run(2.0, (finger, SKIN), (lambda _: np.array([0.06, 0.0, 0.0]), SKIN))
     assert shown[0][0] == "two_markers"
@@ -137,7 +138,7 @@ def test_of_two_unknown_marks_the_one_that_moves_is_the_finger() -> None:
     assert all_at(shown, finger, bench)
 
 
-def test_a_lost_finger_is_known_by_its_looks() -> None:
+def test_a_lost_finger_is_recognised_by_its_appearance() -> None:
     bench = Bench()
     bench.run(1.0, (finger, SKIN))
     bench.time_s += 0.3
@@ -148,7 +149,7 @@ def test_a_lost_finger_is_known_by_its_looks() -> None:
     assert "ok" not in reasons(bench.run(0.5, (bead, CLOTH)))
 
 
-def test_a_moving_mark_that_stays_alone_becomes_the_finger_in_the_end() -> None:
+def test_a_sole_moving_marker_finally_becomes_the_finger() -> None:
     bench = Bench()
     bench.run(0.3, (finger, SKIN))
     bench.run(0.5, (finger, SKIN), (bead, SKIN))

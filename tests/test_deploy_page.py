@@ -1,4 +1,4 @@
-"""docs/deploy.md as what `make deploy-trial` types; and what it counts as having followed."""
+"""Test the parsing of docs/deploy.md for `make deploy-trial`, and the evaluation of following."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.doc_pages import ROOT
 LAB = ROOT / "launch" / "lab.yaml"
 
 
-def test_the_page_says_where_each_command_is_typed_and_how_it_ends() -> None:
+def test_the_page_gives_host_and_exit_code_of_each_command() -> None:
     found = list(steps(PAGE.read_text()))
     typed = [one.command for one in found]
     for part in ("keys new", "keys install", "launch", "doctor hosts", "arms enable", "^C"):
@@ -26,12 +26,12 @@ def test_the_page_says_where_each_command_is_typed_and_how_it_ends() -> None:
     ]
 
 
-def test_a_line_without_a_prompt_is_refused() -> None:
+def test_a_line_without_a_prompt_is_rejected() -> None:
     with pytest.raises(ValueError, match="line 2 has no prompt"):
         list(steps("```console\nflexsheet doctor\n```\n"))
 
 
-def test_an_arm_that_stands_has_not_followed() -> None:
+def test_a_resting_arm_has_not_followed() -> None:
     good = Stroke(seconds=10.0, following=1.0, apart_m=0.001, travel_m=0.03)
     stood = Stroke(seconds=10.0, following=0.1, apart_m=np.inf, travel_m=0.0)
     assert good.problems() == []
@@ -41,11 +41,11 @@ def test_an_arm_that_stands_has_not_followed() -> None:
 def test_a_bag_without_a_stroke_is_no_proof(tmp_path: Path) -> None:
     bag = tmp_path / "nothing.mcap"
     BagWriter(bag).close()
-    with pytest.raises(ValueError, match="no stroke is in it"):
+    with pytest.raises(ValueError, match="contains no stroke"):
         evaluate_stroke(bag)
 
 
-def test_a_bag_that_the_service_cannot_write_is_said(
+def test_a_bag_that_the_service_cannot_write_is_reported(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     install(launch_file=LAB, host="main", root=tmp_path, dry_run=True)

@@ -1,4 +1,4 @@
-"""A stereo pair to a fingertip: which spots are the mark, and each way in which there is none."""
+"""Test the detection of a fingertip in a stereo pair, and each reason for its rejection."""
 
 from __future__ import annotations
 
@@ -100,7 +100,8 @@ def error_m(measured: TriangulatedPoint | None, tip: Floats = HERE) -> float:
 def test_a_point_is_drawn_and_found_again(
     point: tuple[float, float, float], origin: tuple[int, int]
 ) -> None:
-    """Through calibrated lenses to two discs in regions of the sensor, and back."""
+    """The point is projected through calibrated lenses to two discs in regions of the sensor, and
+    back."""
     truth, seed = np.array(point), np.random.default_rng(1)
     pixels = GEOMETRY.project(truth)
     depth_m = rigid.apply(GEOMETRY.left_from_world, truth)[2]
@@ -134,7 +135,7 @@ def test_a_point_is_drawn_and_found_again(
 def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
     name: str, speed_m_per_s: float
 ) -> None:
-    """The normalised squared error has a mean of 3 where the stated covariance is the true one."""
+    """The normalised squared error has a mean of 3 if the reported covariance is correct."""
     camera, random = twin(), np.random.default_rng(3)
     errors, normalised, reasons = [], [], Counter[str]()
     for _ in range(40):
@@ -157,8 +158,9 @@ def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
     assert 0.5 < np.mean(normalised) < 6.0
 
 
-def test_without_an_expected_place_the_mark_is_found_as_well() -> None:
-    """The lab's own glints (on the clamps, on the nail) are smaller than a mark, or in one view."""
+def test_the_marker_is_also_found_without_an_expected_position() -> None:
+    """The lab's glints (on the clamps, on the nail) are smaller than a marker, or in one view
+    only."""
     camera, random = twin(), np.random.default_rng(5)
     for _ in range(20):
         tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
@@ -167,7 +169,7 @@ def test_without_an_expected_place_the_mark_is_found_as_well() -> None:
         assert error_m(measured, tip) < 5e-4
 
 
-def test_a_region_of_interest_gives_what_the_whole_picture_gives() -> None:
+def test_a_region_of_interest_gives_what_the_whole_image_gives() -> None:
     views = pictures(twin())
     whole, near = detect_in(views), detect_in(views, expected=HERE + 0.003)
     assert whole[0] == near[0] == "ok"
@@ -176,7 +178,7 @@ def test_a_region_of_interest_gives_what_the_whole_picture_gives() -> None:
     assert np.array_equal(whole[1].point_world, near[1].point_world)
 
 
-def test_pictures_of_regions_say_where_they_begin() -> None:
+def test_images_of_regions_have_their_origin() -> None:
     views = pictures(twin())
     full = detect_in(views)[1]
     cut = tuple(np.ascontiguousarray(view[180:320, 200:470]) for view in views)
@@ -196,7 +198,7 @@ def test_pictures_of_regions_say_where_they_begin() -> None:
     assert np.allclose(full.point_world, measured.point_world, atol=1e-6)
 
 
-def test_an_expected_place_that_is_no_place_is_no_hindrance() -> None:
+def test_an_invalid_expected_position_is_ignored() -> None:
     views = pictures(twin())
     behind = rigid.apply(GEOMETRY.world_from_left, np.array([0.0, 0.0, -0.3]))
     assert detect_in(views, expected=np.full(3, np.nan))[0] == "ok"
@@ -205,7 +207,7 @@ def test_an_expected_place_that_is_no_place_is_no_hindrance() -> None:
         assert detect_in(views, expected=nowhere, radius_m=20.0)[0] == "ok"
 
 
-def test_no_mark_and_a_mark_in_one_view() -> None:
+def test_no_marker_and_a_marker_in_one_view() -> None:
     empty = twin().picture(lambda _: HERE, exposure_s=0.004, marker=False)
     views = pictures(twin())
     for expected in (None, HERE):
@@ -221,14 +223,14 @@ def test_no_mark_and_a_mark_in_one_view() -> None:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_mark_that_one_camera_does_not_see(side: str) -> None:
+def test_a_marker_that_one_camera_does_not_see(side: str) -> None:
     hidden = covered(1.0, views="left" if side == "left" else "right")
     for expected in (None, HERE):
         reason, _ = detect_in(pictures(twin(together(LAB, hidden))), expected=expected)
         assert reason in ("marker_in_one_view", "inconsistent")
 
 
-def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
+def test_two_markers_are_ambiguous_unless_one_is_expected() -> None:
     views = pictures(twin(together(LAB, second_marker((0.03, 0.0, 0.0)))))
     assert detect_in(views)[0] == "two_markers"
     for there in (HERE, HERE + np.array([0.03, 0.0, 0.0])):
@@ -244,8 +246,8 @@ def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
 @pytest.mark.parametrize(
     ("radius_m", "views"), [(0.0012, "both"), (0.008, "both"), (0.003, "left")]
 )
-def test_a_light_that_is_no_mark_does_not_count(radius_m: float, views: str) -> None:
-    """Too small or too large for its depth, or in one view only."""
+def test_a_light_that_is_no_marker_does_not_count(radius_m: float, views: str) -> None:
+    """The light is too small or too large for its depth, or in one view only."""
     blob = Highlight(FixedPoint((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
     for expected in (None, HERE):
         reason, measured = detect_in(
@@ -263,7 +265,7 @@ def test_lights_that_do_not_belong_together_are_inconsistent() -> None:
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0])
-def test_a_mark_that_a_light_touches_is_right_or_refused(overlap: float) -> None:
+def test_a_marker_that_a_light_touches_is_right_or_rejected(overlap: float) -> None:
     camera, random = twin(together(LAB, touching_highlight(overlap))), np.random.default_rng(2)
     for _ in range(8):
         tip = random.uniform([-0.05, -0.05, 0.0], [0.05, 0.05, 0.05])
@@ -274,7 +276,7 @@ def test_a_mark_that_a_light_touches_is_right_or_refused(overlap: float) -> None
 
 
 @pytest.mark.parametrize("share", [0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])
-def test_a_mark_that_is_partly_hidden_is_right_or_refused(share: float) -> None:
+def test_a_marker_that_is_partly_hidden_is_right_or_rejected(share: float) -> None:
     camera, random = twin(together(LAB, covered(share))), np.random.default_rng(2)
     for _ in range(8):
         tip = random.uniform([-0.05, -0.05, 0.0], [0.05, 0.05, 0.05])
@@ -285,7 +287,7 @@ def test_a_mark_that_is_partly_hidden_is_right_or_refused(share: float) -> None:
 
 
 @pytest.mark.parametrize("defocus_px", [0.5, 1.0, 1.5, 2.0, 3.0, 5.0])
-def test_a_mark_out_of_focus_is_honest_or_refused(defocus_px: float) -> None:
+def test_a_marker_out_of_focus_has_a_true_covariance_or_is_rejected(defocus_px: float) -> None:
     sensor = Sensor(aperture_m=0.05).out_of_focus(defocus_px, 0.48, 540.0)
     camera = twin(aperture_m=sensor.aperture_m, focus_m=sensor.focus_m)
     reason, measured = detect_in(pictures(camera), expected=HERE)
@@ -298,7 +300,7 @@ def test_a_mark_out_of_focus_is_honest_or_refused(defocus_px: float) -> None:
         assert error_m(measured) < 5e-4
 
 
-def test_a_picture_too_bright_to_tell_is_saturated() -> None:
+def test_a_too_bright_image_is_saturated() -> None:
     white = np.full((480, 640), 255, np.uint8)
     views = pictures(twin())
     assert detect_in((white, white))[0] == "saturated"
@@ -329,7 +331,7 @@ def test_beyond_the_volume_and_beyond_what_can_be_known() -> None:
     assert error_m(measured) < 4e-4
 
 
-def test_a_baseline_too_short_for_the_depth_is_refused_not_guessed() -> None:
+def test_a_baseline_too_short_for_the_depth_is_rejected_not_guessed() -> None:
     """With 2 mm between the cameras a hundredth of a pixel is 2 mm of depth."""
     short = SCENE.camera.right_from_left.copy()
     short[:3, 3] *= 0.002 / 0.1205

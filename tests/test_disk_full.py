@@ -1,4 +1,4 @@
-"""With the disk full, a command ends with one line, and leaves no file that it could not finish."""
+"""Test that a command on a full disk ends with one line, and leaves no incomplete file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
 
 def fill(disk: Path) -> None:
-    """Leave not a byte."""
+    """Fill the disk completely."""
     with (disk / "filler").open("wb", buffering=0) as file:
         try:
             while file.write(bytes(1 << 16)):

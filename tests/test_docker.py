@@ -1,4 +1,4 @@
-"""Compose files and systemd unit, as far as can be told without an engine."""
+"""Test compose files and the systemd unit without running them."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_what_is_told_as_json_is_installed_too(tmp_path: Path) -> None:
+def test_packages_in_the_json_output_are_installed_too(tmp_path: Path) -> None:
     done = CliRunner().invoke(
         app,
         ["service", "install", str(ROOT / "launch" / "three.yaml"), "--host", "left",

@@ -1,4 +1,4 @@
-"""The documentation hangs together: each page in the navigation, no link into the void."""
+"""Test the links of the documentation, and that the navigation contains each page."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from website.graph import LAB, TWIN, GraphDrawing
 from website.pages import generate
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
-"""Topics that the pictures of the graph leave out, as their page says."""
+"""Topics that the drawings of the graph omit, as their page explains."""
 
 START = DOCS / "index.md"
 
 
 def targets(page: Path) -> set[Path]:
-    """Pages of the site that a page links to."""
+    """Return the pages of the site that a page links to."""
     found = ((page.parent / link.target.partition("#")[0]).resolve() for link in links(page))
     return {target for target in found if target.suffix == ".md" and DOCS in target.parents}
 
@@ -34,7 +34,7 @@ def test_each_page_is_in_the_navigation_once() -> None:
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)
-def test_links_anchors_and_pictures_are_there(page: Path) -> None:
+def test_links_anchors_and_images_are_there(page: Path) -> None:
     for link in links(page):
         if link.target.startswith(("http://", "https://")):
             continue
@@ -71,7 +71,7 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
 
 
 @pytest.mark.parametrize(("drawing", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
-def test_pictures_of_the_graph_show_what_launch_files_say(drawing: GraphDrawing, file: str) -> None:
+def test_drawings_of_the_graph_agree_with_launch_files(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
         (writer.name, port.topic, node.name)

@@ -1,9 +1,9 @@
-"""What the documentation shows, runs.
+"""Test that the code of the documentation runs.
 
-Blocks of Python run, page by page, each page in one namespace.  Blocks of YAML are checked as what
-they look like: a launch file, nodes of one, a node's parameters, parts of a scene.  In blocks of
-shell, and in code within the text, each call of ours is parsed as the command line would; what is
-cheap is run.  `<!-- not run: why -->` before a block leaves it at reading and parsing.
+Python blocks run page by page, each page in one namespace. YAML blocks are validated by their form:
+a launch file, nodes of one, a node's parameters, parts of a scene. In shell blocks, and in code
+within the text, each call of `flexsheet` is parsed; fast ones run. `<!-- not run: why -->` before a
+block limits the test to parsing.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ OTHERS = {
     "ip", "journalctl", "mkdir", "nano", "pip-compile", "scp", "sleep", "ssh", "sysctl",
     "systemctl", "systemd-analyze", "useradd", "^C",
 }  # fmt: skip
-"""Programs of others that pages may call."""
+"""Other programs that pages may call."""
 
 AT_ONCE = ("--help", "--version", "--install-completion", "--show-completion")
-"""Options that do what they say as soon as they are read, in the reader's home as well."""
+"""Options that act during parsing, also in the reader's home."""
 
 LACKS_SOMETHING = ("MissingParameter", "NoArgsIsHelpError")
-"""What a command line says to the bare name of a command."""
+"""Errors of the command line for a command name without its arguments."""
 
 CHEAP = (
     "flexsheet node ",
@@ -58,8 +58,8 @@ CHEAP = (
     "flexsheet calibrate board",
     "flexsheet keys new",
 )
-"""Run as they stand, in a folder of their own; but for those of the generated pages (`sh`), which
-are the command line's own examples and call for files that are not there."""
+"""Commands to run, in a separate folder. Examples of the generated pages (`sh`) are excluded,
+because they use files that do not exist."""
 
 
 def with_language(*languages: str) -> dict[Path, list[Block]]:
@@ -69,7 +69,7 @@ def with_language(*languages: str) -> dict[Path, list[Block]]:
 
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to be in, with the project's launch files and nothing of the user's."""
+    """Create a working folder with the project's launch files and without the user's files."""
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     for linked in ("scenes", "calibrations"):
         (tmp_path / linked).symlink_to(ROOT / "launch" / linked)
@@ -80,7 +80,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_each_block_says_what_it_is() -> None:
+def test_each_block_names_its_language() -> None:
     for block in (block for those in BLOCKS.values() for block in those):
         assert block.language in LANGUAGES, (
             f"{block.place}: ```{block.language}; one of {', '.join(sorted(LANGUAGES))}"
@@ -112,9 +112,7 @@ def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     "block", [b for those in with_language("yaml").values() for b in those], ids=lambda b: b.place
 )
-def test_yaml_is_what_it_looks_like(
-    block: Block, clone: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_yaml_blocks_are_valid(block: Block, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = YAML(typ="safe").load(block.text)
     if block.not_run is None:
         write_modules(block.page, clone, monkeypatch)
@@ -122,7 +120,7 @@ def test_yaml_is_what_it_looks_like(
 
 
 def write_modules(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file for the page's first block of Python, if it is to be one: it begins by saying so."""
+    """Write the page's first Python block to a file if it names one in its first line."""
     first = next(iter(with_language("python").get(page, [])), None)
     if first is not None and first.text.startswith('"""'):
         for named in re.findall(r"(\w+):\w+", page.read_text()):
@@ -160,7 +158,7 @@ def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """The calls of a block, word by word, without comments, sudo and what is set for one call."""
+    """Yield the calls of a block as words, without comments, sudo and variables."""
     for line in text.replace("\\\n", " ").splitlines():
         line = re.sub(r"^\w+\$ ", "", line)  # noqa: PLW2901  # a prompt of a console
         call: list[str] = []
@@ -174,7 +172,7 @@ def commands(text: str) -> Iterator[list[str]]:
 
 
 def program(call: Sequence[str]) -> list[str]:
-    """The call without `-u USER`, which belongs to sudo, and what follows that."""
+    """Return the call without sudo's `-u USER`."""
     while call[0] == "-u" or re.fullmatch(r"[A-Z_]+=.*", call[0]):
         call = call[2:] if call[0] == "-u" else call[1:]
     return list(call)
@@ -183,7 +181,7 @@ def program(call: Sequence[str]) -> list[str]:
 def check_call(
     call: Sequence[str], written: set[str], place: str, *, may_name_only: bool = False
 ) -> None:
-    """Return whether a call can be made as it stands; or is the name of one at least.
+    """Return whether a call can be parsed, or is the name of a command.
 
     written: files that calls of the page have written.
     """
@@ -222,7 +220,7 @@ def test_each_call_in_a_block_can_be_made(page: Path) -> None:
 
 @pytest.mark.parametrize("page", pages(), ids=name)
 def test_each_call_within_the_text_can_be_made(page: Path) -> None:
-    """Those that are whole: without dots, bars and brackets."""
+    """Only complete calls are tested: without dots, bars and brackets."""
     written = {word for those in BLOCKS[page] for call in calls_of(those) for word in call}
     for line, span in code_spans(page):
         first = span.split(maxsplit=1)[0] if span.split() else ""

@@ -87,7 +87,7 @@ def said(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> S
 
 
 def good(plan: ResolvedGraph) -> dict[str, HostProbe]:
-    """What three hosts say where all is well."""
+    """Return the reports of three hosts without faults."""
     found = {}
     for name in plan.hosts:
         nodes = plan.nodes_on(name)
@@ -305,7 +305,7 @@ async def test_how_far_one_comes_by_tcp(monkeypatch: pytest.MonkeyPatch) -> None
 async def shaken(
     known: Hosts, server: str | None, expected: str, asker: str = "main"
 ) -> Reachability:
-    """What the asker finds at a publisher of `server` where he expects `expected`."""
+    """Return the finding at a publisher of `server` where `expected` is expected."""
     keys = None if server is None else known.ring(server)
     publisher = Publisher(TOPICS["host"], ["tcp://127.0.0.1:*"], keys=keys)
     try:
@@ -316,7 +316,7 @@ async def shaken(
         publisher.close()
 
 
-async def test_keys_that_do_not_fit_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_keys_that_do_not_match_are_distinguished(monkeypatch: pytest.MonkeyPatch) -> None:
     with hosts("main", "left") as known:
         assert await shaken(known, "left", "left") == Reachability.RESPONDING
         assert await shaken(known, "main", "left") == Reachability.KEY_MISMATCH
@@ -363,7 +363,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
         assert ("main", "plan", "failed") in bad(found)
 
 
-def test_own_keys_and_address_are_looked_at_before_the_start(
+def test_own_keys_and_address_are_checked_before_the_start(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.find_opengl_problem", lambda: "no EGL")

@@ -1,4 +1,4 @@
-"""Launch files and scenes that are too large, too deep or no text are refused before parsing."""
+"""Test that launch files and scenes that are too large, too deep or not text are rejected early."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ HOSTILE = {
 
 @pytest.fixture
 def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Counts the tokens that a test has read from a file: the work that was done."""
+    """Count the tokens that a test has read from a file."""
     counted = [0]
     scan = YAML.scan
 
@@ -60,7 +60,7 @@ def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-def test_a_hostile_file_is_refused_with_little_work(
+def test_a_hostile_file_is_rejected_with_little_work(
     tmp_path: Path, tokens: list[int], name: str
 ) -> None:
     text, said = HOSTILE[name]
@@ -75,7 +75,7 @@ def test_a_hostile_file_is_refused_with_little_work(
     assert tokens[0] < MAX_TOKENS
 
 
-def test_what_is_no_utf_8_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_utf_8_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_bytes(b"nodes: {a: \xff\xfe}\n")
     with pytest.raises(BadInputError, match="is not UTF-8 text"):
@@ -96,7 +96,7 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
 
 
 class Choice(BaseModel):
-    """A model whose errors quote pydantic's own wording, and whose keys look like its tags."""
+    """Model whose errors quote pydantic's texts, and whose keys look like its tags."""
 
     model_config = ConfigDict(extra="forbid")
 

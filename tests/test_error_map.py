@@ -1,4 +1,4 @@
-"""The dense map of the image's errors: nought where nothing is off; what was moved comes out."""
+"""Test the dense error map of the image: zero without errors, and known displacements."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCALE_M = 0.0007
 
 
 def painted(places: NDArray[np.float64]) -> Image:
-    """What a pattern of places (rows, columns) m looks like; black where not a number."""
+    """Render a pattern of positions (rows, columns) m; black for NaN."""
     phase = 2.0 * np.pi * places / PERIOD_M
     coarse = 0.2 + 0.8 * (places / RANGE_M + 0.5)
     colours = np.stack([0.5 + 0.5 * np.cos(phase), 0.5 + 0.5 * np.sin(phase), coarse], axis=-1)
@@ -61,7 +61,8 @@ def test_blended_colours_are_left_out() -> None:
 
 
 def test_the_renderer_paints_what_the_twin_reads() -> None:
-    """On an unpushed sheet nothing is off; moved to the side unknown to the renderer, all is."""
+    """The error is zero on an unpushed sheet, and constant on a sheet that was displaced
+    unnoticed."""
     stage = SceneRenderer(SCENE, headless_context(), spacing_m=0.005)
     sheet = SCENE.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)

@@ -1,4 +1,4 @@
-"""A launcher's e-stop: who it takes one from, and that it survives all launchers."""
+"""Test a launcher's e-stop: accepted senders, and its persistence across restarts."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def plan_of(folder: Path, *, arming: str = "manual") -> ResolvedGraph:
-    """A graph in which an arm waits for a person's word; only its launchers are started."""
+    """Load a graph with an arm that waits for arming; only its launchers are started."""
     path = folder / "graph.yaml"
     bridge = BRIDGE | {"parameters": {"side": "left", "arming": arming}}
     topics = ["arm_right", "scene", "sheet_target"]
@@ -65,7 +65,7 @@ def plan_of(folder: Path, *, arming: str = "manual") -> ResolvedGraph:
 
 @dataclass
 class Launchers:
-    """The host agents of all hosts, and a tool that sends e-stops."""
+    """Host agents of all hosts, and a tool that sends e-stops."""
 
     folder: Path
     plan: ResolvedGraph
@@ -118,7 +118,10 @@ class Launchers:
         return endpoint.replace(RUN_DIRECTORY, str(self.folder))
 
     def say(self, estop: EStop, *, before_ns: int = 0) -> None:
-        """Publish as a tool on main does.  before_ns: age of the stamp; negative: in the future."""
+        """Publish as a tool on main does.
+
+        before_ns: age of the stamp; negative: in the future.
+        """
         self._sequence += 1
         now_ns = self._clock.now_ns() - before_ns
         self._tool.send(
@@ -128,10 +131,9 @@ class Launchers:
         )  # fmt: skip
 
     async def heard_late(self, expected: str | None) -> set[str]:
-        """Reasons of the e-stops that a bridge hears which is started only now.
+        """Return the reasons of the e-stops that a new bridge receives.
 
-        Waits for a reason with the expected text; without one, for a while in which none shall
-        come.
+        Wait for a reason with the expected text; without one, wait NOTHING_COMES_S.
         """
         found: set[str] = set()
         others = [one for one in self.plan.sources_to_read("estop") if one.writer != "tools"]
@@ -184,7 +186,7 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
         assert await third.heard_late(None) == set()
 
 
-async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
+async def test_a_reset_from_the_future_is_rejected(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
         launchers.say(STOP)
         await until(lambda: len(files(folder)) == 2, launchers.said)
@@ -195,7 +197,7 @@ async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
 
 
 def test_a_bridge_refuses_a_reset_from_the_future() -> None:
-    """It would clear, sent again to a late reader, all stops until then."""
+    """Sent again to a late reader, it would clear all stops until then."""
     control = ArmControl(Timeouts(0.02, 0.1), max_tracking_error_rad=0.12)
     assert control.on_estop(STOP, 200, 200) is None
     now_ns = 10**9
@@ -216,7 +218,7 @@ async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
         assert any("arms reset" in line for line in launchers.said)
 
 
-async def test_what_cannot_be_written_is_said_kept_and_tried_again(folder: Path) -> None:
+async def test_failed_writes_are_reported_and_retried(folder: Path) -> None:
     plan = plan_of(folder)
     (folder / "state").write_text("no folder")
     async with Launchers(folder, plan) as launchers:
@@ -235,7 +237,7 @@ async def test_a_reason_without_end_is_cut(folder: Path) -> None:
 
 
 def test_graphs_of_other_arms_keep_stops_of_their_own(folder: Path) -> None:
-    """And those of the same arms share them, whatever their launch files."""
+    """Graphs of the same arms share stops, even with different launch files."""
     lab, twin = EStopFile("main", ["192.0.2.1:502", "192.0.2.2:502"]), EStopFile("main", ["::1:7"])
     lab.write(STOP)
     twin.remove()
@@ -261,7 +263,7 @@ def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
     assert files(folder) == []
 
 
-def test_an_arm_shows_an_estop_by_its_typed_field_whatever_its_faults_say() -> None:
+def test_an_arm_shows_an_estop_by_its_typed_field_only() -> None:
     assert has_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
     assert has_estop(arm_state("left", mode="estop"))
     assert not has_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))

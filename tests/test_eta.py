@@ -1,4 +1,4 @@
-"""How far a precomputation is, and how much longer it takes."""
+"""Test the progress and remaining time of a precomputation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def test_time_left_is_reckoned_from_what_steps_took() -> None:
     assert far.text(10, 10, 400.0) == "100 %"
 
 
-def test_steps_kept_from_before_say_nothing_of_the_others() -> None:
+def test_cached_steps_do_not_affect_the_estimate() -> None:
     far = EtaEstimator()
     assert far.text(0, 20, 0.0) == "0 %"
     assert far.text(10, 20, 0.2) == "50 %"
@@ -21,7 +21,7 @@ def test_steps_kept_from_before_say_nothing_of_the_others() -> None:
     assert far.text(12, 20, 10.0) == "60 %, about 40 s left"
 
 
-def test_something_new_is_reckoned_anew() -> None:
+def test_a_new_total_restarts_the_estimate() -> None:
     far = EtaEstimator()
     far.text(0, 10, 0.0)
     far.text(5, 10, 50.0)

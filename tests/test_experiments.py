@@ -1,4 +1,4 @@
-"""The experiments' own arithmetic: a sheet known to be off is found off by just that."""
+"""Test the evaluation of experiments: a known error of the sheet is found."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def points_at(angles: np.ndarray, distance: float) -> np.ndarray:
 def edges_tangent_at(
     angles: np.ndarray, *, lifted_m: float = 0.0
 ) -> tuple[stroke.SampledMotion, ...]:
-    """Edges of a sheet that is tangent to the cylinder at `angles`, moved out along its normal."""
+    """Return edges of a sheet tangent to the cylinder at `angles`, displaced along its normal."""
     contact = points_at(angles, RADIUS + lifted_m)
     along = np.column_stack([np.zeros_like(angles), np.cos(angles), -np.sin(angles)])
     normal = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])
@@ -139,7 +139,7 @@ def test_size_errors_are_absolute_differences_in_mm() -> None:
     assert errors == [pytest.approx(2.0)]
 
 
-def test_tilt_and_push_paths_go_where_their_label_says() -> None:
+def test_tilt_and_push_paths_agree_with_their_labels() -> None:
     hover = image.tilt_path(SCENE, -40.0).positions_world_m[-1] - AXIS
     assert np.degrees(np.arctan2(hover[1], hover[2])) == pytest.approx(-40.0)
     assert np.linalg.norm(hover) == pytest.approx(RADIUS + image.HOVER_M)
@@ -148,7 +148,7 @@ def test_tilt_and_push_paths_go_where_their_label_says() -> None:
     np.testing.assert_allclose(push.positions_world_m[-1], [0.0, 0.0, -0.03], atol=1e-7)
 
 
-def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
+def test_rows_have_the_papers_sizes_and_a_missing_image_is_named() -> None:
     white = np.zeros((400, 400, 3), np.uint8)
     white[150:250, 100:300] = 255
     wider = np.zeros_like(white)
@@ -243,7 +243,7 @@ def test_the_pages_chart_shows_every_method_that_can_be_chosen(family: str) -> N
     assert set(get_args(CHOICES[family])) <= shown, f"flexsheet chart {family} -o docs/charts"
 
 
-def test_charts_are_gathered_on_a_page_and_drawn_anew(
+def test_charts_are_collected_on_a_page_and_drawn_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(FAMILIES, "made-up", "nowhere")

@@ -1,4 +1,4 @@
-"""Exported bags: opened by the readers of those who open them, and right in what they show."""
+"""Test that exported bags can be opened by the usual readers, with correct contents."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def opened(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Per channel (time, message): JSON as it is, protobuf by the schema that the file carries."""
+    """Return (time, message) per channel: JSON, or protobuf by the schema in the file."""
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -82,7 +82,7 @@ def opened(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return found
 
 
-def test_foxglove_gets_pictures_meshes_frames_and_numbers(bag: Path, tmp_path: Path) -> None:
+def test_foxglove_gets_images_meshes_frames_and_numbers(bag: Path, tmp_path: Path) -> None:
     result = export(bag, tmp_path / "out.mcap")
     found = opened(result.output)
     assert result.messages == {name: len(values) for name, values in found.items()}
@@ -113,7 +113,7 @@ def test_foxglove_gets_pictures_meshes_frames_and_numbers(bag: Path, tmp_path: P
     assert found["log"][0][1].message == "e-stop engaged: a person"
 
 
-def test_a_channel_tells_its_fields_before_a_message_is_opened(bag: Path, tmp_path: Path) -> None:
+def test_a_channel_has_its_fields_before_a_message_is_decoded(bag: Path, tmp_path: Path) -> None:
     output = export(bag, tmp_path / "out.mcap").output
     with output.open("rb") as file:
         summary = make_reader(file).get_summary()

@@ -1,4 +1,4 @@
-"""The judge of the picture: rays, occlusion, sizes, and the paper's figures 11 and 13 by rows."""
+"""Test the reference of the image: rays, occlusion, sizes, and figures 11 and 13 of the paper."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def bench(scene: Scene) -> CorrectionBench:
 
 
 def flat_sheet(world_from_sheet: np.ndarray, cells: int = 4) -> DeformedSheet:
-    """A plane sheet of 240 mm, without any mechanics."""
+    """Return a plane sheet of 240 mm, without mechanics."""
     x, y = np.meshgrid(np.linspace(-0.12, 0.12, cells + 1), np.linspace(-0.12, 0.12, cells + 1))
     points = np.stack([x, y, np.zeros_like(x)], axis=-1)
     positions = points @ world_from_sheet[:3, :3].T + world_from_sheet[:3, 3]
@@ -125,7 +125,7 @@ def test_part_of_the_sheet_behind_another_gets_no_light(scene: Scene) -> None:
     assert lit.tolist() == [False, True]
 
 
-def test_flat_sheet_on_the_imaginary_screen_shows_the_picture_mirrored_back(
+def test_flat_sheet_on_the_imaginary_screen_shows_the_image_mirrored_back(
     scene: Scene,
 ) -> None:
     projected = np.zeros((600, 800, 3), np.uint8)
@@ -157,7 +157,7 @@ def test_expected_image_has_the_cylinders_own_size(scene: Scene) -> None:
 
 
 def blob(height: float, upper: float, lower: float, size: int = 300) -> np.ndarray:
-    """A trapezoid (sizes in pixels), antialiased by 16 x 16 samples, about the centre."""
+    """Draw a trapezoid about the centre (sizes in pixels), antialiased by 16 x 16 samples."""
     axis = (np.arange(size * 16) + 0.5) / 16 - size / 2
     y = axis[:, None] / height + 0.5
     half = 0.5 * (upper + (lower - upper) * y)
@@ -185,7 +185,7 @@ def test_a_second_small_blob_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("what", ["black", "specks", "cut off", "split"])
-def test_what_cannot_be_measured_is_said(what: str) -> None:
+def test_what_cannot_be_measured_is_reported(what: str) -> None:
     picture = blob(80.0, 120.0, 120.0)
     if what == "black":
         picture[:] = 0
@@ -211,7 +211,8 @@ def mean_mm(
 
 
 def test_row_of_figure_11(bench: CorrectionBench) -> None:
-    """At 50 degrees the uncorrected error is the paper's tens of mm; corrected, a tenth."""
+    """At 50 degrees the uncorrected error is some tens of mm, as in the paper; corrected, a
+    tenth."""
     rolled = bench.situation(roll_sheet(bench.scene, np.radians(50.0)), None)
     assert 27.0 < mean_mm(bench, "none", rolled, tilt_sizes) < 34.0
     assert 1e3 * bench.size_errors("one_plane", *rolled, tilt_sizes).max() < 0.15
@@ -220,7 +221,7 @@ def test_row_of_figure_11(bench: CorrectionBench) -> None:
 
 
 def test_row_of_figure_13(bench: CorrectionBench) -> None:
-    """Pushed by 50 mm, four triangles leave the paper's few millimetres of its ten and more."""
+    """Pushed by 50 mm, four triangles reduce the paper's ten mm and more to a few millimetres."""
     pushed = bench.situation(*bench.pushed(0.05))
     corrections: tuple[Correction, ...] = ("none", "one_plane", "four_triangles", "two_pass")
     errors = {each: mean_mm(bench, each, pushed, push_sizes) for each in corrections}
@@ -243,7 +244,7 @@ class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
     async def step(
         self, port: str, message: Message, *, age_ms: float = 0.0, sequence: int = 1
     ) -> None:
-        """Pass a message with a fixed stamp; errors of the node are for the tests to judge."""
+        """Pass a message with a fixed stamp; the test checks the node's errors."""
         header = Header(1, 123, 124, "virtual", "test", 1)
         await self.node.step(port, message, header)
 
@@ -263,7 +264,7 @@ class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
         await self.step("twin__arms", self.arms)
 
     async def show(self, *frames: Frame) -> None:
-        """Frames, each followed by the true arms at the instant that it was drawn for."""
+        """Pass frames, each followed by the true arms at the time of its display."""
         for each in frames:
             await self.step("frame", each)
             await self.step("twin__arms", self.arms)
@@ -290,7 +291,7 @@ def frame(label: str, **changes: object) -> Frame:
     return Frame.model_validate({**values, **changes})
 
 
-async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
+async def test_eye_node_renders_each_label_once(scene: Scene) -> None:
     bench = EyeBench(scene)
     await bench.ready()
     display = Display(correction="none", stereo="mono", shading="flat", label="a")
@@ -322,7 +323,7 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
     await bench.node.close()
 
 
-async def test_eye_node_reports_what_has_no_picture_and_goes_on(
+async def test_eye_node_reports_a_missing_image_and_continues(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = EyeBench(scene, max_queue=2)
@@ -344,7 +345,7 @@ async def test_eye_node_reports_what_has_no_picture_and_goes_on(
     await bench.node.close()
 
 
-async def test_eye_node_takes_the_sheet_at_the_instant_of_the_light(scene: Scene) -> None:
+async def test_eye_node_uses_the_sheet_at_the_display_time(scene: Scene) -> None:
     bench = EyeBench(scene)
     await bench.ready()
     # Arms' stamps are 123 in this bench: before this frame's light nothing is pictured.

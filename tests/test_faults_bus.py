@@ -1,4 +1,4 @@
-"""Slow readers, storms and forgers over real sockets: who is not concerned notices nothing."""
+"""Test slow readers, message storms and forged messages over real sockets."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from tests.waiting import until
 __all__ = ["room"]
 
 
-async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Room) -> None:
-    """It is not read at all; the publisher never blocks, another reader loses nothing."""
+async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(room: Room) -> None:
+    """The reader never reads; the publisher does not block, and another reader loses nothing."""
     topic = TOPICS["twin/stereo"]
     publisher, ear = room.mouth(topic), room.ear(topic)
     ear.extra = lambda _: ear.heard.append((None, ear.heard.pop()[1]))  # pictures are not kept
@@ -53,10 +53,10 @@ def large_pictures(number: int) -> StereoPair:
 
 
 @pytest.mark.parametrize("name", ["sheet_target", "twin/finger"])
-async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
+async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
     room: Room, name: str
 ) -> None:
-    """A hundred times as many messages as a topic has, faster than they can be handled."""
+    """The storm has a hundred times the topic's rate, more than can be handled."""
     topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
     publisher, ear = room.mouth(topic), room.ear(topic)
     start = await connected(publisher, ear, finger) + 1
@@ -76,8 +76,8 @@ async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
     assert told == (topic.delivery is Delivery.EVERY and ear.counts.gaps > 0)
 
 
-async def test_of_thousands_of_forgeries_over_a_socket_none_is_taken(room: Room) -> None:
-    """Malformed, of another type, from an earlier start, again: counted, and good ones pass."""
+async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(room: Room) -> None:
+    """They are malformed, of another type, from an earlier start, or repeated; they are counted."""
     topic = TOPICS["fingertip"]
     endpoint = room.endpoint("forger")
     forger = room.raw(zmq.PUB, endpoint)

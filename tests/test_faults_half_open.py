@@ -1,4 +1,4 @@
-"""Half-open connections: one end is gone, and nothing ever told the other."""
+"""Test half-open connections: one end disappeared without notice to the other."""
 
 from __future__ import annotations
 
@@ -34,10 +34,7 @@ Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class Relay:
-    """Passes connections on to a publisher's tcp port, until the computers at its ends vanish.
-
-    What stood then stays open and nothing is read from it any more; what comes later passes.
-    """
+    """Relay to a publisher's tcp port whose connections can become half-open; new ones work."""
 
     def __init__(self, publisher: Publisher) -> None:
         (tcp,) = (one for one in publisher.endpoints if one.startswith("tcp:"))
@@ -66,7 +63,7 @@ class Relay:
         drain.transport.abort()
 
     async def vanish(self) -> None:
-        """Both ends of all that stands are left alone with their connections."""
+        """Stop serving all present connections without closing them."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -75,7 +72,7 @@ class Relay:
         self._standing.clear()
 
     def wake(self) -> None:
-        """Who vanished is there again and knows of no connection: each is reset."""
+        """Reset the connections that vanished."""
         for ends in self.gone:
             for _, writer in ends:
                 writer.transport.abort()
@@ -84,7 +81,7 @@ class Relay:
 
 @asynccontextmanager
 async def relay_to(publisher: Publisher) -> AsyncIterator[tuple[Relay, str]]:
-    """A relay to a publisher, and the endpoint where it takes connections."""
+    """Return a relay to a publisher, and its endpoint."""
     relay = Relay(publisher)
     server = await asyncio.start_server(relay.take, "127.0.0.1", 0)
     try:
@@ -98,7 +95,7 @@ async def relay_to(publisher: Publisher) -> AsyncIterator[tuple[Relay, str]]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Heartbeats ten times as fast as the bus has them."""
+    """Use heartbeats ten times as fast as the bus has them."""
     for option, value in list(bus.HEARTBEATS.items()):
         monkeypatch.setitem(bus.HEARTBEATS, option, value // 10)
 
@@ -142,7 +139,7 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
 async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next_one(
     room: Room,
 ) -> None:
-    """Heartbeats cover what is said now and then; the latched word of the new process is heard."""
+    """Heartbeats cover rare messages; the latched message of the new process is received."""
     topic = TOPICS["estop"]
     publisher = room.mouth(topic, "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
@@ -164,14 +161,14 @@ async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next
 
 
 def established(pid: int, port: int) -> int:
-    """Connections to a port that stand, as a process's own system sees them."""
+    """Return the open connections to a port according to a process's own system."""
     rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
     wanted = f":{port:04X}"
     return sum(row[2].endswith(wanted) and row[3] == ESTABLISHED for row in rows)
 
 
-async def test_a_computer_that_loses_its_power_in_mid_stream_is_missed_and_heard_again() -> None:
-    """Its messages come so often that libzmq's heartbeats would not notice."""
+async def test_a_power_cut_in_mid_stream_is_detected_and_recovered() -> None:
+    """Its messages are so frequent that libzmq's heartbeats would not notice."""
     if why := Computers.missing():
         pytest.skip(why)
     with Computers("main", "left") as computers, hosts("main", "left") as known:
@@ -207,7 +204,8 @@ async def test_a_computer_that_loses_its_power_in_mid_stream_is_missed_and_heard
 
 
 async def listen(ring: Path, endpoint: str, record: Path) -> None:
-    """Write down the epoch and number of all that is heard; patient for 2 s in place of 5."""
+    """Record the epoch and sequence of all received messages, with a timeout of 2 s instead of
+    5."""
     bus.TCP_KEEPALIVE_OPTIONS[zmq.TCP_MAXRT] = 2000
     with record.open("a", buffering=1) as file:
 
@@ -220,7 +218,7 @@ async def listen(ring: Path, endpoint: str, record: Path) -> None:
 
 
 async def speak(ring: Path, endpoint: str, epoch: int) -> None:
-    """Say something a hundred times a second."""
+    """Publish at 100 Hz."""
     publisher, number = Publisher(FINGER, [endpoint], keys=KeyRing(ring)), 0
     while True:
         number += 1

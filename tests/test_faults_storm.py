@@ -1,6 +1,6 @@
-"""A writer of the plan that has gone mad: a hundred times its rate, and all of it nonsense.
+"""Test a defective writer of the plan: a hundred times its rate, and only invalid targets.
 
-In virtual time, so that every command's true interval is known.
+The test runs in virtual time, so that the interval of every command is known.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_LENGTH_M = 0.24 * 1.09
 
 @dataclass
 class Sent:
-    """A command as the arm got it."""
+    """Command as received by the arm."""
 
     at_s: float
     mode: str
@@ -47,7 +47,7 @@ class Sent:
 
 @dataclass
 class Bench:
-    """Both bridges before the twin's controllers; time passes only by `pass_tick`."""
+    """Both bridges with the simulated controllers; time passes only in `pass_tick`."""
 
     monkeypatch: pytest.MonkeyPatch
     clock: VirtualClock = field(default_factory=lambda: VirtualClock(10**9))
@@ -97,7 +97,7 @@ class Bench:
             self.bridges[other].deliver("other_arm", message, header)
 
     async def sleep(self, delay_s: float) -> None:
-        """In place of the loop's."""
+        """Substitute for the loop's sleep."""
         wakes: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._sleepers.append((self.clock.now_ns() + int(delay_s * 1e9), wakes))
         await wakes
@@ -124,7 +124,7 @@ class Bench:
             await self._yield()
 
     async def run(self, seconds: float, targets: Iterator[SheetTarget], *, rate_hz: float) -> None:
-        """Let time pass while the planner says these targets at that rate."""
+        """Let time pass while the planner sends these targets at a rate."""
         begin_ns, told = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if passed_s * rate_hz >= told:
@@ -138,7 +138,7 @@ class Bench:
 
 @dataclass
 class Link:
-    """An arm's link without a network: the twin's controller answers after a millisecond."""
+    """Link to an arm without a network: the simulated controller answers after a millisecond."""
 
     bench: Bench
     side: str
@@ -194,7 +194,7 @@ def steady(clock: VirtualClock) -> Iterator[SheetTarget]:
 
 
 def mad(clock: VirtualClock) -> Iterator[SheetTarget]:
-    """Each leads elsewhere, at speeds that no arm has, from moments past and to come."""
+    """Yield random targets at impossible speeds, with past and future stamps."""
     chance = np.random.default_rng(3)
     while True:
         moment_ns = clock.now_ns() + int(chance.uniform(-0.05, 0.05) * 1e9)
@@ -202,7 +202,7 @@ def mad(clock: VirtualClock) -> Iterator[SheetTarget]:
 
 
 def accelerations(sent: list[Sent]) -> tuple[Floats, Floats]:
-    """Velocities and accelerations (n, 6) that commands ask for, each over its true interval."""
+    """Return velocities and accelerations (n, 6) of commands over their true intervals."""
     joints_rad = np.array([one.joints_rad for one in sent])
     steps_s = np.diff([one.at_s for one in sent])[:, None]
     velocities = np.diff(joints_rad, axis=0) / steps_s

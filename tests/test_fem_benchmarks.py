@@ -1,4 +1,4 @@
-"""The soft body's family: what the chart is drawn from."""
+"""Test the soft body's method family, the data of the chart."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ CHARTS = Path(__file__).parents[1] / "docs" / "charts"
 
 
 def small_scene() -> Scene:
-    """A small cylinder, that a coarse mesh does for."""
+    """Return a small cylinder, for which a coarse mesh is sufficient."""
     content = YAML(typ="safe").load(SCENE.read_text())
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
     return Scene.model_validate(content)
 
 
-def test_every_method_is_judged_by_a_finer_newton(
+def test_every_method_is_compared_with_a_finer_newton(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
@@ -123,7 +123,7 @@ def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> No
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)
 
 
-def test_the_family_says_what_it_is_judged_by() -> None:
+def test_the_family_names_its_reference() -> None:
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE.read_text()))
     assert SOFT_BODY.tolerance(scene) == 0.5
     assert "Newton" in SOFT_BODY.reference

@@ -1,4 +1,4 @@
-"""The fingertip's contact with the soft body: smooth, unique, bounded."""
+"""Test the fingertip's contact with the soft body: smooth, unique, bounded."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_answer_is_the_same_from_every_history(body: LinearSoftBody) -> None
     assert first.force_n.tobytes() == again.force_n.tobytes()
 
 
-def test_force_and_dent_grow_from_nothing_at_touch_down(body: LinearSoftBody) -> None:
+def test_force_and_indentation_grow_from_zero_at_contact(body: LinearSoftBody) -> None:
     depths = np.concatenate([[-1e-3, -1e-6, 0.0], np.linspace(1e-6, 0.003, 200)])
     answers = [body.respond(push(0.004, 0.1, d)) for d in depths]
     forces = np.array([a.force_n @ push(0.004, 0.1, 0.0).normal for a in answers])
@@ -113,7 +113,7 @@ def test_no_finger_falls_between_nodes(body: LinearSoftBody, x: float, angle: fl
 
 
 @pytest.mark.parametrize("depth", [0.002, 0.005])
-def test_skin_under_the_finger_lies_on_the_finger(
+def test_skin_under_the_finger_is_on_the_finger(
     body: LinearSoftBody, model: SoftBodyModel, depth: float
 ) -> None:
     where = push(0.004, 0.1, depth)
@@ -123,7 +123,7 @@ def test_skin_under_the_finger_lies_on_the_finger(
     assert inside.max() < 0.3e-3
 
 
-def test_force_scales_with_the_modulus_and_the_dent_does_not(model: SoftBodyModel) -> None:
+def test_force_scales_with_the_modulus_and_the_indentation_does_not(model: SoftBodyModel) -> None:
     soft, hard = soft_body(model, 4000.0), soft_body(model, 40000.0)
     where = push(0.004, 0.1, 0.004)
     a, b = soft.respond(where), hard.respond(where)
@@ -132,7 +132,7 @@ def test_force_scales_with_the_modulus_and_the_dent_does_not(model: SoftBodyMode
     assert np.abs(a.displacement - b.displacement).max() < 1e-7
 
 
-def test_stiffness_is_there_before_the_touch_and_is_what_the_push_then_gives(
+def test_the_stiffness_before_contact_is_that_of_the_push(
     body: LinearSoftBody,
 ) -> None:
     before = body.respond(push(0.004, 0.1, -0.05)).stiffness_n_per_m
@@ -183,7 +183,7 @@ def test_saturation_has_no_kink() -> None:
     "point",
     [(0.0, 0.0, 0.0), (0.0, 0.0, 5.0), (3.0, 0.0, 0.0), (0.0, -1e-9, 1e-9), (0.0, 0.0, -0.04)],
 )
-def test_every_finite_place_has_an_answer(
+def test_every_finite_position_has_an_answer(
     body: LinearSoftBody, point: tuple[float, float, float]
 ) -> None:
     where = np.array(point)
@@ -195,7 +195,7 @@ def test_every_finite_place_has_an_answer(
     assert answer.stiffness_n_per_m > 0.0
 
 
-def test_a_place_that_is_no_number_is_refused() -> None:
+def test_a_position_that_is_not_finite_is_rejected() -> None:
     with pytest.raises(ValueError, match="not finite"):
         locate(SHAPE, np.array([0.0, np.nan, 0.0]), None)
 
@@ -230,7 +230,7 @@ def test_a_finger_pushed_through_the_axis_keeps_its_side() -> None:
 
 
 @given(angle=st.floats(-1.4, 1.4), depth=st.floats(0.0, 0.02), x=st.floats(-0.05, 0.05))
-def test_to_twenty_millimetres_the_place_follows_from_the_finger_alone(
+def test_to_twenty_millimetres_the_contact_point_depends_on_the_finger_only(
     angle: float, depth: float, x: float
 ) -> None:
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
@@ -275,7 +275,7 @@ def test_shape_functions_at_the_points_reproduce_a_parabola() -> None:
     assert shape @ field(nodes) == pytest.approx(field(local), abs=1e-14)
 
 
-def test_depths_in_the_wrong_order_are_refused(model: SoftBodyModel) -> None:
+def test_depths_in_the_wrong_order_are_rejected(model: SoftBodyModel) -> None:
     with pytest.raises(ValueError, match="max_depth_m"):
         LinearSoftBody(
             model.response,

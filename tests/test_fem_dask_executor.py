@@ -1,4 +1,4 @@
-"""A table's pushes on the workers of a lab's scheduler: real processes, on loopback."""
+"""Test the computation of a table by workers of a scheduler: real processes on loopback."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Lab:
-    """A scheduler of `distributed`, and workers that are started one by one."""
+    """Scheduler of `distributed`, with workers that are started one by one."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:
@@ -80,7 +80,8 @@ def lab() -> Iterator[Lab]:
 
 
 def job(depth_m: float = 0.0005) -> SnapshotJob:
-    """A block of 30 x 30 x 20 mm, glued to the ground, pushed in the middle of its top."""
+    """Return a job: a block of 30 x 30 x 20 mm, fixed at its bottom, pushed at the centre of its
+    top."""
     nodes, elements = box((4, 4, 2), (0.03, 0.03, 0.02))
     faces = boundary_faces(elements)
     return SnapshotJob(
@@ -96,11 +97,11 @@ def job(depth_m: float = 0.0005) -> SnapshotJob:
 
 
 def cpu_s(process: subprocess.Popen[str]) -> float:
-    """Time that a process has been at work."""
+    """Return the processor time of a process, s."""
     return float(sum(psutil.Process(process.pid).cpu_times()[:2]))
 
 
-def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) -> None:
+def test_a_scheduler_without_workers_is_an_error_with_a_remedy(lab: Lab) -> None:
     with (
         pytest.raises(SchedulerError, match=r"dask worker tcp://127\.0\.0\.1"),
         connect_workers(lab.address, connect_s=0.3),
@@ -109,7 +110,7 @@ def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) 
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1", "post://127.0.0.1:8786"])
-def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
+def test_no_scheduler_is_an_error_with_a_remedy(address: str) -> None:
     with (
         pytest.raises(SchedulerError, match=r"no scheduler answers.*null"),
         connect_workers(address),
@@ -117,7 +118,7 @@ def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
         pass
 
 
-def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_said(
+def test_jobs_of_a_lost_worker_move_to_others_and_a_lost_scheduler_is_reported(
     lab: Lab, tmp_path: Path
 ) -> None:
     first = lab.add_worker()

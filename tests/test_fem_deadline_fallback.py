@@ -1,4 +1,4 @@
-"""Which method answers when answers are late."""
+"""Test the selection of the method when results are late."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_single_late_answers_change_nothing() -> None:
         assert not any([*changes, pace.record(0.001)])
 
 
-def test_late_for_long_the_quicker_one_takes_over_until_the_best_is_tried_again() -> None:
+def test_after_late_results_the_faster_method_is_used_until_a_retry() -> None:
     pace = DeadlineFallback(["good", "quick"], 0.004)
     assert [pace.record(0.02) for _ in range(LATE_STEPS)] == [False] * (LATE_STEPS - 1) + [True]
     assert pace.name == "quick"
@@ -30,7 +30,7 @@ def test_late_for_long_the_quicker_one_takes_over_until_the_best_is_tried_again(
     assert not any(pace.record(0.001) for _ in range(100))
 
 
-def test_of_two_late_ones_the_quicker_is_taken() -> None:
+def test_of_two_late_methods_the_faster_is_used() -> None:
     pace = DeadlineFallback(["good", "other"], 0.004)
     for _ in range(LATE_STEPS):
         pace.record(0.01)

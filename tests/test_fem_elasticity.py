@@ -1,4 +1,4 @@
-"""The soft body's mesh and stiffness, against theory and against scikit-fem."""
+"""Test the soft body's mesh and stiffness against theory and scikit-fem."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def cylinder(
 
 
 def box(divisions: tuple[int, int, int], sides: tuple[float, float, float]) -> tuple[Floats, Ints]:
-    """Ten-node tetrahedra of a box: six per brick, along its main diagonal (Kuhn)."""
+    """Return ten-node tetrahedra of a box: six per brick, along its main diagonal (Kuhn)."""
     shape = tuple(n + 1 for n in divisions)
     grid = np.stack(
         np.meshgrid(
@@ -102,7 +102,7 @@ def test_the_mesh_is_a_sound_solid(spacing: float) -> None:
     assert (np.diff(mesh.slab) >= 0).all()
 
 
-def test_the_side_lies_on_the_cylinder_and_is_fine_in_front() -> None:
+def test_the_side_is_on_the_cylinder_and_fine_in_front() -> None:
     mesh = cylinder(0.0045)
     contact_nodes = mesh.nodes[mesh.contact_nodes]
     assert np.hypot(contact_nodes[:, 1], contact_nodes[:, 2]) == pytest.approx(RADIUS, rel=1e-12)
@@ -133,7 +133,7 @@ def test_exactly_the_strip_at_the_back_is_fixed(support: float, spacing: float) 
         ({"touch_angle_rad": 3.0}, "touchable"),
     ],
 )
-def test_a_cylinder_that_cannot_be_meshed_is_refused(change: dict[str, float], word: str) -> None:
+def test_a_cylinder_that_cannot_be_meshed_is_rejected(change: dict[str, float], word: str) -> None:
     good = {
         "radius_m": RADIUS,
         "length_m": LENGTH,
@@ -195,7 +195,8 @@ def test_a_rigid_motion_costs_nothing() -> None:
 
 
 def test_error_falls_with_the_third_power_of_the_element_size() -> None:
-    """Boundary values of a smooth equilibrium field: the gradient of a harmonic potential."""
+    """The boundary values are those of a smooth equilibrium field: the gradient of a harmonic
+    potential."""
     errors = []
     for n in (2, 4, 8):
         nodes, elements = box((n, n, n), (1.0, 1.0, 1.0))
@@ -226,7 +227,7 @@ def test_cantilever_bends_as_a_timoshenko_beam() -> None:
 
 
 @pytest.mark.parametrize("nu", [0.5, 0.49999, 1.0, -1.0, float("nan")])
-def test_poisson_ratios_that_lose_the_answer_are_refused(nu: float) -> None:
+def test_poisson_ratios_that_lose_the_answer_are_rejected(nu: float) -> None:
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="poisson_ratio"):
         stiffness_matrix(nodes, elements, young_modulus_pa=1.0, poisson_ratio=nu)
@@ -240,7 +241,7 @@ def test_stiffness_needs_a_positive_modulus(modulus: float) -> None:
 
 
 def test_quadratic_elements_do_not_lock_near_incompressibility() -> None:
-    """A block squeezed between its end faces: it grows stiffer, but by far not tenfold."""
+    """A block compressed between its end faces becomes stiffer, but by far less than ten times."""
     nodes, elements = box((3, 3, 3), (1.0, 1.0, 1.0))
     held = degrees_of_freedom(np.flatnonzero((nodes[:, 2] == 0) | np.isclose(nodes[:, 2], 1.0)))
     values = np.where(np.isclose(nodes[held // 3, 2], 1.0) & (held % 3 == 2), -0.01, 0.0)

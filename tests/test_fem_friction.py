@@ -1,4 +1,4 @@
-"""A finger that sticks drags the skin along; pushed harder aside than it presses, it slips."""
+"""Test a sticking finger that drags the skin, and slips above the friction limit."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_sticking_finger_drags_the_skin_beneath_it(
     assert np.abs(straight.force_n[:2]).max() < 0.05 * straight.force_n[2]
 
 
-def test_the_pull_is_in_proportion_to_the_drag(body: LinearSoftBody) -> None:
+def test_the_friction_force_is_proportional_to_the_drag(body: LinearSoftBody) -> None:
     straight = body.respond(push(0.004)).force_n
     once = body.respond(push(0.004, (0.001, 0.0005, 0.0))).force_n - straight
     twice = body.respond(push(0.004, (0.002, 0.001, 0.0))).force_n - straight
@@ -104,7 +104,7 @@ def test_the_pull_is_in_proportion_to_the_drag(body: LinearSoftBody) -> None:
 
 
 def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
-    """A tilted push: down and aside at once, from the touch on."""
+    """The push is tilted: downwards and sideways simultaneously, from the first contact."""
     way = np.linspace(0.0, 0.006, 400)
     answers = [body.respond(push(d, (0.5 * d, 0.0, 0.0))) for d in way]
     moves = [
@@ -116,7 +116,7 @@ def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
     assert np.abs(np.diff(pulls)).max() < 0.02 * np.abs(pulls).max()
 
 
-def test_the_place_of_first_touch_stays_until_the_finger_lifts() -> None:
+def test_the_position_of_first_touch_stays_until_the_finger_lifts() -> None:
     contact_nodes, held = locate_sticking(SHAPE, np.array([0.001, 0.0, RADIUS - 1e-4]), None)
     assert contact_nodes.drag_m is None
     there, held = locate_sticking(SHAPE, np.array([0.003, 0.001, RADIUS - 0.004]), held)

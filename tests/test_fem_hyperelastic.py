@@ -1,4 +1,4 @@
-"""The neo-Hookean solid and its direct solver: against theory and against scikit-fem."""
+"""Test the neo-Hookean solid and its direct solver against theory and scikit-fem."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def block(divisions: tuple[int, int, int] = (2, 2, 2), nu: float = NU) -> NeoHoo
 
 
 def bent(solid: NeoHookeanSolid, size: float) -> Floats:
-    """A displacement that bends, twists and stretches."""
+    """Return a displacement that bends, twists and stretches."""
     x, y, z = solid.nodes.T
     return size * np.column_stack([x * y + 0.3 * z, y * z - 0.5 * x * x, np.sin(2 * x) * z])
 
@@ -136,9 +136,10 @@ def test_a_stiffness_that_does_not_resist_is_an_error() -> None:
 
 
 def their_basis(nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
-    """scikit-fem's quadratic basis on a straight mesh, and our degree of freedom for each of its.
+    """Return scikit-fem's quadratic basis on a straight mesh, and our degree of freedom for each of
+    its.
 
-    Same quadrature as ours, so that nothing but the assembly differs.
+    The quadrature is equal, so that only the assembly differs.
     """
     import skfem
     from scipy.spatial import cKDTree
@@ -161,7 +162,7 @@ def their_basis(nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
 
 
 def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> None:
-    """A block held at its bottom, pulled aside by its weight: large strains, solved by both."""
+    """A block fixed at its bottom is deformed sideways by its weight at large strains."""
     import skfem
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve

@@ -1,4 +1,4 @@
-"""Where the soft body's methods end: refused, flagged, or answered all the same."""
+"""Test the limits of the soft body's methods: rejected, flagged, or still answered."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def body() -> Body:
     return make_body(cylinder())
 
 
-def test_a_skin_coarser_than_the_fingertip_is_refused() -> None:
-    """It would answer with twice the force and more, and not know."""
+def test_a_skin_coarser_than_the_fingertip_is_rejected() -> None:
+    """Its force would be more than twice too large without a flag."""
     with pytest.raises(ValueError, match=r"skin_spacing_m: 0.005 .* finger.radius_m \(0.0045\)"):
         make_body(cylinder(finger_m=0.0045))
 
 
-def test_an_incompressible_body_is_refused() -> None:
+def test_an_incompressible_body_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* use 0.499"):
         make_body(cylinder(nu=0.49995))
 
 
-def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
+def test_two_supports_hold_and_one_point_is_rejected(body: Body) -> None:
     hanging = make_body(make_scene(CYLINDER, ENDS, height_m=0.02))
     sample = make_sample(hanging)
     answers = [
@@ -54,7 +54,8 @@ def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
 
 
 def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
-    """Anywhere within a right angle of where it was; nothing is turned over anywhere."""
+    """The result is that of the new position, within a right angle of the old one, without
+    inversion."""
     rng = np.random.default_rng(7)
     jumped: ContactAnchor | None = None
     for _ in range(40):

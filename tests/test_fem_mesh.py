@@ -1,4 +1,4 @@
-"""Meshes of every shape: sound, true to the shape, fine where fingers go, held where asked."""
+"""Test meshes of every shape: validity, accuracy, resolution under fingers, and supports."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ CYLINDER = {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12}
 
 
 def egg_mesh() -> dict[str, Any]:
-    """An ellipsoid as triangles."""
+    """Return an ellipsoid as triangles."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.ascontiguousarray(ball.vertices * EGG_AXES_M, dtype=np.float64)
     return {
@@ -96,7 +96,7 @@ CLOSED = ("sphere", "ellipsoid", "rounded_box", "mesh")
 
 
 def scene(geometry: dict[str, Any], **changes: Any) -> Scene:
-    """The cylinder's scene with another object."""
+    """Return the cylinder's scene with another object."""
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     body = content["object"]
     del body["support_angle_rad"]
@@ -142,7 +142,7 @@ def hull_area(solid: SolidMesh, faces: Ints) -> float:
 
 
 def expected(geometry: dict[str, Any]) -> tuple[float, float]:
-    """Volume and area in closed form, or of a mesh's triangles."""
+    """Return volume and area in closed form, or of a mesh's triangles."""
     match geometry["shape"]:
         case "sphere":
             r = geometry["radius_m"]
@@ -174,7 +174,7 @@ def expected(geometry: dict[str, Any]) -> tuple[float, float]:
 
 
 def require_sound(solid: SolidMesh) -> None:
-    """Valid elements, a closed hull of the sphere's topology, parts that fit one another."""
+    """Assert valid elements, a closed hull with the sphere's topology, and consistent parts."""
     assert radius_ratios(solid.nodes, solid.elements).min() > MIN_RADIUS_RATIO
     assert np.degrees(min_dihedral_rad(solid.nodes, solid.elements).min()) > 8
     assert min_jacobian_ratios(solid.nodes, solid.elements).min() > 0.99 * MIN_JACOBIAN_RATIO
@@ -280,7 +280,7 @@ def test_symmetric_shapes_have_symmetric_meshes(name: str, axis: int) -> None:
 
 @pytest.mark.parametrize("angle_rad", [0.1, 1.2])
 def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> None:
-    """Or a finger that is pressed there is pushed aside: nodes and edges are mirrored."""
+    """Nodes and edges are mirrored; otherwise a pressed finger would be pushed sideways."""
     radius_m, near_m = CYLINDER["radius_m"], 0.011
     mesh = cylinder_mesh(
         radius_m=radius_m,
@@ -313,7 +313,7 @@ def test_the_same_scene_gives_the_same_mesh(name: str) -> None:
         assert (getattr(first, part) == getattr(again, part)).all(), part
 
 
-def test_a_key_stands_for_all_that_a_mesh_depends_on() -> None:
+def test_a_key_covers_all_inputs_of_a_mesh() -> None:
     moved = dict(EGG, vertices_m=EGG["vertices_m"] * 1.0001)
     range_changed = scene(SPHERE).model_copy(
         update={"working_range": scene(SPHERE).working_range.model_copy(update={"tilt_rad": 0.9})}
@@ -500,7 +500,7 @@ def test_a_push_on_every_shape_goes_in_and_is_held(name: str) -> None:
         ),
     ],
 )
-def test_what_cannot_be_meshed_is_refused_with_the_reason(
+def test_what_cannot_be_meshed_is_rejected_with_the_reason(
     geometry: dict[str, Any], changes: dict[str, Any], spacing: float, words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
@@ -561,7 +561,7 @@ def test_a_lattice_fills_its_box_with_outward_diagonals() -> None:
     depth=st.integers(1, 4),
 )
 @settings(max_examples=20, deadline=None)
-def test_bisection_conforms_and_knows_three_shapes_only(
+def test_bisection_conforms_with_three_shapes_only(
     places: list[tuple[float, float, float]], depth: int
 ) -> None:
     targets = np.array(places) * CELL
@@ -581,12 +581,12 @@ def test_bisection_conforms_and_knows_three_shapes_only(
     assert ratios.min() > 0.4
 
 
-def test_bisection_beyond_the_unit_is_refused() -> None:
+def test_bisection_beyond_the_unit_is_rejected() -> None:
     with pytest.raises(UnfitMeshError, match="far too small"):
         bisect(*make_lattice((1, 1, 1)), lambda v, t: (v[t] == 0).all(axis=2).any(axis=1))
 
 
-def test_a_core_gives_way_to_pinches_until_nothing_is_left() -> None:
+def test_a_core_shrinks_at_pinches_until_nothing_is_left() -> None:
     by_edge = np.array([[0, 1, 2, 3], [0, 1, 4, 5]])
     depth = -np.arange(1.0, 7.0)
     core = np.array([False, False, True, False, True, False])

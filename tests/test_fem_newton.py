@@ -1,4 +1,4 @@
-"""The full Newton with a finger: balanced, smooth, never inside out, whatever the push."""
+"""Test Newton's method with a finger: equilibrium, smoothness, no inversion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def pad(
     divisions: tuple[int, int, int] = (5, 5, 2),
     factor_dtype: type[np.float32 | np.float64] = np.float64,
 ) -> NeoHookeanBody:
-    """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0."""
+    """Return a block of 30 x 30 x 12 mm, fixed at its bottom, with its top at z = 0."""
     nodes, elements = box(divisions, (SIDE, SIDE, HEIGHT))
     nodes = nodes - [0.5 * SIDE, 0.5 * SIDE, HEIGHT]
     faces = boundary_faces(elements)
@@ -91,8 +91,8 @@ def test_no_point_of_the_skin_is_inside_the_finger(
 
 
 def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBody) -> None:
-    """At the minimum, what the energy gains with the finger's place is the force: exact contact
-    mechanics, whatever the mesh."""
+    """At the minimum, the derivative of the energy by the finger's position is the force, for any
+    mesh."""
     step = 1e-5
     states = press(body, centre(0.0), centre(0.003 - step), centre(0.003), centre(0.003 + step))
 
@@ -106,7 +106,7 @@ def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBo
     assert states[2].force_n[2] == pytest.approx(slope, rel=1e-4)
 
 
-def test_without_friction_every_way_there_gives_the_same(
+def test_without_friction_the_result_is_independent_of_the_path(
     body: NeoHookeanBody, pressed: EquilibriumState
 ) -> None:
     aside = press(body, centre(0.0, x=-0.004), centre(0.003, x=-0.004, y=0.003), centre(0.004))[-1]
@@ -116,8 +116,8 @@ def test_without_friction_every_way_there_gives_the_same(
         assert other.force_n == pytest.approx(pressed.force_n, abs=1e-5 * pressed.force_n[2])
 
 
-def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None:
-    """Its change from step to step changes little: C1, as the bed's energy is made to give."""
+def test_the_answer_is_smooth_in_the_fingers_position(body: NeoHookeanBody) -> None:
+    """Its change from step to step is small, since the contact energy is twice differentiable."""
     step = 4e-5
     places = [centre(0.003, x=-0.0004 + step * i) for i in range(13)]
     states = press(body, centre(0.0, x=-0.0004), *places)[1:]
@@ -131,7 +131,8 @@ def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None
 def test_factors_of_single_precision_lead_to_the_same_balance(
     body: NeoHookeanBody, pressed: EquilibriumState
 ) -> None:
-    """They only say where to look next: the balance is that of forces in double precision."""
+    """Single precision only affects the search direction; equilibrium is tested in double
+    precision."""
     coarse = pad(factor_dtype=np.float32)
     quick = press(coarse, centre(0.0), pressed.centre)[-1]
     assert quick.reached
@@ -172,8 +173,7 @@ def test_a_push_deeper_than_the_body_is_bounded_flagged_and_not_inside_out() -> 
 
 
 def test_where_newton_does_not_settle_the_push_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though no element is turned over: the last answer stays, flagged, and a table takes the push
-    to be as deep as that."""
+    """Without inversion the last result remains, flagged, and a table ends at that depth."""
     body = pad(divisions=(4, 4, 2))
     job = SnapshotJob(
         nodes=body.solid.nodes,

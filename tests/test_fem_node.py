@@ -1,4 +1,4 @@
-"""The soft body node, driven as the runner drives it."""
+"""Test the soft body node with the runner's calls."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 
 
 def scene(**changes: Any) -> Scene:
-    """The cylinder scene; `changes` go into its object."""
+    """Return the cylinder scene; `changes` are applied to its object."""
     content = YAML(typ="safe").load((SCENES / "cylinder.yaml").read_text())
     content["object"].update(changes)
     return Scene.model_validate(content)
@@ -58,7 +58,7 @@ def fingertip(
 
 
 class Named:
-    """A method under another name."""
+    """Method under another name."""
 
     def __init__(self, method: Any, name: str) -> None:
         self._method, self.name = method, name
@@ -68,7 +68,7 @@ class Named:
 
 
 class Bench(NodeHarness[FemSolver, VirtualClock]):
-    """A solver that gets fingertips by hand."""
+    """Solver that receives fingertips from the test."""
 
     def __init__(self, **parameters: Any) -> None:
         given = FemSolverParameters(skin_spacing_m=0.007, **parameters)
@@ -107,7 +107,7 @@ async def bench(cache: str) -> AsyncIterator[Bench]:
     assert bench.node.errors == 0, bench.node.last_error
 
 
-async def test_nothing_is_said_before_a_scene(cache: str) -> None:
+async def test_nothing_is_published_before_a_scene(cache: str) -> None:
     bench = Bench(cache_dir=cache)
     await bench.node.setup()
     await bench.node.step("fingertip", fingertip((0, 0, 0)), header())
@@ -115,7 +115,7 @@ async def test_nothing_is_said_before_a_scene(cache: str) -> None:
     assert "scene" in bench.node.note
 
 
-async def test_the_skin_stands_where_the_scene_puts_it(bench: Bench) -> None:
+async def test_the_skin_has_the_pose_of_the_scene(bench: Bench) -> None:
     skin = bench.skin()
     assert bench.sent[0][2].source_ns == 5
     low, high = skin.vertices_world_m.min(axis=0), skin.vertices_world_m.max(axis=0)
@@ -124,7 +124,7 @@ async def test_the_skin_stands_where_the_scene_puts_it(bench: Bench) -> None:
     assert "ready" in bench.node.note
 
 
-async def test_a_push_dents_the_skin_towards_the_back(bench: Bench) -> None:
+async def test_a_push_deforms_the_skin_towards_the_back(bench: Bench) -> None:
     answer = await bench.push(fingertip((0.0, 0.0, -0.004)), 17)
     assert answer.mesh_id == bench.skin().mesh_id
     assert answer.in_range
@@ -184,7 +184,7 @@ async def test_lead_moves_the_finger_along_its_velocity(cache: str, bench: Bench
 @pytest.mark.parametrize(
     "rpy", [(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2), (2.0, 0.0, 0.0), (0.3, 0.0, 1.0)]
 )
-async def test_the_body_may_lie_any_way_across(cache: str, rpy: tuple[float, ...]) -> None:
+async def test_the_body_may_have_any_orientation(cache: str, rpy: tuple[float, ...]) -> None:
     bench = Bench(cache_dir=cache)
     await bench.node.setup()
     pose = {"position_m": [0.01, 0.02, -0.0353553], "rpy_rad": list(rpy)}
@@ -265,7 +265,7 @@ async def test_closing_interrupts_the_precomputation(tmp_path: Path) -> None:
 async def test_a_newer_scene_interrupts_the_precomputation(
     cache: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cached scene waited for minutes of work on the one that it replaced."""
+    """A cached scene waited for minutes of computation for the scene that it replaced."""
     begun, meshed, ended = threading.Event(), threading.Event(), threading.Event()
 
     def endless(spec: Any, progress: Any, parts: Any = None) -> Any:
@@ -366,7 +366,7 @@ async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_pa
     assert not any("table" in path.name and path.suffix == ".npz" for path in tmp_path.iterdir())  # noqa: ASYNC240
 
 
-async def test_a_late_method_is_left_for_a_quicker_one_and_that_is_said(
+async def test_a_late_method_is_replaced_by_a_faster_one_and_reported(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = {"linear": 0.0}

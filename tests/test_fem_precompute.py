@@ -1,4 +1,4 @@
-"""The precomputation and its cache: right, whole or absent, never half."""
+"""Test the precomputation and its cache: correct and atomic."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_progress_runs_from_nothing_to_all() -> None:
 
 
 @pytest.mark.parametrize("stop_at", [0.0, 0.1, 0.9])
-def test_an_interrupted_computation_goes_on_where_it_stopped(
+def test_an_interrupted_computation_resumes(
     model: SoftBodyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: float
 ) -> None:
     monkeypatch.setattr(precompute, "CHUNK_LOADS", 20)
@@ -169,7 +169,7 @@ def test_an_interrupted_computation_goes_on_where_it_stopped(
     assert [path.name for path in tmp_path.iterdir()] == [response_cache(SPEC).path(tmp_path).name]
 
 
-def test_a_damaged_part_is_computed_anew(model: SoftBodyModel, tmp_path: Path) -> None:
+def test_a_damaged_part_is_computed_again(model: SoftBodyModel, tmp_path: Path) -> None:
     def stop(done: int, total: int, need: ResponseBudget) -> None:
         if done == total:
             raise Interrupted
@@ -209,7 +209,7 @@ def test_what_a_killed_process_left_is_swept(model: SoftBodyModel, tmp_path: Pat
     assert alive.exists()
 
 
-def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_reported_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.003)
     mesh = build_mesh(fine.mesh)
     need = compute_budget(mesh, NestedDissection(mesh.nodes, mesh.elements, mesh.fixed))
@@ -225,7 +225,7 @@ def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.Monkey
         compute(fine, quiet)
 
 
-def test_the_cache_is_where_the_desktop_wants_it(
+def test_the_cache_follows_the_desktop_standard(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -236,7 +236,7 @@ def test_the_cache_is_where_the_desktop_wants_it(
 
 
 def test_the_node_module_is_light_to_import() -> None:
-    """No part of scipy is loaded before a scene needs it: processes must start quickly."""
+    """No part of scipy is loaded before a scene needs it, since processes must start quickly."""
     code = (
         "import sys, json, flexsheet.nodes.fem_solver.node;"
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('scipy', 'matplotlib')]))"

@@ -1,4 +1,4 @@
-"""Every shape of a scene yields under the finger: dented where it is pushed, smoothly, bounded."""
+"""Test that every shape of a scene deforms smoothly under the finger, within bounds."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BASE = {"kind": "base", "height_m": 0.01}
 
 
 def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
-    """The demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object, its front at the world's origin."""
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     del content["object"]["support_angle_rad"]
     content["object"] |= {
@@ -79,13 +79,13 @@ def soft(request: pytest.FixtureRequest) -> SceneBody:
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:
-    """The answer to a finger at a depth below the surface near (x, y), and the normal there."""
+    """Return the result for a finger at a depth below the surface near (x, y), and the normal."""
     found = soft.shape.closest(soft.front + np.array([x, y, 0.0]))
     point = found.point - depth * found.normal
     return soft.respond(rigid.apply(soft.world_from_mesh, point), None)[0], found.normal
 
 
-def test_a_push_dents_the_skin_where_it_is(soft: SceneBody) -> None:
+def test_a_push_deforms_the_skin_where_it_is(soft: SceneBody) -> None:
     answer, normal = pushed(soft, 0.003, 0.002, 0.004)
     assert answer.in_range
     assert answer.push_depth_m == pytest.approx(0.004)
@@ -130,7 +130,7 @@ def test_a_deep_push_is_bounded_and_flagged(soft: SceneBody) -> None:
     assert not answer.in_range
 
 
-def test_the_force_curve_is_said_before_the_touch(soft: SceneBody) -> None:
+def test_the_force_curve_is_published_before_contact(soft: SceneBody) -> None:
     curve = soft.at_rest().force_curve
     assert (np.diff(curve[:, 1]) >= 0.0).all()
     answer, normal = pushed(soft, 0.0, 0.0, 0.006)

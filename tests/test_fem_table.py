@@ -1,4 +1,4 @@
-"""The nonlinear table: filled from few pushes, smooth, bounded, kept, made in other processes."""
+"""Test the nonlinear table: interpolation, smoothness, bounds, cache, and worker processes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MODULUS = 4000.0
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse() -> Iterator[None]:
-    """Few sites, few depths, a coarse mesh: what is tested does not depend on them."""
+    """Return a specification with few samples, few depths and a coarse mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
         patch.setattr(snapshots, "SPACING_RATIO", 1.0)
@@ -102,7 +102,7 @@ def largest_move(a: Response, b: Response) -> float:
 def test_away_from_the_finger_it_is_what_newton_finds(
     body: TableSoftBody, model: SoftBodyModel
 ) -> None:
-    """At a place that no push was solved at."""
+    """The test position is not a sample of the table."""
     there = push(0.005, 0.2, 0.003)
     mesh = build_mesh(SPEC.body.mesh)
     sample = SamplePoint(there.surface, there.normal)
@@ -159,7 +159,7 @@ def test_deeper_than_solved_is_flagged_bounded_and_never_inverted(
         assert alignments.min() > 0.0
 
 
-def test_past_the_end_the_dent_fades_and_is_flagged(body: TableSoftBody) -> None:
+def test_past_the_end_the_indentation_fades_and_is_flagged(body: TableSoftBody) -> None:
     answers = [body.respond(push(0.02 + 1e-4 * i, 0.1, 0.004)) for i in range(300)]
     assert max(largest_move(a, b) for a, b in itertools.pairwise(answers)) < 0.25e-3
     assert answers[0].in_range
@@ -212,7 +212,7 @@ def test_a_point_is_found_on_the_hull() -> None:
     assert weights.sum(axis=1) == pytest.approx(1.0)
 
 
-def test_the_least_turn_takes_one_direction_into_another() -> None:
+def test_the_smallest_rotation_maps_one_direction_to_another() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         start, end = rng.normal(size=(2, 3))
@@ -260,9 +260,7 @@ def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> No
     assert load_cached(make_table_cache(SPEC), tmp_path) is None
 
 
-def test_an_interrupted_table_goes_on_where_it_stopped(
-    model: SoftBodyModel, table: Table, tmp_path: Path
-) -> None:
+def test_an_interrupted_table_resumes(model: SoftBodyModel, table: Table, tmp_path: Path) -> None:
     def stop(done: int, total: int, need: object) -> None:
         if done >= precompute_table.SNAPSHOT_STEPS * 2:
             raise Interrupted
@@ -280,7 +278,7 @@ def test_an_interrupted_table_goes_on_where_it_stopped(
     assert np.allclose(again.fields, table.fields, atol=1e-9)
 
 
-def test_too_little_memory_is_said_before_it_is_taken(
+def test_too_little_memory_is_reported_before_allocation(
     model: SoftBodyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Little:

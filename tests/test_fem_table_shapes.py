@@ -1,4 +1,4 @@
-"""The nonlinear table of shapes that are no cylinder: made on their own mesh, smooth, bounded."""
+"""Test the nonlinear table of shapes other than cylinders: own mesh, smooth, bounded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SCENES = {
 def both(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Body, SceneBody]:
-    """The body by the linear method, and by a table of few sites and few, shallow depths."""
+    """Return the body by the linear method, and by a table of few samples and shallow depths."""
     scene = SCENES[request.param]
     linear = make_body(scene, 0.0065)
     with pytest.MonkeyPatch.context() as patch:
@@ -51,7 +51,7 @@ def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response,
     return body.method.respond(push), push
 
 
-def test_it_dents_where_it_is_pushed_as_the_linear_method_does(
+def test_it_deforms_at_the_push_like_the_linear_method(
     both: tuple[Body, SceneBody],
 ) -> None:
     linear, table = both

@@ -144,7 +144,7 @@ def test_a_sticking_finger_that_goes_too_far_is_flagged() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_finger_nowhere_is_an_error(value: float) -> None:
+def test_a_finger_without_a_position_is_an_error(value: float) -> None:
     """Return whether it is the first place or a later one."""
     with pytest.raises(ValueError, match="not finite"):
         pressed(pad(), (value, 0.0, 0.0))
@@ -167,7 +167,7 @@ def test_a_turned_corner_is_seen_though_quadrature_sees_nothing() -> None:
 
 
 @pytest.mark.parametrize(("place", "times"), [((0.4, 0.5, 0.6), 1.0), ((1.2, 0.5, 0.5), 0.0)])
-def test_winding_number_tells_inside(place: tuple[float, float, float], times: float) -> None:
+def test_winding_number_detects_inside(place: tuple[float, float, float], times: float) -> None:
     """Once around from inside, not at all from outside."""
     nodes, elements = box((2, 2, 2), (1.0, 1.0, 1.0))
     hull = boundary_faces(elements)[:, :3]

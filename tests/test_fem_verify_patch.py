@@ -201,7 +201,7 @@ def test_large_deformation_with_a_sliver(record_property: Record) -> None:
 
 
 @pytest.mark.parametrize("flatness", [0.0, -1e-3, 1e-9])
-def test_flat_and_inverted_elements_are_refused(flatness: float) -> None:
+def test_flat_and_inverted_elements_are_rejected(flatness: float) -> None:
     """Both laws refuse what has no volume to rounding, by the same measure."""
     nodes, elements = with_sliver(flatness)
     with pytest.raises(SolidMeshError, match="inverted or flat"):
@@ -211,7 +211,7 @@ def test_flat_and_inverted_elements_are_refused(flatness: float) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_nodes_that_are_not_finite_are_refused(value: float) -> None:
+def test_nodes_that_are_not_finite_are_rejected(value: float) -> None:
     """Not a number is not a place."""
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     nodes[3, 1] = value

@@ -1,4 +1,4 @@
-"""How well a finger was followed: known errors, lost contact and drop-outs come out as they are."""
+"""Test the evaluation of following: known errors, lost contact and interruptions."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def write_hand(
     mode: Callable[[float], str] = lambda _: "follow",
     phase: Callable[[float], str] = lambda _: "contact",
 ) -> Path:
-    """A finger on the scene's cylinder for two seconds, the sheet wrong as in `sessions`.
+    """Write a finger on the scene's cylinder for two seconds, with the sheet's error of `sessions`.
 
-    height_m: of the finger above the object.  mode: of the left arm.  phase: of the target.
+    height_m: of the finger above the object. mode: of the left arm. phase: of the target.
     """
     with BagWriter(path, {"recording": {"clock_id": "clock"}}) as writer:
         desk = sessions.Desk(writer, ())
@@ -103,7 +103,7 @@ def test_a_known_error_comes_out_of_the_bag(tmp_path: Path) -> None:
 
 
 def test_only_contact_counts(tmp_path: Path) -> None:
-    """From 0.5 s to 1.5 s the finger is 10 mm above the object, which the sheet need not meet."""
+    """From 0.5 s to 1.5 s the finger is 10 mm above the object, without a required contact."""
     lifted = write_hand(tmp_path / "a.mcap", height_m=lambda s: 0.01 * (0.5 <= s < 1.5))
     (row,) = read_followed(lifted)
     assert row["contact_ratio"] == pytest.approx(0.5, abs=0.02)
@@ -117,7 +117,7 @@ def test_only_contact_counts(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("by", ["arm", "planner"])
 def test_drop_outs_are_counted_in_contact(tmp_path: Path, by: str) -> None:
-    """Two in contact, of 0.3 s and 0.2 s; a third while the finger is away is none."""
+    """Two occur in contact, for 0.3 s and 0.2 s; a third, without the finger, does not count."""
 
     def out(s: float) -> bool:
         return 0.2 <= s < 0.5 or 0.7 <= s < 0.9 or 1.3 <= s < 1.5
@@ -134,7 +134,7 @@ def test_drop_outs_are_counted_in_contact(tmp_path: Path, by: str) -> None:
     assert row["following_ratio"] == pytest.approx(1.1 / 1.6, abs=0.02)
 
 
-def test_the_report_says_the_same(tmp_path: Path) -> None:
+def test_the_report_agrees(tmp_path: Path) -> None:
     bag = write_hand(tmp_path / "a.mcap", mode=lambda s: "hold" if 1.0 <= s < 1.2 else "follow")
     session = read_session(bag)
     numbers = make_result(session)
@@ -150,7 +150,7 @@ def test_the_report_says_the_same(tmp_path: Path) -> None:
     )
 
 
-def test_the_demo_takes_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demo_uses_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_hand(tmp_path / "a.mcap")
     row = read_followed_path(bag, LABEL)
     json.dumps(row, allow_nan=False)
@@ -199,7 +199,7 @@ TIMES = np.arange(5, dtype=np.int64) * 10_000_000
 
 
 def sheet(centre: Floats, normal: Floats) -> tuple[stroke.SampledMotion, stroke.SampledMotion]:
-    """Both edges of a sheet that stands still, 240 mm wide."""
+    """Return both edges of a resting sheet, 240 mm wide."""
     across = np.cross([0.0, 1.0, 0.0], normal)
     across /= np.linalg.norm(across)
     along = np.cross(normal, across)

@@ -1,7 +1,7 @@
-"""Forged fingertips and forged states of the other arm move no arm beyond a limit.
+"""Test that forged fingertips and forged states of the other arm move no arm beyond a limit.
 
-Planner, both bridges and the simulated arms' controllers in virtual time.  Speeds are those of the
-simulated joints, the tool's by the simulator's kinematics.
+Planner, both bridges and the simulated controllers run in virtual time. Speeds are those of the
+simulated joints, and of the tool by the simulator's kinematics.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
 
 
 class Immediate(PathChecker):
-    """Check paths at once, since time is virtual here."""
+    """Path checker without delay, for virtual time."""
 
     def poll(
         self, question: PathCheckRequest | None
@@ -80,7 +80,7 @@ def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
 
 @dataclass
 class ForgedBench(Bench):
-    """The bench with a planner, and with somebody who replaces states of the other arm."""
+    """Harness with a planner, and with a replacement of the other arm's states."""
 
     forge_state: Callable[[ArmState, Header], tuple[ArmState, Header]] | None = None
     targets_told: list[SheetTarget] = field(default_factory=list)
@@ -139,7 +139,7 @@ class ForgedBench(Bench):
         *,
         at_most_until: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Let time pass while the planner gets these fingertips."""
+        """Let time pass while the planner receives these fingertips."""
         begin_ns, told = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if at_most_until():
@@ -221,7 +221,7 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
 
 
 def run_bench(test: Callable[[ForgedBench], Awaitable[None]]) -> None:
-    """Run a test on a bench of its own."""
+    """Run a test with a new harness."""
 
     async def main() -> None:
         with pytest.MonkeyPatch.context() as patch:
@@ -263,7 +263,7 @@ def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: in
 
 
 @pytest.mark.parametrize("kind", ["nan", "infinite", "stale", "future", "path nan"])
-def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_says_why(kind: str) -> None:
+def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_reports_why(kind: str) -> None:
     async def test(bench: ForgedBench) -> None:
         random = np.random.default_rng(len(kind))
         await bench.point(0.4, bench.honest)

@@ -1,4 +1,4 @@
-"""What fuzzing has found, each kept as a test: see `make fuzz`."""
+"""Test the findings of fuzzing: see `make fuzz`."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def test_what_an_earlier_run_has_found_is_not_found_again(
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(fuzz.subprocess, "run", run)
-    assert fuzz.hunted("wire", tmp_path, 1.0)["found"] == [str(folder / "timeout-new")]
-    assert fuzz.hunted("wire", tmp_path, 1.0)["found"] == []
+    assert fuzz.fuzz_in_process("wire", tmp_path, 1.0)["found"] == [str(folder / "timeout-new")]
+    assert fuzz.fuzz_in_process("wire", tmp_path, 1.0)["found"] == []
 
 
 HEADER = Header(1, 10, 20, "clock", "planner", 1, "plan")
@@ -53,7 +53,7 @@ FINGERTIP = TOPICS["fingertip"]
 
 
 def header_frame(**changes: Any) -> list[Any]:
-    """The header of a fingertip, some of its eleven elements replaced."""
+    """Return the header of a fingertip with some of its eleven elements replaced."""
     places = {"protocol": 0, "name": 1, "fingerprint": 2, "sequence": 3, "writer": 7, "fields": -1}
     elements = list(msgpack.unpackb(encode(example(Fingertip), HEADER)[0], use_list=False))
     for name, value in changes.items():
@@ -62,12 +62,12 @@ def header_frame(**changes: Any) -> list[Any]:
 
 
 ARRAY = msgpack.ExtType(1, struct.pack("<BBxxI", 9, 1, 2) + bytes(8))
-"""Two float32, where a name belongs."""
+"""Two float32 in the position of a name."""
 
 
 @pytest.mark.parametrize("place", ["protocol", "name", "fingerprint", "sequence", "writer"])
-def test_an_array_where_a_name_belongs_is_refused_and_ends_no_reader(place: str) -> None:
-    """An array is neither equal nor unequal to a name, and asking raised ValueError."""
+def test_an_array_where_a_name_belongs_is_rejected_and_ends_no_reader(place: str) -> None:
+    """The comparison of an array with a name raised ValueError."""
     problems: list[str] = []
     counts = PortCounts()
     subscriber = Subscriber(FINGERTIP, [], print, counts, on_problem=problems.append)
@@ -77,8 +77,8 @@ def test_an_array_where_a_name_belongs_is_refused_and_ends_no_reader(place: str)
 
 
 @pytest.mark.parametrize("place", ["protocol", "name", "sequence", "writer", "fields"])
-def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str) -> None:
-    """Their text is not made: it would need more depth than Python has."""
+def test_lists_nested_to_the_parsers_limit_are_rejected_in_a_sentence(place: str) -> None:
+    """Their text is not created: it would need more depth than Python has."""
     deep = b"\x91" * 1000 + b"\x90"
     mark = "here"
     packed = msgpack.packb(header_frame(**{place: mark})).replace(msgpack.packb(mark), deep)
@@ -87,8 +87,8 @@ def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str)
     assert len(str(refused.value)) < 300
 
 
-def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
-    """Each asks for its room before its elements are there: 8 GB for a message of a megabyte."""
+def test_lists_with_a_false_length_allocate_no_memory() -> None:
+    """Each allocated memory before its elements arrived: 8 GB for a message of a megabyte."""
     claim = b"\xdd" + struct.pack(">I", 60_000)
     bomb = claim * 1000 + bytes(100_000)
     tracemalloc.start()
@@ -100,8 +100,8 @@ def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
         tracemalloc.stop()
 
 
-def test_a_header_of_many_small_values_is_refused_before_it_is_read() -> None:
-    """A byte of the wire may be 64 of memory, and a picture's topic lets 64 MiB in."""
+def test_a_header_of_many_small_values_is_rejected_before_it_is_read() -> None:
+    """A byte of the message can need 64 bytes of memory, and an image's topic allows 64 MiB."""
     large = bytes(wire.MAX_HEADER_BYTES + 1)
     with pytest.raises(WireError, match="header of"):
         decode([large], TOPICS["frame"])
@@ -121,7 +121,7 @@ def rewritten(path: Path, records: list[Record]) -> Path:
 
 
 def with_schema(records: list[Record], text: bytes) -> list[Record]:
-    """The records with another JSON Schema, and a fingerprint that is not today's."""
+    """Return the records with another JSON Schema, and an outdated fingerprint."""
     changed = []
     for opcode, body in records:
         start, at = body.find(b"{"), body.find(b"fingerprint") + len(b"fingerprint") + 4
@@ -148,7 +148,7 @@ REFERENCE = {"$ref": "#/$defs/A"}
     ],
 )
 def test_a_schema_without_an_end_is_no_schema(tmp_path: Path, schema: bytes) -> None:
-    """Nested deeper than Python is, or leading to itself: that hung."""
+    """A schema nested deeper than Python allows, or with a cycle, caused an endless loop."""
     records = with_schema(small_bag(tmp_path / "a.mcap"), schema)
     bag = rewritten(tmp_path / "b.mcap", records)
     reader = BagReader(bag)
@@ -158,7 +158,7 @@ def test_a_schema_without_an_end_is_no_schema(tmp_path: Path, schema: bytes) -> 
 
 
 def test_a_schema_that_names_its_parts_again_and_again_is_compared_once() -> None:
-    """Three ways in each of forty steps are more than anybody can wait for."""
+    """Three references in each of forty levels took exponential time."""
     parts: dict[str, Any] = {"p40": {"type": "string"}}
     for number in range(40):
         reference = {"$ref": f"#/$defs/p{number + 1}"}
@@ -172,7 +172,7 @@ def test_a_schema_that_names_its_parts_again_and_again_is_compared_once() -> Non
 
 @pytest.mark.parametrize("claimed", [1 << 40, 1 << 20, 10])
 def test_a_chunk_is_unpacked_no_further_than_it_claims(tmp_path: Path, claimed: int) -> None:
-    """A file of 2 MB could ask for as much memory as there is."""
+    """A file of 2 MB could allocate all memory."""
     records = small_bag(tmp_path / "a.mcap")
     packer = zstandard.ZstdCompressor().compressobj()
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(300)) + packer.flush()
@@ -218,7 +218,7 @@ ODD_YAML = {
 
 @pytest.mark.parametrize("text", ODD_YAML.values(), ids=ODD_YAML)
 def test_odd_yaml_is_a_problem_with_its_file(tmp_path: Path, text: str) -> None:
-    """Each was another exception, a hang or an explosion."""
+    """Each case was an unhandled exception, an endless loop or exponential growth."""
     file = tmp_path / "a.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError, match=r"a\.yaml"):
@@ -238,7 +238,7 @@ def test_brackets_in_comments_and_strings_nest_nothing(open_: str, close: str) -
         parse_value("""['x]', """ * 200)
 
 
-def test_a_file_too_large_to_be_written_by_hand_is_refused(tmp_path: Path) -> None:
+def test_a_file_too_large_to_be_written_by_hand_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "a.yaml"
     file.write_text("a: 1\n" * 300_000)
     with pytest.raises(BadInputError, match="at most"):
@@ -264,16 +264,18 @@ def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
         ),
     ],
 )
-def test_an_impossible_mesh_is_refused_in_words(tmp_path: Path, text: str, said: str) -> None:
-    """Numbers that no integer holds ran over within the library."""
+def test_an_impossible_mesh_is_rejected_with_an_error_text(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    """Numbers beyond the range of integers overflowed in the library."""
     file = tmp_path / "a.obj"
     file.write_text(text)
     with pytest.raises(MeshError, match=said), np.errstate(all="ignore"):
         read_mesh(file, 0.1, None)
 
 
-def test_check_sums_of_a_rewritten_bag_are_looked_at(tmp_path: Path) -> None:
-    """What the tests above rewrite would be read if it were sound."""
+def test_check_sums_of_a_rewritten_bag_are_verified(tmp_path: Path) -> None:
+    """The check sums of the rewritten bags of the tests above must be valid."""
     records = small_bag(tmp_path / "a.mcap", compress=False)
     assert len(list(BagReader(rewritten(tmp_path / "b.mcap", records)))) == 1
     changed = [(op, body[:-1] + b"\xff" if op == 6 else body) for op, body in records]

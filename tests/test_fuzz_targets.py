@@ -1,6 +1,7 @@
-"""Bytes from outside, changed by what knows their structure: understood, or refused as declared.
+"""Test the fuzzing targets with hypothesis: inputs are decoded, or rejected with the declared
+error.
 
-The same targets that `make fuzz` hunts in for longer.
+`make fuzz` runs the same targets for longer.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from benchmarks.fuzz_targets import (
 EXAMPLES = {
     "wire": 150, "bag": 40, "launch": 6, "scene": 6, "mesh": 15, "modbus": 30, "mxt": 30
 }  # fmt: skip
-"""Each some tenths of a second to two."""
+"""Number of examples by target; each target takes some tenths of a second to two seconds."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,7 +37,7 @@ def _cleared_away() -> Iterator[None]:
 
 @pytest.mark.parametrize("name", TARGETS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning:trimesh", "ignore::DeprecationWarning:trimesh")
-def test_changed_input_is_understood_or_refused(name: str) -> None:
+def test_changed_input_is_understood_or_rejected(name: str) -> None:
     target = TARGETS[name]
     # Of YAML the smallest, which is slow to read already.
     seeds = sorted(target.seeds(), key=len)[: 1 if name in ("launch", "scene") else None]
@@ -65,7 +66,7 @@ def test_valid_examples_are_understood(name: str) -> None:
     assert any(target.check(seed) for seed in target.seeds())
 
 
-def test_what_executes_or_takes_too_much_is_found() -> None:
+def test_execution_and_excessive_memory_are_found() -> None:
     with pytest.raises(Finding, match=r"os\.system"), ExecutionMonitor.looks():
         __import__("os").system("true")
     with pytest.raises(Finding, match="MiB"), bounded_memory(-1):

@@ -187,7 +187,7 @@ def test_fingertips_that_never_came_are_counted(tmp_path: Path) -> None:
     assert result["error_mm"]["max"] < 1e-9
 
 
-def test_a_prediction_is_not_judged_where_the_truth_was_not_seen(tmp_path: Path) -> None:
+def test_a_prediction_is_not_evaluated_without_the_truth(tmp_path: Path) -> None:
     """Eight missed frames in each second: across them the truth is not known, so not made up."""
     unseen = Tracked("reach-fast", unseen=lambda i: i % 60 > 51)
     result = result_of(write(tmp_path / "a.mcap", unseen), "reach-fast")

@@ -1,4 +1,4 @@
-"""Gestures: what a person's finger does, on whatever object, within what the scene allows."""
+"""Test simulated gestures of a user's finger on any object, within the scene's limits."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ SCENE = Scene.model_validate(values())
 
 @st.composite
 def scenes(draw: Callable[..., float]) -> Scene:
-    """Scenes with other objects, in another place, for slower fingers in smaller volumes."""
+    """Return scenes with other objects, positions, finger speeds and volumes."""
     changed = values()
     radius = draw(st.floats(0.015, 0.06))
     place = [draw(st.floats(-0.03, 0.03)), draw(st.floats(-0.03, 0.03)), -radius]
@@ -74,7 +74,7 @@ def scenes(draw: Callable[..., float]) -> Scene:
 def motion_on(
     path: FingerPath, scene: Scene, *, steady: bool = False, seed: int = 1
 ) -> FingerMotion:
-    """The motion of a finger that was resting at the path's first point."""
+    """Return the motion of a finger that was resting at the path's first point."""
     return FingerMotion.resting(path.positions_world_m[0], seed=seed).followed_by(
         0.0,
         times_s=path.times_s,
@@ -87,7 +87,7 @@ def motion_on(
 
 
 def heights(points: Floats, scene: Scene) -> Floats:
-    """Distances (n,) of world points from a cylinder that lies along x."""
+    """Return distances (n,) of world points from a cylinder along x."""
     radius_m = scene.object.geometry.radius_m
     local = points - scene.object.world_from_object.position_m
     return np.asarray(np.hypot(local[:, 1], local[:, 2]) - radius_m)
@@ -215,7 +215,8 @@ def test_a_reverse_turns_at_full_speed_within_100_ms() -> None:
 )
 @settings(max_examples=40, deadline=None)
 def test_a_reach_of_least_jerk_comes_out_as_it_was_meant(way_m: float, duration_s: float) -> None:
-    """Its samples, joined by the spline, are within 10 um of it, at any acceleration up to 2 g."""
+    """Its samples, interpolated by the spline, have an error below 10 um at any acceleration up to
+    2 g."""
     duration_s = max(duration_s, float(np.sqrt(5.77 * way_m / 20.0)))
     times, places = minimum_jerk([0.0, 0.0, 0.0], [(duration_s, [way_m, 0.0, 0.0])])
     motion = validate_path(times, places, "spline")
@@ -231,7 +232,7 @@ def test_a_reach_of_least_jerk_comes_out_as_it_was_meant(way_m: float, duration_
 
 
 def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
-    """Why there is a spline: the rounding takes 0.3 mm off an ordinary reach."""
+    """Rounded corners instead of a spline would reduce an ordinary reach by 0.3 mm."""
     times, places = minimum_jerk([0.0, 0.0, 0.0], [(0.5, [0.05, 0.0, 0.0])])
     missed = []
     for joined_by in ("rounded_lines", "spline"):
@@ -247,7 +248,7 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
 
 @gestures
 def test_halving_the_samples_changes_no_gesture(gesture: Gesture) -> None:
-    """The samples hold the whole motion."""
+    """The samples describe the whole motion."""
     path = gesture(SCENE)
     whole = validate_path(path.times_s, path.positions_world_m, "spline")
     keep = np.unique(np.append(np.arange(0, len(path.times_s), 2), len(path.times_s) - 1))
@@ -274,7 +275,7 @@ def test_no_smooth_path_is_faster_than_its_bound(
         assert max(np.linalg.norm(path.at(time)[1]) for time in inside) <= bound + 1e-9
 
 
-def test_a_smooth_path_that_is_too_fast_between_its_samples_is_refused() -> None:
+def test_a_smooth_path_that_is_too_fast_between_its_samples_is_rejected() -> None:
     rest = FingerMotion.resting(np.zeros(3), seed=1)
     with pytest.raises(FingerPathError, match=r"speed .* after times_s\[0\]"):
         rest.followed_by(
@@ -288,12 +289,12 @@ def test_a_smooth_path_that_is_too_fast_between_its_samples_is_refused() -> None
         )
 
 
-def test_one_point_is_a_place_to_rest_however_it_is_joined() -> None:
+def test_one_point_is_a_rest_position_for_any_interpolation() -> None:
     path = validate_path(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
     assert path.at(3.0)[0][0] == pytest.approx(0.1)
 
 
-def test_speeds_add_up_to_the_way() -> None:
+def test_speeds_integrate_to_the_path() -> None:
     times, way = integrate_speed_profile(
         [(0.2, 0.1), (0.5, 0.1), (0.05, 0.0), (0.3, 0.0), (0.1, -0.2)]
     )
@@ -320,7 +321,7 @@ def test_a_turned_object_is_touched_from_the_users_side() -> None:
 
 
 def test_a_recorded_hand_keeps_what_it_did_between_its_samples(tmp_path: Path) -> None:
-    """A tremor of 8 Hz that was recorded at 48 Hz is still there, as large as it was."""
+    """A tremor of 8 Hz that was recorded at 48 Hz keeps its amplitude."""
     t = np.arange(0.0, 6.0, 1.0 / 48.0)
     tremor_mm = 0.2 * np.sin(2.0 * np.pi * 8.0 * t)
     # Depths such that this hand hovers where its tremor shows: along the object.

@@ -1,4 +1,4 @@
-"""The renderer draws what it drew; see `tests/golden_pictures.py` for how to redraw."""
+"""Test that the renderer's images are unchanged; see `tests/golden_pictures.py` to redraw them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tests.golden_pictures import CASES, FOLDER
 Image = NDArray[np.uint8]
 
 MAX_MEAN = 3.0
-"""Levels of 255, over the lit pixels: other windows and samples leave up to 2.7, a pixel's shift of
-the object 4.5 and more."""
+"""Maximum mean difference over the lit pixels, levels. Other sampling gives up to 2.7, an object
+shifted by a pixel 4.5 and more."""
 MAX_OFF, OFF_LEVELS = 0.02, 40
-"""Share of those pixels that may differ by more levels: outlines between other samples."""
+"""Maximum fraction of these pixels that differ by more levels, as at outlines."""
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,8 @@ def golden(name: str) -> Image:
 
 
 def difference(picture: Image, wanted: Image) -> tuple[float, float]:
-    """Mean difference (levels) and share of pixels that are quite other, of those that are lit."""
+    """Return the mean difference (levels) and the fraction of very different pixels, of the lit
+    ones."""
     assert picture.shape == wanted.shape
     off = np.abs(picture.astype(int) - wanted).max(axis=2)
     lit = max(int((wanted.max(axis=2) > 8).sum()), 1000)
@@ -46,7 +47,7 @@ def agree(picture: Image, wanted: Image) -> bool:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
+def test_the_image_is_as_it_was(context: moderngl.Context, name: str) -> None:
     mean, share = difference(CASES[name](context), golden(name))
     assert mean <= MAX_MEAN
     assert share <= MAX_OFF
@@ -67,6 +68,6 @@ def test_light_from_elsewhere_is_noticed(
     assert not agree(CASES["shape-cylinder"](context), golden("shape-cylinder"))
 
 
-def test_a_picture_moved_by_a_pixel_is_noticed() -> None:
+def test_an_image_moved_by_a_pixel_is_noticed() -> None:
     wanted = golden("texture-grid")
     assert not agree(np.roll(wanted, 1, axis=1), wanted)

@@ -1,4 +1,4 @@
-"""The whole graph on localhost, judged by its own bag: rates, ages, losses, exits, nothing left."""
+"""Test the whole graph on localhost by its own bag: rates, ages, losses, exits, remains."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MIN_FRAMES = 20
 
 
 def processes_of_run(run_id: str) -> list[psutil.Process]:
-    """Live processes that carry the run's tag."""
+    """Return the live processes with the run's tag."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -49,7 +49,7 @@ def processes_of_run(run_id: str) -> list[psutil.Process]:
 
 
 def on_ports(plan_ports: tuple[int, int]) -> list[str]:
-    """Settings that put the twin's arms on ports of this test's own."""
+    """Return settings that put the simulated arms on this test's ports."""
     left, right = plan_ports
     return [
         f"twin_arms.left_port={left}",
@@ -60,7 +60,7 @@ def on_ports(plan_ports: tuple[int, int]) -> list[str]:
 
 
 def free_ports() -> tuple[int, int]:
-    """Two TCP ports of the loopback that nobody listens on now."""
+    """Return two free TCP ports of loopback."""
     with socket.socket() as one, socket.socket() as other:
         one.bind(("127.0.0.1", 0))
         other.bind(("127.0.0.1", 0))
@@ -69,7 +69,7 @@ def free_ports() -> tuple[int, int]:
 
 @dataclass
 class Session:
-    """What a run of the graph left behind."""
+    """Results of a run of the graph."""
 
     bag: Path
     exit_codes: dict[str, int]
@@ -163,7 +163,7 @@ def recording(session: Session) -> stroke.StrokeRecording:
 
 
 def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> None:
-    """Rates over the first stroke, before anything is killed, from the publishers' own stamps."""
+    """Rates are computed over the first stroke, before the kill, from the publishers' stamps."""
     stamps: dict[str, list[int]] = {}
     windows = stroke.read_recording(session.bag).windows_ns
     begin_ns, end_ns = windows[stroke.stroke_label(STROKE_S)]
@@ -183,7 +183,7 @@ def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> N
         assert len(stamps.get(name, ())) / duration_s >= 0.5 * rate[0], name
 
 
-def test_nothing_was_lost_or_refused_on_the_way(session: Session) -> None:
+def test_nothing_was_lost_or_rejected(session: Session) -> None:
     problems = Counter()
     writers = set()
     for _, message, _, _ in BagReader(session.bag, topics=["status"]):
@@ -207,7 +207,7 @@ def test_sequences_in_the_bag_have_no_gaps(session: Session) -> None:
 
 
 def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
-    """What was used is nearly the newest that had been published, however slow the machine is."""
+    """Used data are nearly the newest that had been published, on any machine."""
     published: dict[str, list[tuple[int, int]]] = {"fingertip": [], "sheet_target": []}
     used: dict[str, list[tuple[int, int]]] = {"planner": [], "arms": [], "renderer": []}
     for topic, message, header, _ in BagReader(session.bag):
@@ -240,7 +240,7 @@ def test_the_sheet_follows_the_finger(recording: stroke.StrokeRecording) -> None
     assert errors.true_delta_theta_rad.mean() < np.radians(2.0)
 
 
-def test_the_arms_stand_safely_while_the_triangulator_is_gone_and_follow_again(
+def test_the_arms_rest_safely_without_the_triangulator_and_follow_again(
     session: Session,
 ) -> None:
     modes: dict[str, list[str]] = {"left": [], "right": []}

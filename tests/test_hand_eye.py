@@ -1,4 +1,4 @@
-"""Where the arms' bases stand: measured from a board on the flange, with honest uncertainty."""
+"""Test the poses of the arms' bases, measured from a board on the flange, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ SIZE = (SCENE.camera.width_px, SCENE.camera.height_px)
 
 
 def seen(left_from_board: Floats, noise: Floats) -> list[CornerView]:
-    """The corners by the twin's own projection; noise (2, 35, 2) px."""
+    """Project the corners with the simulator; noise (2, 35, 2) px."""
     views = []
     for lens, eye_from_left, off in zip(
         (SCENE.camera.left, SCENE.camera.right),
@@ -81,7 +81,7 @@ def seen(left_from_board: Floats, noise: Floats) -> list[CornerView]:
 
 
 class Workplace:
-    """An arm of the twin with a board on its flange, before the camera."""
+    """Simulated arm with a board on its flange, in front of the camera."""
 
     def __init__(self, seed: int, side: Side = "left") -> None:
         self.random = np.random.default_rng(seed)
@@ -94,7 +94,8 @@ class Workplace:
         self.flange_from_board = inverse(flange) @ board
 
     def joints(self, turn_rad: Floats, shift_m: Floats) -> Floats:
-        """Joints that turn the board (rotation vector, in the camera's axes) and shift it."""
+        """Return joints that rotate the board (rotation vector, in the camera's axes) and shift
+        it."""
         rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(turn_rad)
         board = transform(rotation, self.held + shift_m - rotation @ CORNERS.mean(axis=0))
         return solve_inverse_kinematics(
@@ -119,7 +120,8 @@ class Workplace:
         joint_noise_rad: float = 0.0,
         turn_rad: Any = 0.3,
     ) -> list[BoardDetection]:
-        """turn_rad: deviation of the turns, one for all three axes or for each."""
+        """Simulate detections; turn_rad: standard deviation of the rotations, for all axes or for
+        each."""
         found: list[BoardDetection] = []
         while len(found) < count:
             turn = self.random.normal(0.0, 1.0, 3) * turn_rad
@@ -134,7 +136,7 @@ class Workplace:
         return found
 
     def error(self, fit: BaseFit) -> Floats:
-        """(6,) motion from the found base to the true one."""
+        """Return the motion (6,) from the estimated base to the true one."""
         turn = self.base[:3, :3] @ fit.world_from_base[:3, :3].T
         shift = self.base[:3, 3] - fit.world_from_base[:3, 3]
         return np.concatenate([vector_from_rotation(turn), shift])
@@ -172,7 +174,7 @@ def test_the_errors_are_within_the_stated_uncertainty(
     assert chi2.ppf(1e-4, 36) < sum(squares) < chi2.ppf(0.999, 36)
 
 
-def test_the_arms_own_error_is_told_from_the_cameras() -> None:
+def test_the_arms_error_is_separated_from_the_cameras() -> None:
     place = Workplace(7)
     fit = calibrate_base(place.detections(25, noise_px=0.05, joint_noise_rad=1e-3), RIG)
     # Three wrist joints and what the others add: somewhat more than one joint's deviation.
@@ -184,7 +186,7 @@ def test_the_arms_own_error_is_told_from_the_cameras() -> None:
     assert quiet.compute_std(np.zeros(3))[0] < 0.2 * fit.compute_std(np.zeros(3))[0]
 
 
-def test_more_places_make_it_more_certain() -> None:
+def test_more_poses_reduce_the_uncertainty() -> None:
     few, many = (
         calibrate_base(Workplace(3).detections(n, noise_px=0.1, joint_noise_rad=5e-4), RIG)
         for n in (8, 30)
@@ -193,7 +195,7 @@ def test_more_places_make_it_more_certain() -> None:
 
 
 @pytest.mark.parametrize("strays", [1, 3])
-def test_places_with_wrong_joints_are_left_out(strays: int) -> None:
+def test_poses_with_wrong_joints_are_excluded(strays: int) -> None:
     place = Workplace(5)
     detections = place.detections(14, noise_px=0.1, joint_noise_rad=2e-4)
     for index in range(strays):
@@ -220,7 +222,7 @@ def test_a_board_read_from_its_other_end_is_left_out() -> None:
     assert [each.name for each in fit.residuals if each.reason] == ["place 3"]
 
 
-def test_when_nothing_fits_together_it_says_so() -> None:
+def test_inconsistent_poses_are_an_error() -> None:
     place = Workplace(6)
     detections = place.detections(12, noise_px=0.1)
     shuffled = [
@@ -245,13 +247,13 @@ def test_when_nothing_fits_together_it_says_so() -> None:
         ([0.4, 0.03, 0.03], "rotates about one axis only"),
     ],
 )
-def test_motions_that_leave_it_open_are_refused(turn_rad: Any, words: str) -> None:
+def test_motions_that_leave_it_open_are_rejected(turn_rad: Any, words: str) -> None:
     detections = Workplace(8).detections(12, noise_px=0.1, turn_rad=turn_rad)
     with pytest.raises(HandEyeError, match=words):
         calibrate_base(detections, RIG)
 
 
-def test_too_few_places_are_refused() -> None:
+def test_too_few_poses_are_rejected() -> None:
     with pytest.raises(HandEyeError, match="5 arm poses, at least 6"):
         calibrate_base(Workplace(9).detections(5), RIG)
 
@@ -265,7 +267,7 @@ def test_joints_that_are_none_are_named(joints: Floats) -> None:
         calibrate_base(detections, RIG)
 
 
-def test_the_same_places_give_the_same_result() -> None:
+def test_the_same_poses_give_the_same_result() -> None:
     detections = Workplace(4).detections(8, noise_px=0.1, joint_noise_rad=2e-4)
     first, second = (calibrate_base(detections, RIG) for _ in range(2))
     assert (first.world_from_base == second.world_from_base).all()
@@ -288,7 +290,7 @@ def test_roll_pitch_yaw_of_straight_up_and_down(pitch: float) -> None:
 def write_poses(
     folder: Path, detections: list[BoardDetection], place: Workplace, unit: str
 ) -> None:
-    """A table with the board's poses instead of pictures."""
+    """Write a table with the board's poses instead of images."""
     names = ("board_x_m", "board_y_m", "board_z_m", "board_rx_rad", "board_ry_rad", "board_rz_rad")
     with (folder / TABLE).open("w", newline="") as file:
         writer = csv.writer(file)
@@ -341,7 +343,7 @@ def test_a_bad_table_is_named_to_the_cell(tmp_path: Path, text: str | None, word
         read_pose_table(tmp_path)
 
 
-def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
+def test_a_board_behind_the_camera_is_rejected(tmp_path: Path) -> None:
     header = ",".join([*(f"j{n}_deg" for n in range(1, 7)), "board_x_m", "board_y_m", "board_z_m"])
     (tmp_path / TABLE).write_text(
         f"{header},board_rx_rad,board_ry_rad,board_rz_rad\n0,25,119,0,-54,0,0,0,-0.5,0,0,0\n"
@@ -351,7 +353,7 @@ def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
 
 
 class Live:
-    """A PoseRecorder that is shown what the twin's camera sees, with a clock of its own."""
+    """PoseRecorder with images of the simulated camera and a separate clock."""
 
     def __init__(self, folder: Path) -> None:
         self.place = Workplace(12)
@@ -371,7 +373,7 @@ class Live:
         return self.taker.update_images(*self.shown.pair(pose), self.now_s)
 
 
-def test_a_place_is_taken_when_the_arm_rests_somewhere_new(tmp_path: Path) -> None:
+def test_a_pose_is_recorded_when_the_arm_rests_at_a_new_one(tmp_path: Path) -> None:
     live = Live(tmp_path)
     dark = np.zeros((480, 640), np.uint8)
     assert live.taker.update_images(dark, dark, 0.0) == "no message from the arm yet"
@@ -402,7 +404,7 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *ar
 COMMON = ("--scene", SCENE_FILE, "--board", "7x5", "--square-mm", "15")
 
 
-def test_the_twins_arms_are_calibrated_from_pictures(
+def test_the_twins_arms_are_calibrated_from_images(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     output, copy = tmp_path / "arms.yaml", tmp_path / "copy.yaml"
@@ -481,7 +483,7 @@ def test_bad_input_to_the_command_is_named(
         assert not output.exists()
 
 
-def test_pictures_of_another_size_or_without_a_board(tmp_path: Path) -> None:
+def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     live = Live(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
     with pytest.raises(ArmPosesError, match="images of 640x480 px"):

@@ -1,4 +1,4 @@
-"""Every command that reads a bag refuses a damaged or hostile one in a sentence."""
+"""Test that every command that reads a bag rejects a damaged or hostile one with an error text."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def flipped(seed: int) -> Callable[[bytes], bytes]:
 
 
 def records(data: bytes, opcode: int) -> list[int]:
-    """Where the lengths of a kind of record stand."""
+    """Return the positions of the lengths of a kind of record."""
     found, offset = [], 8
     while offset + 9 < len(data):
         kind, length = struct.unpack_from("<BQ", data, offset)
@@ -72,7 +72,7 @@ def longer(opcode: int, length: int) -> Callable[[bytes], bytes]:
 
 
 def bomb(data: bytes) -> bytes:
-    """A chunk of 4 GB of zeros in some hundred KB, which says so, behind the first header."""
+    """Insert a chunk of 4 GB of zeros, compressed to some hundred KB, after the first header."""
     packer = zstandard.ZstdCompressor(level=1).compressobj()
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(4096)) + packer.flush()
     body = struct.pack("<QQQI", 0, 1, 4096 << 20, 0) + struct.pack("<I", 4) + b"zstd"
@@ -81,7 +81,7 @@ def bomb(data: bytes) -> bytes:
 
 
 def lying_bomb(data: bytes) -> bytes:
-    """The same, but the chunk says that it is small."""
+    """Insert the same chunk with a small declared size."""
     packer = zstandard.ZstdCompressor(level=1).compressobj()
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1024)) + packer.flush()
     body = struct.pack("<QQQI", 0, 1, 1000, 0) + struct.pack("<I", 4) + b"zstd"
@@ -95,7 +95,7 @@ def _behind_header(data: bytes, record: bytes) -> bytes:
 
 
 def made(write: Callable[[Writer], None]) -> Callable[[bytes], bytes]:
-    """A bag of its own, well formed as a file."""
+    """Write a well-formed bag."""
 
     def make(_: bytes) -> bytes:
         from io import BytesIO
@@ -161,7 +161,7 @@ HOSTILE: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-def test_a_hostile_bag_is_refused_or_read_in_part(
+def test_a_hostile_bag_is_rejected_or_read_in_part(
     whole: bytes, command: Command, tmp_path: Path, name: str
 ) -> None:
     bag, graph = tmp_path / "hostile.mcap", tmp_path / "graph.yaml"
@@ -180,6 +180,6 @@ def test_a_hostile_bag_is_refused_or_read_in_part(
 
 
 def test_the_whole_bag_is_read(whole: bytes, tmp_path: Path) -> None:
-    """What is refused above is refused for its damage."""
+    """The inputs above are rejected for their damage only."""
     (tmp_path / "a.mcap").write_bytes(whole)
     assert BagReader(tmp_path / "a.mcap").complete

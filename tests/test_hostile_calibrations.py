@@ -1,4 +1,4 @@
-"""Calibration files that no command of ours has written are refused in a sentence."""
+"""Test that invalid calibration files are rejected with an error text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("name", list(HOSTILE))
 @pytest.mark.parametrize("load", [load_calibration, load_arms_calibration, load_sheet_calibration])
-def test_it_is_refused(tmp_path: Path, load: object, name: str) -> None:
+def test_it_is_rejected(tmp_path: Path, load: object, name: str) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_bytes(HOSTILE[name])
     with pytest.raises(CalibrationFileError) as refused:
@@ -44,7 +44,7 @@ def test_it_is_refused(tmp_path: Path, load: object, name: str) -> None:
     [("fx_px", "1.0e+300"), ("fx_px", ".nan"), ("width_px", "2000000000"), ("square_m", "-1.0"),
      ("reprojection_rms_px", ".inf")],
 )  # fmt: skip
-def test_an_absurd_number_is_refused_by_its_key(tmp_path: Path, key: str, value: str) -> None:
+def test_an_absurd_number_is_rejected_by_its_key(tmp_path: Path, key: str, value: str) -> None:
     head, found, rest = WHOLE.partition(f"{key}: ")
     assert found
     end = min(rest.index(one) for one in ",}\n" if one in rest)

@@ -1,4 +1,5 @@
-"""The lines of the house hold: imports go down only, nobody looks into a neighbour's room."""
+"""Test the structure of the project: imports follow the layers, and no package uses private
+names."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def modules(floor: str) -> Iterator[Path]:
 
 
 def imports_of(path: Path) -> set[str]:
-    """Dotted names of everything that a file imports, at any depth of it."""
+    """Return the dotted names of everything that a file imports, at any depth."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -43,7 +44,7 @@ def imports_of(path: Path) -> set[str]:
 
 
 def floor_of(name: str) -> str:
-    """The top-level folder of a module of the project; the first part of any other name."""
+    """Return the top-level folder of a module of the project; the first part of any other name."""
     return name.removeprefix("flexsheet.").split(".", maxsplit=1)[0]
 
 
@@ -86,7 +87,7 @@ def test_models_know_neither_messages_nor_sockets_nor_files() -> None:
         assert not found, f"{path.relative_to(ROOT)} imports {found}"
 
 
-def test_the_twin_shares_nothing_with_what_it_judges() -> None:
+def test_the_simulator_shares_nothing_with_the_code_it_evaluates() -> None:
     for path in modules("nodes/twin"):
         shared = {
             name

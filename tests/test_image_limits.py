@@ -1,4 +1,4 @@
-"""Where the picture cannot be right: dark there, or the last good plane held, and never wrong."""
+"""Test the limits of the image: dark, or the last valid plane, but never wrong."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
 STRETCH = 1.05
 WHOLE = 14600
-"""Points of the whole object at 0.7 mm a pixel."""
+"""Number of points of the whole object at 0.7 mm per pixel."""
 METHODS = ("one_plane", "four_triangles", "two_pass")
 EYE = SCENE.eyes.centre_world_m
 PROJECTOR = np.array(SCENE.projector.world_from_projector.position_m)
@@ -60,7 +60,8 @@ def sheet_at(pose: Floats, tip: Floats | None = None) -> SheetPose:
 
 
 def plane_through(point: Floats) -> Floats:
-    """world_from_sheet about the world's origin, turned about x until it contains the point."""
+    """Return world_from_sheet at the world's origin, rotated about x until it contains the
+    point."""
     angle = float(np.arctan2(point[1], point[2])) - 0.5 * np.pi
     return transform(rotation_from_vector([-angle, 0.0, 0.0]), np.zeros(3))
 
@@ -129,7 +130,7 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
         ((0.0, 0.0, -0.02), ""),
     ],
 )
-def test_a_push_out_of_range_is_drawn_and_said(
+def test_a_push_out_of_range_is_drawn_and_reported(
     stage: SceneRenderer, tip: tuple[float, float, float], said: str
 ) -> None:
     picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
@@ -140,8 +141,8 @@ def test_a_push_out_of_range_is_drawn_and_said(
 def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
     stage: SceneRenderer,
 ) -> None:
-    """The dent of a sheet that faces down stands in the light's way: what is lit is as it should
-    be, the rest is lost."""
+    """The indentation of a downward sheet blocks the light: the lit part is correct, the rest is
+    dark."""
     place = np.array([0.0, 0.05, 0.0])
     pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])

@@ -1,4 +1,4 @@
-"""The sheet's motion: bounded in speed, acceleration and jerk, and on its target all the same."""
+"""Test the sheet's motion: bounded in speed, acceleration and jerk, and accurate at its target."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ targets = st.one_of(
 
 @given(st.lists(st.tuples(targets, st.integers(1, 12)), min_size=1, max_size=8))
 @settings(max_examples=60, deadline=None)
-def test_speed_acceleration_and_jerk_are_bounded_whatever_is_wanted(
+def test_speed_acceleration_and_jerk_are_bounded_for_any_target(
     wishes: list[tuple[SheetMotion | None, int]],
 ) -> None:
     motion, sheets = START, [START.sheet] * 3

@@ -166,7 +166,7 @@ def test_at_the_shoulder_singularity_the_first_joint_stays() -> None:
     assert solved == pytest.approx(present, abs=1e-6)
 
 
-def test_a_turn_of_the_last_joint_past_180_degrees_goes_on() -> None:
+def test_a_rotation_of_the_last_joint_past_180_degrees_continues() -> None:
     joints = np.array([0.0, 0.4, 2.0, 0.1, 0.5, np.radians(178.0)])
     for angle_deg in range(178, 200):
         joints[5] = np.radians(angle_deg)
@@ -182,7 +182,7 @@ def test_a_turn_of_the_last_joint_past_180_degrees_goes_on() -> None:
         ((0.503, 0.0, 0.3), "J3", "nearest has J3 at 42.0 degrees, its range is 60 to 155"),
     ],
 )
-def test_unreachable_poses_say_what_binds(
+def test_unreachable_poses_name_the_violated_limit(
     position: tuple[float, float, float], limit: str, words: str
 ) -> None:
     pose = transform(rotation_from_rpy([0.0, np.pi / 2, 0.0]), position)
@@ -246,9 +246,9 @@ def test_away_from_singularities_the_next_joints_are_exact(joints: Floats, step:
 
 
 def wrist_path(past_rad: float, step_rad: float, bend_rad: float = 0.0) -> list[Floats]:
-    """Poses on which the flange's axis passes that of the forearm at a distance.
+    """Return poses on which the flange's axis passes that of the forearm at a distance.
 
-    The wrist's centre stays; seen along the forearm the axis draws a line, which turns aside by
+    The wrist's centre is fixed. Seen along the forearm, the axis draws a line with a bend of
     `bend_rad` at the nearest point.
     """
     base = forward(np.array([*CENTRE_RAD[:3], 0.0, 0.0, 0.0]))
@@ -341,7 +341,7 @@ def test_held_still_at_a_singularity_the_arm_stays() -> None:
     assert present == pytest.approx(joints, abs=1e-6)
 
 
-def test_where_a_branch_ends_another_is_taken_or_the_range_is_named() -> None:
+def test_where_a_branch_ends_another_is_used_or_the_range_is_named() -> None:
     # J4 at the end of its range: the flipped wrist has the same pose.
     joints = np.radians([0.0, 25.0, 110.0, 159.9, 40.0, 10.0])
     beyond = joints + np.radians([0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
@@ -355,7 +355,7 @@ weird = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 @settings(max_examples=200)
 @given(arrays(np.float64, (4, 4), elements=weird), in_range)
-def test_whatever_is_asked_joints_are_in_range_or_the_error_says_so(
+def test_joints_are_in_range_or_the_error_names_it(
     pose: Floats, present: Floats
 ) -> None:
     for solve in (solve_next_joints, inverse_kinematics):

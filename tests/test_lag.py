@@ -1,4 +1,4 @@
-"""The lag of one motion behind another: found where it is known, and not where there is none."""
+"""Test the estimated lag of one motion behind another, with a known lag and without a relation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RATE_HZ = 60.0
 
 
 def wander(times_s: Floats, seed: int, *, band_hz: tuple[float, float] = (0.15, 1.2)) -> Floats:
-    """A slow random motion (n, 3) of 0.5 mm, known at any time."""
+    """Return a slow random motion (n, 3) of 0.5 mm, as a function of time."""
     generator = np.random.default_rng(seed)
     frequencies = generator.uniform(*band_hz, (7, 3))
     phases = generator.uniform(0.0, 2.0 * np.pi, (7, 3))
@@ -24,7 +24,7 @@ def wander(times_s: Floats, seed: int, *, band_hz: tuple[float, float] = (0.15, 
 
 
 def stroke(times_s: Floats, seed: int = 0) -> Floats:
-    """60 degrees around a cylinder in ten seconds, unsteadily."""
+    """Return 60 degrees around a cylinder in ten seconds, with tremor."""
     angle = np.radians(6.0) * times_s
     around = 0.035 * np.stack([np.zeros_like(angle), np.sin(angle), np.cos(angle)], axis=1)
     return np.asarray(around + wander(times_s, seed))
@@ -57,7 +57,7 @@ def test_a_lag_of_the_papers_size_is_found_in_one_axis() -> None:
     assert estimate_lag_s(times, late, stroke(times)[:, 1]) == pytest.approx(0.067, abs=1e-3)
 
 
-def test_quick_taps_are_not_taken_for_their_neighbours() -> None:
+def test_quick_taps_are_not_confused_with_their_neighbours() -> None:
     times = np.arange(0.0, 4.0, 1.0 / RATE_HZ)
 
     def taps(at: Floats) -> Floats:
@@ -68,13 +68,13 @@ def test_quick_taps_are_not_taken_for_their_neighbours() -> None:
     )
 
 
-def test_an_even_motion_tells_no_lag() -> None:
+def test_a_uniform_motion_gives_no_lag() -> None:
     times = np.arange(0.0, 5.0, 0.01)
     even = np.stack([0.1 * times, -0.02 * times], axis=1)
     assert estimate_lag_s(times, even - 0.003, even) is None
 
 
-def test_another_motion_tells_no_lag() -> None:
+def test_another_motion_gives_no_lag() -> None:
     times = np.arange(0.0, 30.0, 1.0 / RATE_HZ)
     assert estimate_lag_s(times, wander(times, 1, band_hz=(1.0, 4.0)), wander(times, 2)) is None
     noise = np.random.default_rng(3).normal(0.0, 1e-3, (len(times), 3))
@@ -98,7 +98,7 @@ def test_a_lag_beyond_the_range_is_not_given_as_its_edge() -> None:
         (np.arange(0), np.zeros(0), np.zeros(0), "at least 8 samples"),
     ],
 )
-def test_what_holds_no_lag_is_said(
+def test_a_missing_lag_is_reported(
     times: Floats, follower: Floats, leader: Floats, said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):

@@ -1,4 +1,4 @@
-"""What a launcher says of its host, and the e-stop that it keeps for who comes late."""
+"""Test a launcher's reports of its host, and its e-stop for late subscribers."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def plan_of(folder: Path, nodes: dict[str, Any]) -> ResolvedGraph:
 async def heard_late(
     plan: ResolvedGraph, graph: RunningGraph, expected: dict[str, EStop]
 ) -> dict[str, EStop]:
-    """The e-stops, by writer, that somebody hears who comes only now.
+    """Return the e-stops, by writer, that a new subscriber receives.
 
-    Waits for the expected ones; without any, for a while in which none shall come.
+    Wait for the expected ones; without any, wait NOTHING_COMES_S.
     """
     heard: dict[str, EStop] = {}
     subscriber = make_subscriber(
@@ -66,7 +66,7 @@ async def heard_late(
     return heard
 
 
-async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -> None:
+async def test_an_estop_outlives_its_sender_until_it_is_reset(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, {"beacon": BEACON})
     said: list[str] = []
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
@@ -86,7 +86,7 @@ async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -
         assert await heard_late(plan, graph, {}) == {}
 
 
-async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) -> None:
+async def test_each_host_reports_its_state_and_its_nodes(tmp_path: Path) -> None:
     nodes = {
         "beacon": BEACON | {"restart": {"delay_s": 0.01}},
         "other": BEACON | {"host": "left", "topics": {"twin__finger": None}},

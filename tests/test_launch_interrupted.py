@@ -1,5 +1,4 @@
-"""SIGINT at any moment of a launcher's start leaves nothing; beside other tests, unlike its other
-tests."""
+"""Test that SIGINT at any time of a launcher's start leaves nothing."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ __all__ = ["runs_root", "started"]
 
 @pytest.fixture(scope="module")
 def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
-    """How long a launcher takes now from its start until its nodes are ready."""
+    """Measure the present time of a launcher from its start until its nodes are ready."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     path = write(tmp_path_factory.mktemp("graph"), {"beacon": beacon(), "listener": LISTENER})
     begun_s = time.monotonic()
@@ -68,9 +67,9 @@ def test_interrupted_at_any_moment_the_command_leaves_nothing(
     start_up_s: float,
     fraction: float | None,
 ) -> None:
-    """After a fraction of the start-up, or when it is over (None).
+    """SIGINT comes after a fraction of the start-up, or after it (None).
 
-    The interpreter's own start is left out: SIGINT is blocked until our first statement.
+    SIGINT is blocked until the first statement, which excludes the interpreter's own start.
     """
     path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
     process = start_command(started, "launch", str(path), blocked=True)

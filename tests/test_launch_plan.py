@@ -1,4 +1,4 @@
-"""Launch files: what is wrong with one is said before any process starts, with line and remedy."""
+"""Test the errors of launch files, which name line and remedy before any process starts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def complaint(folder: Path, text: str, **options: object) -> str:
     return str(caught.value)
 
 
-def test_a_plan_knows_every_endpoint(tmp_path: Path) -> None:
+def test_a_plan_contains_every_endpoint(tmp_path: Path) -> None:
     plan = load_graph(write(tmp_path, GRAPH))
     assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/beacon.twin.finger",)
     assert plan.nodes["beacon"].parameters["rate_hz"] == 20.0
@@ -51,7 +51,7 @@ def test_the_same_file_gives_the_same_hash_and_another_value_another(tmp_path: P
     assert load_graph(path).hash != load_graph(path, settings=["beacon.rate_hz=21"]).hash
 
 
-def test_the_hash_does_not_depend_on_where_the_file_lies(tmp_path: Path) -> None:
+def test_the_hash_does_not_depend_on_the_files_folder(tmp_path: Path) -> None:
     text = GRAPH.replace("rate_hz: 20", "mark: here/mark")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
@@ -180,11 +180,11 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
+def test_an_error_is_reported(tmp_path: Path, text: str, said: str) -> None:
     assert said in complaint(tmp_path, text)
 
 
-def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
+def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
     text = GRAPH.replace("rate_hz", "rate") + "    host: left\nexternal_topics: [nothing]\n"
     with pytest.raises(BadInputError) as caught:
         load_graph(write(tmp_path, text))
@@ -271,7 +271,7 @@ def test_the_launch_files_of_the_house_resolve(name: str) -> None:
         ("triangulator.calibration=absent.yaml", "absent.yaml"),
     ],
 )
-def test_a_calibration_that_is_none_is_refused_before_the_start(setting: str, words: str) -> None:
+def test_a_calibration_that_is_none_is_rejected_before_the_start(setting: str, words: str) -> None:
     with pytest.raises(BadInputError, match=words) as caught:
         load_graph(ROOT / "launch" / "demo.yaml", settings=[setting])
     assert setting.split("=", maxsplit=1)[0].split(".")[1] in str(caught.value)

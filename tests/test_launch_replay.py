@@ -1,4 +1,4 @@
-"""Replay: the clock stands where the recorder's stood, timers come due, chance is found out."""
+"""Test replay: recorded clock, due timers, and the detection of random behaviour."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def finger(number: int) -> TwinFinger:
 
 
 def bag_of(folder: Path, *, log_ms: list[int], **parameters: Any) -> Path:
-    """A bag with fingers, each exposed 5 ms before it was recorded, for a relay."""
+    """Write a bag with fingers, each exposed 5 ms before it was recorded, for a relay."""
     relay = {"type": "tests.launch_nodes:Relay", "parameters": parameters}
     graph = {"nodes": {"relay": relay}, "external_topics": ["twin/finger"]}
     (folder / "graph.yaml").write_text(json.dumps(graph))

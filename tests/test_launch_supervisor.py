@@ -1,4 +1,4 @@
-"""The supervisor: nodes come up, come back, and nothing of them stays."""
+"""Test the supervisor: nodes start, restart, and leave nothing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HOSTS = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 
 @pytest.fixture(autouse=True)
 def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A directory of runs of the test's own, with a short path."""
+    """Create a directory of runs for the test, with a short path."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
     yield folder
@@ -67,7 +67,7 @@ LISTENER = {"type": "tests.launch_nodes:Listener"}
 
 
 def processes_of(run_id: str) -> list[psutil.Process]:
-    """All processes that carry the run's tag."""
+    """Return all processes with the run's tag."""
     found = []
     for process in psutil.process_iter():
         try:
@@ -90,12 +90,12 @@ def assert_nothing_left(folder: Path) -> None:
 
 
 def session_niceness(pid: int) -> int | None:
-    """None where the kernel does not weigh sessions."""
+    """Return the niceness of a session; None if the kernel does not weight sessions."""
     autogroup = Path(f"/proc/{pid}/autogroup")
     return int(autogroup.read_text().split()[-1]) if autogroup.exists() else None
 
 
-async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Path) -> None:
+async def test_a_nice_node_has_low_priority_as_a_process_and_as_a_session(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(), quiet=beacon(nice=7, topics={"twin__finger": None}))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
@@ -106,7 +106,7 @@ async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Pat
             assert session_niceness(pid) in (None, more)
 
 
-async def test_a_node_takes_precedence_where_the_user_may_give_it(tmp_path: Path) -> None:
+async def test_a_node_has_high_priority_if_the_user_may_raise_it(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(nice=-7))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
@@ -203,10 +203,10 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
 
 
 @pytest.mark.alone
-async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(
+async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One stands still as a whole, the loop of the other does not turn; the third is well."""
+    """One process is stopped, and the loop of another hangs; the third is healthy."""
     monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)  # of the deaf node, at the end
     quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
     plan = plan_of(
@@ -238,7 +238,7 @@ def any_has(lines: list[str], words: str) -> bool:
 async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Suspended, but with the readings of a process that waits for a processor."""
+    """The process is suspended, with the measurements of one that waits for a processor."""
     starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
     monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
@@ -293,7 +293,8 @@ def test_what_counts_as_starved_in_half_a_second(
     now: tuple[float, float, str] | None,
     starved: float,
 ) -> None:
-    """Asleep, suspended, in a loop of its own; sometimes and always waiting for a processor."""
+    """The cases are asleep, suspended, in an endless loop, and partly or always waiting for a
+    processor."""
     earlier = None if before is None else ProcessorTime(*before)
     later = None if now is None else ProcessorTime(*now)
     assert compute_starved_s(earlier, later, 0.5) == pytest.approx(starved)
@@ -319,7 +320,7 @@ async def test_waiting_for_ready_has_a_deadline_of_its_own(tmp_path: Path) -> No
             await graph.wait_ready(0.05)
 
 
-async def test_a_node_that_hears_no_signal_is_killed_with_its_children(
+async def test_a_node_that_ignores_signals_is_killed_with_its_children(
     tmp_path: Path, runs_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)
@@ -368,7 +369,8 @@ async def test_a_port_in_use_is_named_before_anything_starts(
 
 
 def heard_estop(bag: Path) -> bool:
-    """Whether the listener has heard ten messages of the beacon, which it says by an e-stop."""
+    """Return whether the listener received ten messages of the beacon, which it reports by an
+    e-stop."""
     return "estop" in BagReader(bag).topics
 
 
@@ -385,14 +387,14 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
             await asyncio.to_thread(wait_until, heard, "the listener to hear the beacon")
 
 
-async def test_addresses_beyond_loopback_are_refused_without_keys(tmp_path: Path) -> None:
+async def test_addresses_beyond_loopback_are_rejected_without_keys(tmp_path: Path) -> None:
     hosts = {"main": {"address": "192.0.2.1"}}
     plan = load_graph(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
     with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is bey"):
         await RunningGraph(plan).__aenter__()
 
 
-async def test_an_unknown_host_is_refused(tmp_path: Path) -> None:
+async def test_an_unknown_host_is_rejected(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon())
     with pytest.raises(BadInputError, match="unknown host"):
         await RunningGraph(plan, host="left").__aenter__()
@@ -411,7 +413,7 @@ async def test_the_directory_of_runs_must_be_ours(
 
 @pytest.fixture
 def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Commands of a test; those that it leaves running are killed, with their nodes."""
+    """Start commands for a test; remaining ones are killed with their nodes."""
     processes: list[subprocess.Popen[str]] = []
     yield processes
     left = [process for process in processes if process.poll() is None]
@@ -423,7 +425,7 @@ def started() -> Iterator[list[subprocess.Popen[str]]]:
 
 
 def set_sigint(action: signal.Handlers, *, blocked: bool) -> None:
-    """In a child before it runs: a test's own parent may ignore SIGINT, and children inherit it."""
+    """Set SIGINT in a child before it runs, since children inherit an ignored SIGINT."""
     signal.signal(signal.SIGINT, action)
     how = signal.SIG_BLOCK if blocked else signal.SIG_UNBLOCK
     signal.pthread_sigmask(how, {signal.SIGINT})
@@ -522,8 +524,9 @@ def test_a_killed_launcher_leaves_no_node_behind(
 
 
 @pytest.mark.alone
-def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
-    """An orphan that neither signal nor lifeline reached; a live launcher's; one without a tag."""
+def test_only_orphans_are_killed(tmp_path: Path) -> None:
+    """The processes are an orphan without lifeline, one of a live launcher, and one without a
+    tag."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead_run = f"{dead.pid}.1.1"
     dead.wait()

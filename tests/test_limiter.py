@@ -179,20 +179,20 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
         ),
     ],
 )
-def test_a_sheet_in_trouble_is_named(own: Floats, other: Floats, words: str | None) -> None:
+def test_a_violation_of_the_sheet_is_named(own: Floats, other: Floats, words: str | None) -> None:
     for left in (True, False):
         pair = (own, other) if left else (other, own)
         found = check_sheet(*pair, left=left, limits=SHEET)
         assert (found is None) if words is None else (found is not None and words in found)
 
 
-def test_edges_that_have_changed_places_are_in_trouble() -> None:
+def test_swapped_edges_are_a_violation() -> None:
     found = check_sheet(edge(0.12), edge(-0.12), left=True, limits=SHEET)
     assert found is not None
     assert "skewed by 180" in found
 
 
-def test_flanges_outside_the_workspace_or_too_near_are_in_trouble() -> None:
+def test_flanges_outside_the_workspace_or_too_near_are_a_violation() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
     assert check_flange(transform(np.eye(3), [-0.15, 0.0, 0.0]), far, SHEET) is None
     outside = check_flange(transform(np.eye(3), [0.0, 0.0, 0.31]), far, SHEET)
@@ -228,8 +228,8 @@ whatever = st.one_of(
 def test_from_any_state_no_goal_and_no_step_leads_out_of_bounds(
     joints: Floats, share: Floats, goal: Floats, along: Floats, step_s: float
 ) -> None:
-    """NaN, infinite, huge and denormal goals; joints out of range, from where only the way back is
-    open; any speeds, be they such that the arm cannot stop in range."""
+    """Goals are NaN, infinite, huge and denormal; joints are also out of range, with any speed,
+    even if the arm cannot stop in range."""
     velocity = step(joints, share * LIMITS.speed_rad_per_s, goal, along, step_s)
     after = joints + velocity * step_s
     assert np.isfinite(velocity).all()
@@ -253,7 +253,7 @@ def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() ->
         assert way >= 0.9 * TOOL_SPEED * min(gap_s, MAX_TRAVEL_STEP_S)
 
 
-def test_what_is_not_finite_is_trouble() -> None:
+def test_non_finite_values_are_a_violation() -> None:
     sound, odd = edge(-0.12), edge(0.12)
     for row, column in ((0, 0), (1, 2), (0, 3), (2, 3)):
         broken = odd.copy()
@@ -266,7 +266,7 @@ def test_what_is_not_finite_is_trouble() -> None:
     assert check_tracking_error(np.full(6, np.nan), np.zeros(6), 0.1) is not None
 
 
-def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
+def test_a_command_far_from_the_measured_joints_is_a_violation() -> None:
     joints = np.zeros(6)
     assert check_tracking_error(joints + 0.1, joints, 0.12) is None
     assert (
@@ -275,7 +275,7 @@ def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
     )
 
 
-def test_measured_places_have_some_slack_and_commanded_ones_none() -> None:
+def test_measured_poses_have_a_tolerance_and_commanded_ones_none() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
     outside = transform(np.eye(3), [0.0, 0.0, 0.301])
     assert check_flange(outside, far, SHEET) is not None
@@ -300,7 +300,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_random_or_adversarial_command_moves_an_arm_out_of_its_limits(seed: int) -> None:
-    """Run a short `python -m benchmarks.limiter` with its judging code."""
+    """Run a short `python -m benchmarks.limiter`."""
     result = run(5000, seed, hunting=False)
     assert result["commands"] >= 5000
     assert not any(result["violations"].values()), result

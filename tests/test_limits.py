@@ -1,4 +1,4 @@
-"""Every number of a scene, a launch file and a node's parameters has limits that are checked."""
+"""Test that every number of a scene, a launch file and a node's parameters has limits."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Key = tuple[Any, ...]
 
 
 def numbers_in(value: Any, key: Key = ()) -> Iterator[Key]:
-    """The keys of all numbers in plain values."""
+    """Return the keys of all numbers in plain values."""
     match value:
         case dict():
             for name, one in value.items():
@@ -80,7 +80,7 @@ quick = settings(max_examples=60, suppress_health_check=UNUSUAL)
 
 @settings(examples(25), suppress_health_check=UNUSUAL)
 @given(where=st.sampled_from(SCENE_NUMBERS), value=ABSURD)
-def test_an_absurd_number_in_a_scene_is_refused_by_its_key(
+def test_an_absurd_number_in_a_scene_is_rejected_by_its_key(
     tmp_path: Path, where: tuple[str, Key], value: float
 ) -> None:
     name, key = where
@@ -98,7 +98,7 @@ def test_an_absurd_number_in_a_scene_is_refused_by_its_key(
 
 @quick
 @given(where=st.sampled_from(PARAMETER_NUMBERS), value=ABSURD)
-def test_an_absurd_parameter_is_refused(where: tuple[str, str], value: float) -> None:
+def test_an_absurd_parameter_is_rejected(where: tuple[str, str], value: float) -> None:
     node, field = where
     with pytest.raises(ValidationError) as refused:
         PARAMETERS[node].model_validate({field: value})
@@ -110,8 +110,8 @@ def test_an_absurd_parameter_is_refused(where: tuple[str, str], value: float) ->
     where=st.sampled_from(SCENE_NUMBERS),
     value=st.floats(min_value=-1e-12, max_value=1e-12, exclude_min=True, exclude_max=True),
 )
-def test_a_tiny_number_is_refused_or_is_a_coordinate(where: tuple[str, Key], value: float) -> None:
-    """What must be above zero is not accepted below what a device resolves."""
+def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], value: float) -> None:
+    """A value that must be positive is not accepted below a device's resolution."""
     name, key = where
     if name == "organ":
         return
@@ -149,7 +149,7 @@ def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, said: st
     assert said in str(refused.value)
 
 
-def test_an_absurd_rate_in_a_launch_file_is_refused(tmp_path: Path) -> None:
+def test_an_absurd_rate_in_a_launch_file_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_text("nodes:\n  arms:\n    type: twin_arms\n    parameters: {rate_hz: 1.0e+308}\n")
     said = r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 is invalid; give at most 10000 hz"
@@ -167,7 +167,7 @@ def models_below(base: type[BaseModel]) -> Iterator[type[BaseModel]]:
 
 
 def test_what_files_hold_is_limited() -> None:
-    """The roots; their parts derive from the same class, as they share it."""
+    """The test lists the top-level models; nested ones derive from the same class."""
     limited = set(models_below(LimitedModel))
     assert {LaunchFile, StereoCalibration, *PARAMETERS.values()} <= limited
     for name, field in Scene.model_fields.items():

@@ -1,4 +1,4 @@
-"""A node's log repeats no warning without end."""
+"""Test that a node's log does not repeat a warning endlessly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.nodes.log_limit import MAX_DISTINCT, REPORT_PERIOD_S, RepeatLimit
 
 
 class Log:
-    """A logger behind a limiter whose clock the test sets."""
+    """Logger behind a limiter with a clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -40,7 +40,7 @@ def test_of_414_warnings_the_first_and_two_counts_are_logged(log: Log) -> None:
     assert log.passed[0]["problem"] == "no answer from 127.0.0.1:5020 within 30 ms"
 
 
-def test_what_goes_on_is_logged_once_a_period(log: Log) -> None:
+def test_a_repeated_warning_is_logged_once_a_period(log: Log) -> None:
     for second in range(int(3 * REPORT_PERIOD_S) + 1):
         log.now_s = float(second)
         log.logger.warning("input", problem="damaged")
@@ -48,7 +48,7 @@ def test_what_goes_on_is_logged_once_a_period(log: Log) -> None:
     assert logged == [None, 10, 70, 100, 160]
 
 
-def test_other_words_are_another_warning(log: Log) -> None:
+def test_another_text_is_another_warning(log: Log) -> None:
     for problem in ("no connection", "no answer", "no connection", "no answer"):
         log.logger.warning("arm lost", problem=problem)
     log.logger.error("arm lost", problem="no connection", topic="arm_left")

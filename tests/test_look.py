@@ -1,4 +1,4 @@
-"""What the object looks like: shading, textures, marks and patterns, and no seams in them."""
+"""Test the object's appearance: shading, textures, markers and patterns, without seams."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CYLINDER = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(CYLINDER)
 SOFT = DrawStyle(flat=False, pattern="object")
 MIDDLE = (299, 399)
-"""Row and column that light the world's origin; two pixels to a millimetre, x to the left."""
+"""Row and column that light the world's origin; two pixels per millimetre, x to the left."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def drawn(
     return picture
 
 
-def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: SceneRenderer) -> None:
+def test_the_indentation_is_darker_and_its_walls_are_shaded(plain: SceneRenderer) -> None:
     follow(plain, None)
     before = drawn(plain).astype(int)
     follow(plain, dent(plain, 0.015))
@@ -132,7 +132,7 @@ POSES = [
 def test_an_even_patch_has_no_seam(
     plain: SceneRenderer, correction: Correction, pose: Floats
 ) -> None:
-    """No dark line where triangles meet, of the sheet or of what is drawn."""
+    """There is no dark line between triangles, of the sheet or of the object."""
     tip = (pose @ [0.02, -0.03, -0.03, 1.0])[:3]
     picture = drawn(
         plain, DrawStyle(False, "white"), correction=correction, sheet=sheet_at(SCENE, pose, tip)
@@ -149,7 +149,7 @@ def test_an_even_patch_has_no_seam(
 
 @pytest.mark.parametrize("correction", ["none", "four_triangles", "two_pass"])
 def test_edges_are_soft(plain: SceneRenderer, correction: Correction) -> None:
-    """Outlines have steps between black and white: they are sampled more than once a pixel."""
+    """Outlines have intermediate levels, since they are multisampled."""
     picture = drawn(plain, DrawStyle(True, "object"), correction=correction)[..., 0]
     between = (picture > 16) & (picture < 240)
     assert between.sum() > 200
@@ -185,7 +185,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image", "needs an image"),
     ],
 )
-def test_a_file_that_is_no_texture_is_told(tmp_path: Path, appearance: str, told: str) -> None:
+def test_a_file_that_is_no_texture_is_reported(tmp_path: Path, appearance: str, told: str) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
     cv2.imwrite(str(tmp_path / "huge.png"), np.zeros((1, 2050, 3), np.uint8))
     with pytest.raises(BadInputError, match=f"(?s){told}"):

@@ -1,4 +1,4 @@
-"""Marks in single pictures: what counts as one, and its centre against the best possible."""
+"""Test the detection of markers in single images, and the accuracy of their centres."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def disc(
     ground: float = 30.0,
     blur_px: float = 0.0,
 ) -> Image:
-    """A disc on an even ground, every pixel lit by the share of it that is covered."""
+    """Draw a disc on a uniform ground, with each pixel weighted by its covered fraction."""
     y, x = np.mgrid[0 : 100 * 8, 0 : 120 * 8] / 8.0 - 0.4375
     covered = np.hypot(x - centre[0], y - centre[1]) < radius
     share = covered.reshape(100, 8, 120, 8).mean(axis=(1, 3))
@@ -66,7 +66,7 @@ def sound_marks_in(image: Image) -> list[Marker]:
 @given(x=st.floats(20, 100), y=st.floats(20, 80), radius=st.floats(2.5, 8))
 @settings(max_examples=40, deadline=None)
 def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: float) -> None:
-    """Without a lens's blur the least mark is hardest: the grid's worst place, not its mean."""
+    """Without blur the smallest marker is the hardest at the worst position on the pixel grid."""
     image = disc((x, y), radius=radius)
     for name, limit_px in (
         ("moments", 0.35),
@@ -79,7 +79,7 @@ def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: 
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_window_gives_the_same_mark_as_the_whole_picture(name: str) -> None:
+def test_a_window_gives_the_same_marker_as_the_whole_image(name: str) -> None:
     image = disc((61.3, 40.7), blur_px=0.7)
     window = window_around(np.array([65.0, 45.0]), image.shape, LOOKS.window_half_px)
     whole, near = detect_blobs(image, LOOKS), detect_blobs(image, LOOKS, window)
@@ -89,7 +89,7 @@ def test_a_window_gives_the_same_mark_as_the_whole_picture(name: str) -> None:
     assert np.array_equal(a.covariance, b.covariance)
 
 
-def test_a_window_keeps_inside_the_picture() -> None:
+def test_a_window_stays_inside_the_image() -> None:
     assert window_around(np.array([2.0, 3.0]), (480, 640), 10) == (slice(0, 14), slice(0, 13))
     for outside in ([-50.0, 3.0], [np.inf, 3.0], [np.nan, 3.0], [3.0, 1e300]):
         assert window_around(np.array(outside), (480, 640), 10) is None
@@ -110,16 +110,16 @@ def test_a_window_keeps_inside_the_picture() -> None:
     ],
     ids=["black", "saturated", "grey", "dim", "speck", "lamp", "cut top", "cut right", "chaos"],
 )
-def test_what_is_no_mark_is_not_found(image: Image) -> None:
+def test_what_is_no_marker_is_not_found(image: Image) -> None:
     assert sound_marks_in(image) == []
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (200, 2)])
-def test_pictures_too_small_for_a_mark_have_none(shape: tuple[int, int]) -> None:
+def test_images_too_small_for_a_marker_have_none(shape: tuple[int, int]) -> None:
     assert detect_blobs(np.full(shape, 200, np.uint8), LOOKS) == []
 
 
-def test_only_a_white_picture_is_overexposed() -> None:
+def test_only_a_white_image_is_overexposed() -> None:
     assert is_overexposed(np.full((50, 50), 255, np.uint8))
     assert not is_overexposed(np.full((50, 50), 240, np.uint8))
     image = disc((60, 40), level=255)
@@ -127,7 +127,7 @@ def test_only_a_white_picture_is_overexposed() -> None:
     assert is_overexposed(image, (slice(37, 44), slice(57, 64)))
 
 
-def test_a_mark_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> None:
+def test_a_marker_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> None:
     image = disc((40.0, 40.0), level=215.0)
     image[60:, 30:50] = 110  # the finger, up to the mark and under it
     image[36:60, 30:50] = np.maximum(image[36:60, 30:50], 110)
@@ -139,7 +139,7 @@ def test_a_mark_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> Non
 def drawn(
     count: int, radius_px: float, motion_px: float, *, seed: int, noise: PixelNoise = SENSOR
 ) -> list[tuple[DrawnDisc, Image]]:
-    """Discs all over the pixel grid that move in all directions, as a noisy sensor sees them."""
+    """Draw discs at random subpixel positions and motions, with sensor noise."""
     random = np.random.default_rng(seed)
     discs = []
     for _ in range(count):
@@ -151,9 +151,11 @@ def drawn(
 
 
 @pytest.mark.parametrize(("radius_px", "motion_px"), [(1.6, 0.0), (3.2, 0.0), (3.2, 4.0), (6.0, 0)])
-def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: float) -> None:
-    """Within 1.25 of what no method can beat, though it also allows for a ground that slopes,
-    which the bound does not; and the normalised errors are those of what it states (2 if exact)."""
+def test_the_fit_is_near_the_bound_with_a_true_covariance(
+    radius_px: float, motion_px: float
+) -> None:
+    """The error is within 1.25 of the bound, although the fit also estimates a sloped ground. The
+    errors, normalised by the reported covariance, are near 2, as for an exact one."""
     discs = drawn(100, radius_px, motion_px, seed=5)
     bound_px = np.mean([centre_bound_px(one, SENSOR) for one, _ in discs[:3]])
     errors, normalised = [], []
@@ -168,7 +170,7 @@ def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: floa
     assert 0.4 < np.mean(normalised) < 2.6
 
 
-def test_a_mark_drawn_out_by_motion_is_less_certain_along_it() -> None:
+def test_a_marker_drawn_out_by_motion_is_less_certain_along_it() -> None:
     ratios = []
     for one, image in drawn(10, 3.2, 6.0, seed=6):
         (marker,) = markers_in(image)
@@ -179,7 +181,7 @@ def test_a_mark_drawn_out_by_motion_is_less_certain_along_it() -> None:
 
 
 def test_more_noise_than_the_sensor_should_have_is_stated() -> None:
-    """The residuals tell it, whatever the sensor's data sheet says."""
+    """The residuals show it, independent of the sensor's specification."""
     loud = PixelNoise(4.0 * SENSOR.read_levels, SENSOR.photons_per_level / 16.0)
     normalised = []
     for one, image in drawn(100, 3.2, 0.0, seed=7, noise=loud):
@@ -189,7 +191,7 @@ def test_more_noise_than_the_sensor_should_have_is_stated() -> None:
     assert 1.2 < np.mean(normalised) < 3.0
 
 
-def test_an_overexposed_mark_keeps_its_centre_and_its_honesty() -> None:
+def test_an_overexposed_marker_keeps_its_centre_and_covariance() -> None:
     errors, normalised = [], []
     for one, _ in drawn(60, 3.2, 0.0, seed=8):
         image = noisy(replace(one, marker=400.0).levels(), SENSOR, np.random.default_rng(1))
@@ -201,7 +203,7 @@ def test_an_overexposed_mark_keeps_its_centre_and_its_honesty() -> None:
     assert np.mean(normalised) < 3.0
 
 
-def test_a_mark_out_of_focus_is_said_to_be() -> None:
+def test_a_marker_out_of_focus_is_reported() -> None:
     sharp, soft = (
         noisy(
             DrawnDisc(np.array([28.2, 27.9]), 4.5, np.zeros(2), blur_px=blur_px).levels(),
@@ -215,8 +217,8 @@ def test_a_mark_out_of_focus_is_said_to_be() -> None:
 
 
 @pytest.mark.parametrize("gap_px", [3.0, 4.0, 5.5])
-def test_a_mark_that_runs_into_a_light_is_no_sound_one(gap_px: float) -> None:
-    """Two lights in one spot: never a mark that is sound, of its size, and lies between them."""
+def test_a_marker_merged_with_a_light_is_not_valid(gap_px: float) -> None:
+    """Two lights in one blob never give a valid marker of the right size between them."""
     image = np.maximum(disc((50.0, 40.0), radius=3.2), disc((50.0 + gap_px, 41.0), radius=2.5))
     image = np.maximum(image, disc((50.0 + gap_px, 41.0), radius=2.5, level=255.0))
     for marker in sound_marks_in(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7))):
@@ -224,7 +226,7 @@ def test_a_mark_that_runs_into_a_light_is_no_sound_one(gap_px: float) -> None:
         assert wrong_px < 0.3 or abs(math.log(marker.radius / 3.2)) > 0.15
 
 
-def test_half_a_mark_is_no_sound_mark() -> None:
+def test_half_a_marker_is_not_valid() -> None:
     image = disc((50.0, 40.0), radius=3.2, blur_px=0.7)
     image[:, 51:] = 30
     for marker in sound_marks_in(image):
@@ -249,8 +251,8 @@ def test_a_fit_that_starts_beside_the_disc_or_on_nothing_does_not_settle() -> No
 
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=12, deadline=None)
-def test_no_picture_breaks_the_search(seed: int) -> None:
-    """Rough noise, smooth noise and steps: marks may be found, but numbers are finite."""
+def test_no_image_breaks_the_search(seed: int) -> None:
+    """Noise and steps can give markers, but all numbers are finite."""
     random = np.random.default_rng(seed)
     image = random.normal(120.0, 80.0, (60, 80))
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), float(random.uniform(0.3, 3.0))))
@@ -262,7 +264,7 @@ def test_no_picture_breaks_the_search(seed: int) -> None:
             assert np.linalg.eigvalsh(marker.covariance).min() > 0
 
 
-def test_the_mark_family_tells_the_methods_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_marker_family_distinguishes_the_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmarks, "MARKER_IMAGES", 12)
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
@@ -277,7 +279,7 @@ def test_the_mark_family_tells_the_methods_apart(monkeypatch: pytest.MonkeyPatch
         assert point.error > 0.7 * float(point.params["bound_px"])
 
 
-def test_mark_methods_are_judged_with_the_noise_that_the_node_tells_them(
+def test_marker_methods_are_evaluated_with_the_nodes_noise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))

@@ -1,4 +1,4 @@
-"""The true sheet: against published-style FE figures, theory, balance of forces, and hard cases."""
+"""Test the true sheet against published FE results, theory, equilibrium and hard cases."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_edge_force_of_the_flat_sheet(stretch: float, force_n: float) -> None:
 
 
 class Patch:
-    """A rigid disc of 10 mm radius that carries its nodes with it: the load of the FE table."""
+    """Rigid disc of 10 mm radius that is bonded to its nodes: the load of the FE table."""
 
     def __init__(self, rest: np.ndarray, start: np.ndarray, depth_m: float) -> None:
         self.on = np.hypot(*(rest.reshape(-1, 2) - 0.12).T) < 0.010
@@ -135,7 +135,7 @@ def test_slack_sheet_is_found_and_pulls_nothing() -> None:
     assert np.linalg.norm(sheet.left_force_n) < 0.1
 
 
-def test_edges_that_coincide_are_refused() -> None:
+def test_edges_that_coincide_are_rejected() -> None:
     with pytest.raises(ValueError, match="apart"):
         solve(RUBBER, np.eye(4), np.eye(4))
 

@@ -1,4 +1,4 @@
-"""Bags: what was recorded comes back, and what a crash left is never lost nor misread."""
+"""Test bags: recorded messages are read back, and after a crash none is lost or misread."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ STEP_NS = 10_000_000
 
 
 def fill(writer: BagWriter, count: int, *, flush_every: int = 0) -> None:
-    """`count` fingers, a picture each ten, an e-stop first; log time 1 s + 10 ms each."""
+    """Write `count` fingers, an image every ten, an e-stop first; log time 1 s + 10 ms each."""
     writer.write(TOPICS["estop"], EStop(engaged=False, reason="start"), header(1), 10**9)
     for number in range(count):
         log_ns = 10**9 + number * STEP_NS
@@ -213,7 +213,7 @@ def test_foreign_data_is_rejected_as_frames(data: bytes) -> None:
 
 
 def entries_by_boundary(path: Path) -> list[tuple[int, int]]:
-    """(byte after each whole chunk, messages up to there), found by mcap's own reader."""
+    """Return (byte after each complete chunk, messages up to it), by mcap's reader."""
     found: list[tuple[int, int]] = []
     count = 0
     with path.open("rb") as file:
@@ -284,7 +284,7 @@ def test_bag_truncated_at_any_byte(
 def test_bag_damaged_at_any_byte(
     sample: tuple[bytes, list[Any], Path], draw: st.DataObject
 ) -> None:
-    """Bytes overwritten: every message that comes is one that was recorded, or BagError."""
+    """Every message that is read from overwritten bytes was recorded, or BagError is raised."""
     data, _, folder = sample
     damaged = bytearray(data)
     at = draw.draw(st.integers(0, len(data) - 1))
@@ -377,7 +377,7 @@ def test_full_disk_is_reported(tmp_path: Path) -> None:
     assert len(list(BagReader(tmp_path / "full.mcap"))) > 20
 
 
-def test_changed_type_is_refused_by_name_but_its_bytes_stay_readable(
+def test_changed_type_is_rejected_by_name_but_its_bytes_stay_readable(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""The bus: deliveries, losses, refusals, restarts; each waits for a condition, never for a time."""
+"""Test the bus: deliveries, losses, rejections and restarts."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def pictures(value: int) -> StereoPair:
 
 
 class Ear:
-    """A subscriber that writes down what it hears."""
+    """Subscriber that records its messages."""
 
     def __init__(self, topic: Topic, endpoints: list[str]) -> None:
         self.heard: list[tuple[Any, Header]] = []
@@ -78,7 +78,7 @@ class Ear:
 
 
 class ForeignPublisher:
-    """Sends any frames to whoever connects."""
+    """Sender of any frames to all connections."""
 
     def __init__(self, endpoint: str) -> None:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
@@ -92,7 +92,7 @@ class ForeignPublisher:
 
 
 class Room:
-    """Makes publishers and ears, and clears them away."""
+    """Factory of publishers and subscribers that closes them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -112,7 +112,7 @@ class Room:
         return ear
 
     def raw(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
-        """A foreign socket that knows nothing of messages."""
+        """Open a socket without flexsheet's protocol."""
         opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
         opened.setsockopt(zmq.LINGER, 0)
         opened.bind(endpoint)
@@ -129,7 +129,7 @@ async def room(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Room]:
 
 
 async def connected(publisher: Publisher, ear: Ear, make: Callable[[int], Message]) -> int:
-    """Send numbered messages until the first is heard; the number of the last one sent."""
+    """Send numbered messages until the first is received; return the number of the last one."""
     number = 0
     while not ear.heard:
         number += 1
@@ -332,7 +332,7 @@ async def test_close_within_the_handler(room: Room) -> None:
     ear.subscriber.close()
 
 
-async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
+async def test_bad_messages_are_rejected_and_good_ones_pass(room: Room) -> None:
     topic = TOPICS["estop"]
     foreign = room.raw(zmq.PUB, room.endpoint())
     ear = room.ear(topic)
@@ -376,7 +376,7 @@ async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Ro
     assert "at most" in ear.problems[0]
 
 
-async def test_too_large_a_message_is_refused_at_the_sender(room: Room) -> None:
+async def test_too_large_a_message_is_rejected_at_the_sender(room: Room) -> None:
     publisher = room.mouth(replace(TOPICS["stereo"], max_bytes=5000))
     with pytest.raises(WireError, match=r"StereoPair.*at most 5000"):
         publisher.send(pictures(1), header(1))
@@ -394,7 +394,7 @@ async def test_endpoint_in_use(room: Room) -> None:
             room.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
 
 
-async def test_stale_ipc_file_of_a_killed_writer_is_taken_over(room: Room) -> None:
+async def test_stale_ipc_file_of_a_killed_writer_is_replaced(room: Room) -> None:
     dead = socket.socket(socket.AF_UNIX)
     dead.bind(room.endpoint().removeprefix("ipc://"))
     dead.close()
@@ -468,7 +468,7 @@ def arms() -> TwinArms:
 
 @pytest.mark.parametrize("delivery", [Delivery.EVERY, Delivery.LATEST, Delivery.LATCHED])
 async def test_bursts_never_leave_a_message_lying(room: Room, delivery: Delivery) -> None:
-    """Edge-triggered wake-ups: whatever the rhythm, no message waits for the next one."""
+    """With edge-triggered wake-ups no message waits for the next one at any rate."""
     topic = replace(TOPICS["twin/arms"], delivery=delivery)
     publisher = room.mouth(topic)
     ear = room.ear(topic)

@@ -1,4 +1,4 @@
-"""The message reference is what the types say."""
+"""Test that the message reference agrees with the types."""
 
 from __future__ import annotations
 

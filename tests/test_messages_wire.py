@@ -1,4 +1,4 @@
-"""The wire: what goes in comes out, byte for byte; whatever else comes in is one WireError."""
+"""Test the wire format: lossless encoding, and WireError for any invalid input."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def scene() -> Scene:
 
 
 def same(a: object, b: object) -> bool:
-    """Equality that looks into arrays, bit by bit."""
+    """Compare values bit by bit, including arrays."""
     if isinstance(a, BaseModel):
         return type(a) is type(b) and same(a.__dict__, b.__dict__)
     if isinstance(a, dict) and isinstance(b, dict):
@@ -218,7 +218,7 @@ def test_foreign_msgpack(value: object, more: list[bytes]) -> None:
 
 @given(st.data())
 def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
-    """Any one element of a good header replaced, any one field replaced."""
+    """Any one element of a valid header or any one field is replaced."""
     message = data.draw(fingertips)
     codec = get_codec(Fingertip)
     fields: dict[str, object] = {
@@ -236,8 +236,8 @@ def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
 
 @settings(max_examples=300)
 @given(messages, st.data())
-def test_mutated_messages_are_refused_or_valid(message: Message, data: st.DataObject) -> None:
-    """Flipped, cut, lengthened, exchanged, dropped: a WireError or a message that is valid."""
+def test_mutated_messages_are_rejected_or_valid(message: Message, data: st.DataObject) -> None:
+    """Bytes are flipped, cut, added, exchanged or dropped: WireError, or a valid message."""
     frames = [bytearray(frame) for frame in encode(message, HEADER, inline_bytes=64)]
     which = data.draw(st.integers(0, len(frames) - 1))
     frame = frames[which]
@@ -270,7 +270,7 @@ def test_truncated_header(cut: int) -> None:
     refused([bytes(frames[0])[:-cut], *frames[1:]], Scene)
 
 
-def test_causes_are_told_apart() -> None:
+def test_causes_are_distinguished() -> None:
     good = as_bytes(encode(EStop(engaged=True, reason="x"), HEADER))
     assert refused([b"GET / HTTP/1.1\r\n\r\n"], EStop).cause == "malformed"
     assert refused([], EStop).cause == "frames"
@@ -291,7 +291,7 @@ def test_causes_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_non_finite_arrays_are_refused(value: float) -> None:
+def test_non_finite_arrays_are_rejected(value: float) -> None:
     tip = Fingertip.model_construct(
         valid=True,
         state="tracking",
@@ -325,7 +325,7 @@ def test_huge_but_finite_arrays_pass(value: float) -> None:
         np.zeros(3, ">f8"),
     ],
 )
-def test_wrong_arrays_are_refused(array: Any) -> None:
+def test_wrong_arrays_are_rejected(array: Any) -> None:
     with pytest.raises(ValueError, match="expected"):
         ArraySpec("<f8", (3,)).validate(array)
 
@@ -338,7 +338,7 @@ def test_lists_with_fractions_are_no_whole_numbers() -> None:
             spec.validate(bad)
 
 
-def test_what_has_no_form_on_the_wire_is_said() -> None:
+def test_a_type_without_a_wire_format_is_reported() -> None:
     for value in (np.array([object()]), object(), np.zeros(2, ">f8"), np.zeros(3, np.complex128)):
         with pytest.raises(WireError, match="EStop cannot be encoded"):
             encode(EStop.model_construct(engaged=True, reason=value), HEADER)

@@ -1,4 +1,4 @@
-"""Bags outlive the types in them: what was recorded by earlier code is read by today's."""
+"""Test that bags of earlier versions can be read by the current types."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Before(Message):
 
 
 class More(Message):
-    """What Before could become without anybody's help."""
+    """Type that Before can become without a migration."""
 
     mode: Literal["on", "off", "auto"]
     size_mm: float
@@ -163,7 +163,7 @@ def row(message_type: type[Message]) -> Topic:
 
 @pytest.fixture
 def changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A bag with a size in millimetres, opened when sizes are in metres."""
+    """Write a bag with a size in millimetres, opened when sizes are in metres."""
     path = tmp_path / "before.mcap"
     with BagWriter(path) as writer:
         writer.write(row(Before), Before(mode="off", size_mm=2.5), HEADER, 10)

@@ -1,4 +1,4 @@
-"""The register map: what the bridge encodes, what it accepts, and what the document says of it."""
+"""Test the register map: encoding of the bridge, accepted values, and documentation."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_register_map_is_written_between_its_marks() -> None:
 
 
 def status_registers(**changed: int | float) -> list[int]:
-    """A sound status block but for what is changed; `crc` is computed unless given."""
+    """Return a valid status block with changes; `crc` is computed unless given."""
     values: dict[str, int | float] = {
         "magic": 0x4653, "version": 1, "accepted": 7, "cycle": 9, "time_us": 11, "state": 1,
         "faults": 0, "j1": 0.1, "j2": 0.2, "j3": 0.3, "j4": 0.4, "j5": 0.5, "j6": 0.6,
@@ -80,12 +80,12 @@ def test_a_sound_status_is_decoded() -> None:
         ({"j3": float("nan")}, "not finite"),
     ],
 )
-def test_an_unsound_status_is_refused(changed: dict[str, int | float], words: str) -> None:
+def test_an_unsound_status_is_rejected(changed: dict[str, int | float], words: str) -> None:
     with pytest.raises(ArmAnswerError, match=words):
         decode_status(status_registers(**changed))
 
 
-def test_a_status_of_another_length_is_refused() -> None:
+def test_a_status_of_another_length_is_rejected() -> None:
     with pytest.raises(ArmAnswerError, match="status of 3 registers"):
         decode_status([1, 2, 3])
 
@@ -118,7 +118,7 @@ def quiet_controller() -> Controller:
 
 
 SHORT_S = 0.03
-"""The time-out where no answer is awaited; elsewhere a busy machine has time to answer."""
+"""Time-out in tests without an answer; in others a busy machine needs more time."""
 
 
 @asynccontextmanager
@@ -176,7 +176,7 @@ async def test_a_silent_arm_is_closed_and_reopened_with_back_off() -> None:
         assert link.connected
 
 
-async def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
+async def test_a_late_answer_is_never_used_for_the_next_request() -> None:
     async with linked("slow", timeout_s=SHORT_S) as (link, controller):
         with pytest.raises(ArmSilentError):
             await exchange(link)
@@ -195,7 +195,7 @@ async def test_an_exception_keeps_the_connection() -> None:
         assert link.connections == 1
 
 
-async def test_nobody_listening_is_an_error_in_one_line() -> None:
+async def test_a_missing_server_is_an_error_in_one_line() -> None:
     link = ModbusLink("127.0.0.1", 1, timeout_s=DEADLINE_S)
     with pytest.raises(ArmSilentError, match=r"no connection to 127\.0\.0\.1:1"):
         await exchange(link)
@@ -212,7 +212,7 @@ async def test_an_answer_to_another_command_closes_the_connection(
         assert not link.connected
 
 
-async def test_a_sequence_that_is_not_newer_is_refused() -> None:
+async def test_a_sequence_that_is_not_newer_is_rejected() -> None:
     async with linked() as (link, controller):
         await exchange(link)
         controller.accepted = 1000
@@ -235,7 +235,7 @@ async def test_a_cancellation_is_not_swallowed_by_an_answer_that_comes_with_it()
 
 
 def test_the_map_is_frozen() -> None:
-    """The bytes of version 1.  Whoever changes them makes another version of the map."""
+    """These are the bytes of version 1. A change requires another version of the map."""
     command = encode_command(
         sequence=0x01020304,
         time_us=0x0A0B0C0D,
@@ -279,9 +279,10 @@ def test_any_registers_are_a_status_or_an_error(registers: list[int]) -> None:
 async def test_the_librarys_fault_that_the_link_guards_against_is_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A late answer is taken for the next request's, when the connection is kept open.
+    """A late answer is used for the next request if the connection stays open.
 
-    If this fails the library has fixed it; the guard stays, for the network may be late as well.
+    If this test fails, the library has fixed it. The guard is still needed, since the network can
+    be late as well.
     """
     # Far beyond the client's time-out, which a busy machine may notice late.
     monkeypatch.setattr(twin_arms, "LATE_S", 1.0)
@@ -310,7 +311,7 @@ async def test_the_librarys_fault_that_the_link_guards_against_is_there(
 
 
 class LateServer:
-    """Answers the first command only once the second has come, and then both, oldest first."""
+    """Server that answers the first command only after the second, and then both in order."""
 
     def __init__(self) -> None:
         self.connections = 0
@@ -339,7 +340,7 @@ class LateServer:
         self.closed.set()
 
 
-async def test_an_answer_late_on_the_servers_side_is_told_by_its_echo() -> None:
+async def test_an_answer_late_on_the_servers_side_is_detected_by_its_echo() -> None:
     late = LateServer()
     server = await asyncio.start_server(late.serve, "127.0.0.1", 0)
     link = ModbusLink("127.0.0.1", server.sockets[0].getsockname()[1], timeout_s=0.05)
@@ -370,8 +371,8 @@ async def test_a_repeated_answer_is_not_believed() -> None:
         assert not link.connected
 
 
-async def test_an_arm_that_is_cut_off_is_silent_and_heard_again() -> None:
-    """Closed under the exchange, and half-open: both are one error, and the next one reopens."""
+async def test_an_arm_that_is_cut_off_is_reconnected() -> None:
+    """A closed and a half-open connection each give one error, and the next exchange reopens it."""
     async with linked() as (link, _), Cut(link.port) as cut:
         through = ModbusLink("127.0.0.1", cut.port)
 
@@ -407,7 +408,7 @@ async def test_an_arm_that_is_cut_off_is_silent_and_heard_again() -> None:
 async def test_an_answer_that_is_not_modbus_is_one_error_and_no_trace(
     answer: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The frame is right, what is in it is not; raised into the loop it would be logged by it."""
+    """The frame is valid, but not its content; an exception in the loop would be logged."""
     served: list[asyncio.Task[None] | None] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

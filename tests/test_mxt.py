@@ -1,4 +1,4 @@
-"""The real-time external control: its packets, its link, and the simulated controller."""
+"""Test the real-time external control: packets, link, and the simulated controller."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_the_document_has_the_layout_of_the_code() -> None:
 
 
 def test_the_bytes_of_a_command_are_the_makers() -> None:
-    """Offsets from the maker's struct: command 0, types 2 and 4, data 8, counters 58 and 60."""
+    """The offsets are those of the manufacturer's struct: command 0, types 2 and 4, data 8,
+    counters 58 and 60."""
     packet = encode_joints(np.array([0.5, -0.25, 1.5, 2.0, -1.0, 0.0]))
     assert len(packet) == 196
     assert packet[:8].hex() == "0100020008000000"
@@ -112,13 +113,13 @@ def test_a_sound_answer_is_decoded() -> None:
         (answer(joints=(0, 0, 0, 0, 0, 1e6)), "not angles"),
     ],
 )
-def test_an_unsound_answer_is_refused(packet: bytes, words: str) -> None:
+def test_an_unsound_answer_is_rejected(packet: bytes, words: str) -> None:
     with pytest.raises(ArmAnswerError, match=words):
         decode_answer(packet)
 
 
 @pytest.mark.parametrize("command", [2, 255, 65535])
-def test_the_end_of_external_control_is_told(command: int) -> None:
+def test_the_end_of_external_control_is_reported(command: int) -> None:
     with pytest.raises(ArmRefusedError, match="ended external control"):
         decode_answer(answer(command=command))
 
@@ -145,7 +146,7 @@ def test_any_bytes_are_a_status_or_an_error(packet: bytes) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 2**31 - 1))
-def test_a_counter_goes_on_over_its_end_and_not_back(count: int, steps: int) -> None:
+def test_a_counter_wraps_around_and_never_decreases(count: int, steps: int) -> None:
     assert has_advanced((count + steps) % 2**32, count, 1)
     assert has_advanced((count + steps) % 2**32, count, steps)
     assert not has_advanced((count + steps) % 2**32, count, steps + 1)
@@ -169,7 +170,7 @@ inside = arrays(np.float64, 6, elements=st.floats(0.02, 0.98)).map(
 
 @settings(max_examples=100, deadline=None)
 @given(inside)
-def test_a_encode_pose_says_where_the_flange_shall_be(joints: Floats) -> None:
+def test_a_pose_packet_contains_the_flange_target(joints: Floats) -> None:
     numbers = np.array(struct.unpack_from("<8f", encode_pose(joints), 8), dtype=np.float64)
     assert pose_from(numbers) == pytest.approx(kinematics.forward(joints), abs=2e-6)
 
@@ -195,7 +196,7 @@ def controller(**changed: float) -> MxtController:
 
 
 def ask(arm: MxtController, packet: bytes, sender: tuple[str, int] = ME) -> bytes | None:
-    """One cycle with that packet; the answer, if there was one."""
+    """Exchange one packet; return the answer, if any."""
     arm.receive_command(packet, sender)
     arm.advance(CONTROLLER_CYCLE_S)
     answers, arm.answers = arm.answers, []
@@ -231,7 +232,7 @@ def test_it_follows_set_points_through_filter_and_servo() -> None:
     assert trailing_s == pytest.approx(np.full(6, 0.025), abs=0.002)
 
 
-def test_it_takes_poses_as_it_takes_joints() -> None:
+def test_it_accepts_poses_as_well_as_joints() -> None:
     one, other = controller(), controller()
     for arm in (one, other):
         ask(arm, encode(COMMAND_NONE))
@@ -384,7 +385,7 @@ async def test_commands_are_answered_one_by_one_and_move_the_arm() -> None:
         assert server.controller.wanted_rad == pytest.approx(JOINTS + 0.007, abs=1e-6)
 
 
-async def test_a_pose_link_moves_the_arm_to_the_same_place() -> None:
+async def test_a_pose_link_moves_the_arm_to_the_same_pose() -> None:
     async with linked() as (_, server):
         link = MxtLink("127.0.0.1", server.port, timeout_s=DEADLINE_S, poses=True)
         await exchange(link, "idle")
@@ -446,8 +447,8 @@ async def test_late_answers_are_thrown_away() -> None:
         assert link.stale >= 1
 
 
-async def test_an_older_answer_is_not_taken_for_the_newest() -> None:
-    """A network that delivers an answer twice: the second is told by its count."""
+async def test_an_older_answer_does_not_replace_the_newest() -> None:
+    """The network delivers an answer twice: the second is identified by its counter."""
 
     class Twice(asyncio.DatagramProtocol):
         count = 4
@@ -471,7 +472,7 @@ async def test_an_older_answer_is_not_taken_for_the_newest() -> None:
         transport.close()
 
 
-async def test_nobody_listening_is_an_error_in_one_line() -> None:
+async def test_a_missing_server_is_an_error_in_one_line() -> None:
     link = MxtLink("127.0.0.1", 1, timeout_s=DEADLINE_S)
     for _ in range(3):
         with pytest.raises(ArmSilentError, match=r"127\.0\.0\.1:1: Connection refused"):
@@ -493,7 +494,7 @@ async def test_a_cancellation_is_not_swallowed() -> None:
         await exchange(link, "idle")
 
 
-def test_the_document_tells_the_refusals() -> None:
+def test_the_document_lists_the_rejections() -> None:
     text = DOCUMENT.read_text()
     source = (Path(__file__).parent.parent / "nodes/twin/mxt_controller.py").read_text()
     for words in re.findall(r'MxtError\("([^"]+)"\)', source):

@@ -1,4 +1,4 @@
-"""Planner, both bridges and the twin's arms, which speak the real-time external control."""
+"""Test planner, both bridges and the simulated arms with the real-time external control."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node form: ports, parameters, handlers, mailboxes, errors and status."""
+"""Test the node base class: ports, parameters, handlers, mailboxes, errors and status."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class EchoParameters(NodeParameters):
 
 
 class Echo(Node):
-    """Sends each stop on; fails when told to."""
+    """Node that forwards each stop, or fails on request."""
 
     parameters: EchoParameters
     estop: Input[EStop]
@@ -106,7 +106,7 @@ def test_a_port_can_be_connected_to_another_topic_of_its_type_only() -> None:
         build(topics={"fingertip": "fingertips"})
 
 
-def test_unknown_parameters_are_refused() -> None:
+def test_unknown_parameters_are_rejected() -> None:
     with pytest.raises(ValidationError, match="gian"):
         EchoParameters.model_validate({"gian": 2.0})
 
@@ -121,7 +121,7 @@ def test_every_node_of_the_table_imports_and_declares_its_ports() -> None:
         node_class("planer")
 
 
-async def test_an_error_in_a_handler_is_counted_and_shown_and_the_node_goes_on() -> None:
+async def test_an_error_in_a_handler_is_counted_and_shown_and_the_node_continues() -> None:
     node, _, _ = build()
     node.deliver("estop", EStop(engaged=True, reason="hot"), header(1))
     node.deliver("estop", EStop(engaged=False, reason=""), header(2))

@@ -1,4 +1,4 @@
-"""The import package: its public names, one name per module, and what a wheel holds."""
+"""Test the import package: public names, one name per module, and the content of a wheel."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_importing_the_package_imports_no_library(tmp_path: Path) -> None:
 
 
 def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
-    """With the checkout on the path, and with foreign packages of the same names."""
+    """The checkout and foreign packages of the same names are on the path."""
     for name in FOLDERS:
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('foreign package')\n")
@@ -142,7 +142,7 @@ def test_a_wheel_holds_the_package_only(tmp_path: Path) -> None:
 
 
 def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
-    """On a graph of one node, which publishes fingertips."""
+    """The script runs with a graph of one node, which publishes fingertips."""
     (script,) = (
         block.text for block in blocks(ROOT / "README.md") if "flexsheet.load_graph" in block.text
     )
@@ -162,7 +162,8 @@ def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
 
 
 def copy_of_sources(folder: Path) -> Path:
-    """Link what a build reads into a folder, so that the build writes nothing into the checkout."""
+    """Link the sources of a build into a folder, so that the build writes nothing into the
+    checkout."""
     folder.mkdir()
     for name in (*FOLDERS, "flexsheet", "pyproject.toml", "README.md", "LICENSE"):
         (folder / name).symlink_to(ROOT / name)
@@ -170,7 +171,7 @@ def copy_of_sources(folder: Path) -> Path:
 
 
 def test_every_module_has_one_file() -> None:
-    """The links lead to the folders beside the package, and nowhere else."""
+    """The links lead only to the folders beside the package."""
     for name in FOLDERS:
         assert os.readlink(ROOT / "flexsheet" / name) == f"../{name}"
         module = importlib.import_module(f"flexsheet.{name}")

@@ -1,4 +1,4 @@
-"""Parameters marked by type: devices, device addresses and calibration files."""
+"""Test parameters marked by type: devices, device addresses and calibration files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class OwnParameters(NodeParameters):
 
 
 class OwnBridge(Node):
-    """A laboratory's bridge, whose parameters have names of their own."""
+    """Bridge with other parameter names."""
 
     parameters: OwnParameters
     arm: Output[ArmState]

@@ -42,7 +42,7 @@ from tests.waiting import DEADLINE_S, until
 Floats = NDArray[np.float64]
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
 FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 0.0, 0.0]))
-"""Sheet so far to the right that the left arm's J3 is out of range."""
+"""Pose of the sheet so far to the right that the left arm's J3 is out of range."""
 
 
 def make_request(start: SheetMotion, goal: SheetMotion) -> PathCheckRequest:
@@ -57,13 +57,13 @@ def mirrored(way: PathCheckRequest) -> PathCheckRequest:
 
 
 def find_violation(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> str | None:
-    """Return why the path is blocked; None where it is clear, without its alignment."""
+    """Return why the path is blocked; None if it is clear, independent of its alignment."""
     result = check_path(arm, other, request)
     return result if isinstance(result, str) else None
 
 
 def run_with_checks(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
-    """Run both arms like `run`, and check each requested path at once."""
+    """Run both arms like `run`, and check each requested path immediately."""
     for _ in range(cycles):
         for arm, other in (arms, arms[::-1]):
             control = arm.control
@@ -80,7 +80,7 @@ def sheet_of(arms: tuple[Arm, Arm]) -> SheetMotion:
     return arms[0].geometry.sheet_between(arms[0].edge, arms[1].edge)
 
 
-def test_a_barred_way_is_named_and_nothing_moves() -> None:
+def test_a_blocked_path_is_named_and_nothing_moves() -> None:
     arms = pair()
     places = [arm.joints.copy() for arm in arms]
     run_with_checks(arms, FAR, 30)
@@ -106,7 +106,7 @@ def test_a_target_within_reach_again_is_gone_to() -> None:
 
 
 @pytest.mark.parametrize("barred", [0, 1])
-def test_where_only_one_bridge_finds_the_way_clear_neither_moves(barred: int) -> None:
+def test_if_only_one_bridge_finds_the_path_clear_neither_moves(barred: int) -> None:
     arms = pair()
     places = [arm.joints.copy() for arm in arms]
     for _ in range(100):
@@ -219,7 +219,7 @@ lean = st.tuples(st.floats(-1.2, 1.2), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6
 @settings(max_examples=6, deadline=None)
 @example(shift=(0.0, 0.0, 0.125), lean=(0.0, 0.5, 0.0), stretch=1.0)
 @given(shift=shift, lean=lean, stretch=st.floats(0.9, 1.1))
-def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
+def test_a_clear_path_is_followed_without_a_fault_and_both_bridges_agree(
     shift: tuple[float, ...], lean: tuple[float, ...], stretch: float
 ) -> None:
     goal = SheetMotion(transform_from_rpy(shift, lean), np.zeros(6), stretch, 0.0)
@@ -238,7 +238,7 @@ def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
     assert sheet_of(arms).world_from_sheet == pytest.approx(goal.world_from_sheet, abs=2e-3)
 
 
-def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
+def test_from_beyond_a_limit_there_is_a_path_back_but_none_further() -> None:
     beyond = sheet_at(stretch=1.0872)
     assert find_violation(LEFT, RIGHT, make_request(beyond, sheet_at(stretch=1.05))) is None
     further = find_violation(LEFT, RIGHT, make_request(beyond, sheet_at(stretch=1.0875)))
@@ -247,7 +247,7 @@ def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
-def test_numbers_that_are_none_bar_the_way(broken: float) -> None:
+def test_nan_blocks_the_path(broken: float) -> None:
     pose = np.eye(4)
     pose[1, 3] = broken
     way = make_request(HOME, HOME)
@@ -260,7 +260,7 @@ def test_numbers_that_are_none_bar_the_way(broken: float) -> None:
         assert find_violation(LEFT, RIGHT, asked) is not None
 
 
-async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
+async def test_paths_are_checked_outside_the_loop_one_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     threads: list[int] = []
@@ -289,7 +289,7 @@ async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
 @pytest.mark.parametrize(
     ("given_s", "rate_hz", "due_s"), [(None, 120.0, 1 / 120), (0.02, 60, 0.02)]
 )
-async def test_targets_are_due_at_the_cameras_rate_unless_told_otherwise(
+async def test_targets_are_due_at_the_cameras_rate_by_default(
     given_s: float | None, rate_hz: float, due_s: float
 ) -> None:
     node = ArmBridge(
@@ -328,7 +328,7 @@ async def aim(rig: Rig, nodes: dict[str, ArmBridge], sheet: SheetMotion) -> None
         await asyncio.sleep(1 / 60)
 
 
-async def test_the_twins_arms_stand_before_a_barred_way_and_go_a_clear_one() -> None:
+async def test_the_simulated_arms_rest_at_a_blocked_path_and_follow_a_clear_one() -> None:
     sides: tuple[Side, Side] = ("left", "right")
     patient = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
     async with running_rig({"watchdog_s": 0.8}, **patient) as (rig, nodes):

@@ -1,6 +1,6 @@
-"""Test that a path back exists from wherever a fault has stopped the arms.
+"""Test that a path back exists from any position where a fault has stopped the arms.
 
-A path is judged by its own rehearsal and by arms that are sent along it.
+A path is tested by its rehearsal and by arms that follow it.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ def in_range(joints: Floats) -> bool:
 
 
 def stopped_joints(target: SheetMotion, behind: int, deviation: Floats) -> Joints | None:
-    """Joints of both arms where the path to a target ends for one of them; None: it does not.
+    """Return joints of both arms where the path to a target ends for one of them; None if it does
+    not.
 
-    behind: by so many tenths of a second one arm trails the other; even: the left one.  deviation
-    (2, 6): how far each joint has come to rest from its command.
+    behind: delay of one arm in tenths of a second; even: the left one. deviation (2, 6): distance
+        of each resting joint from its command.
     """
     reachable: list[Joints] = [
         (LEFT.joints_for_sheet(HOME, GUESS), RIGHT.joints_for_sheet(HOME, GUESS))
@@ -87,7 +88,7 @@ def way_from(joints: Joints, goal: SheetMotion) -> PathCheckRequest:
 
 
 def keeps_length(joints: Joints) -> bool:
-    """Return whether a fault can leave the sheet like this, by the limits of commands."""
+    """Return whether a fault can leave the sheet in this state, by the limits of commands."""
     way = way_from(joints, HOME)
     return way.start.stretch_ratio * 0.24 <= LEFT.sheet_limits.max_length_m
 
@@ -139,7 +140,7 @@ def test_from_wherever_a_path_ends_there_is_one_back(
 
 
 def standing(side: str, joints: Floats) -> Arm:
-    """Return an arm that stands at these joints, with a new bridge."""
+    """Return an arm at rest at these joints, with a new bridge."""
     geometry = LEFT if side == "left" else RIGHT
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.12, auto_arming=True)
     for _ in range(SETTLED_COUNT):
@@ -189,7 +190,7 @@ def assert_goes_home(arms: tuple[Arm, Arm]) -> None:
 def test_stopped_where_no_even_sheet_can_be_held_both_go_home(
     target: SheetMotion, behind: int
 ) -> None:
-    """One arm is at the end of its range, so the mean sheet is out of reach."""
+    """One arm is at the end of its range, so that the mean sheet is not reachable."""
     deviation = np.array([[0.0, 0.03, -0.03, 0.01, 0.0, 0.0], [0.0, 0.0, 0.02, 0.0, 0.01, 0.0]])
     joints = stopped_joints(target, behind, deviation)
     assert joints is not None

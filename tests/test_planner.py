@@ -1,4 +1,4 @@
-"""The planner: approach, rolling, holding, bounds, compliance, and the same bytes every time."""
+"""Test the planner: approach, rolling, holding, bounds, compliance and determinism."""
 
 from __future__ import annotations
 
@@ -42,13 +42,14 @@ FRAME_NS = 16_666_667
 
 
 def on_cylinder(angle_deg: float, height: float = 0.0, x: float = 0.0) -> Floats:
-    """A point at a height over the cylinder's skin, in the object's frame."""
+    """Return a point at a height over the cylinder's skin, in the object's frame."""
     angle, reach = math.radians(angle_deg), RADIUS + height
     return np.array([x, reach * math.sin(angle), reach * math.cos(angle)])
 
 
 def sheet_on_cylinder(angle: float, y_m: float) -> Floats:
-    """object_from_sheet in closed form: tangent at the angle, the sheet's line at `y_m` there."""
+    """Return object_from_sheet in closed form: tangent at the angle, with the sheet's line at
+    `y_m`."""
     normal = np.array([0.0, math.sin(angle), math.cos(angle)])
     along = np.array([0.0, math.cos(angle), -math.sin(angle)])
     axes = np.column_stack([[1.0, 0.0, 0.0], along, normal])
@@ -61,7 +62,7 @@ def in_world(point: Floats) -> Floats:
 
 
 class Table:
-    """A planner, fed by hand at 60 Hz."""
+    """Planner with messages from the test at 60 Hz."""
 
     def __init__(self, scene: Scene, **parameters: Any) -> None:
         self.sent: list[SheetTarget] = []
@@ -152,7 +153,7 @@ async def test_the_sheet_approaches_the_tangent_plane_under_the_finger(angle_deg
 async def stroke(
     desk: Table, from_deg: float, to_deg: float, frames: int, height: float = -0.002
 ) -> list[SheetTarget]:
-    """A finger that goes evenly from one angle to another; its velocity is known exactly."""
+    """Return a finger that moves uniformly from one angle to another, with its exact velocity."""
     rate = math.radians(to_deg - from_deg) / (frames * FRAME_NS * 1e-9)
     reach, sent = RADIUS + height, []
     for number in range(1, frames + 1):
@@ -235,7 +236,7 @@ async def test_after_a_lift_the_sheet_is_met_at_its_middle_again() -> None:
     assert lifted.contact_sheet_m == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-async def test_a_contact_begun_on_the_way_takes_the_sheet_as_it_is() -> None:
+async def test_a_contact_during_the_approach_uses_the_sheet_as_it_is() -> None:
     desk = await table(prediction_horizon_s=0.0)
     await desk.rest_at(in_world(on_cylinder(40.0, 0.02)))
     for _ in range(3):
@@ -261,7 +262,7 @@ STILL = np.zeros(3)
 
 
 class Desk:
-    """An encounter with the cylinder, in the terms of its cross-section."""
+    """Encounter with the cylinder, in coordinates of its cross-section."""
 
     def __init__(self) -> None:
         self.machine = ContactStateMachine(SHAPE, np.eye(3), LIMITS)
@@ -303,7 +304,7 @@ def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, reason: str, dep
     assert (back.phase, angle_of(back)) == ("contact", pytest.approx(0.0, abs=1e-12))
 
 
-def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_back() -> None:
+def test_the_sheet_holds_at_its_usable_height_and_continues_when_the_finger_is_back() -> None:
     desk = touched()
     for angle_deg in np.arange(0.0, 61.0, 2.0):
         shown = desk.see(on_cylinder(angle_deg, -0.001))
@@ -318,7 +319,7 @@ def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_bac
 
 
 def test_a_deep_push_neither_shakes_nor_leaves_the_sheet() -> None:
-    """To the axis and past it, with a measured finger that trembles by a tenth of a millimetre."""
+    """The finger moves to the axis and beyond, with a tremor of a tenth of a millimetre."""
     desk = touched()
     noise = np.random.default_rng(1)
     for depth in np.concatenate([np.linspace(0.001, 0.05, 200), np.full(200, 0.05)]):
@@ -412,7 +413,7 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
+async def test_motion_is_bounded_for_any_finger(seed: int) -> None:
     random = np.random.default_rng(seed)
     desk = await table(prediction_horizon_s=0.05)  # so that targets are even in time
     given = desk.planner.parameters
@@ -438,7 +439,7 @@ async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
 
 
 def soft(stiffness: float) -> SoftBody:
-    """An object of that stiffness, a spring as far as it is known."""
+    """Return an object of that stiffness, a linear spring."""
     return SoftBody(
         mesh_id="m",
         method="test",
@@ -470,7 +471,7 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
-async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: str) -> None:
+async def test_what_the_sheet_cannot_render_is_reported(stiffness: float, words: str) -> None:
     desk = await table(compliance_mode="stiffness")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
     assert words in desk.planner.note
@@ -479,7 +480,7 @@ async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: st
     assert target.stretch_ratio == pytest.approx(least if words == "softer" else largest)
 
 
-def test_the_arms_pull_limits_the_stretch() -> None:
+def test_the_arms_force_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
     _, largest = compute_stretch_range(weak)
     force = edge_force_n(
@@ -522,7 +523,7 @@ async def test_an_object_turned_in_the_world_is_met_from_the_users_side() -> Non
     assert np.hypot(on_object[1], on_object[2]) == pytest.approx(RADIUS)
 
 
-async def test_an_object_that_cannot_be_presented_is_said_and_nothing_is_sent() -> None:
+async def test_an_object_that_cannot_be_presented_is_reported_and_nothing_is_sent() -> None:
     desk = await table()
     await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 3)
     sent = len(desk.sent)

@@ -1,4 +1,4 @@
-"""Bounded following: no lag on an even target, no overshoot, no leap."""
+"""Test bounded following: no lag on a uniform motion, no overshoot, no jump."""
 
 from __future__ import annotations
 

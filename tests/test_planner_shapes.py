@@ -1,5 +1,5 @@
-"""What the sheet does on every shape: it rolls as exactly as it must, and where it cannot go on the
-outcome is decided and never a step."""
+"""Test the sheet on every shape: exact rolling, and defined outcomes without a step at its
+limits."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ SOLIDS: dict[str, dict[str, Any]] = {
 
 
 def as_mesh(vertices: Floats, triangles: NDArray[np.int64], smoothing_m: float) -> dict[str, Any]:
-    """The geometry of a scene with that mesh."""
+    """Return a geometry of a scene with that mesh."""
     mesh = Mesh(
         vertices_m=vertices,
         triangles=triangles.astype(np.int32),
@@ -68,13 +68,13 @@ def as_mesh(vertices: Floats, triangles: NDArray[np.int64], smoothing_m: float) 
 
 @lru_cache
 def meshed() -> dict[str, Any]:
-    """An ellipsoid of 50 x 30 x 20 mm as 5120 triangles."""
+    """Return an ellipsoid of 50 x 30 x 20 mm as 5120 triangles."""
     return as_mesh(*ellipsoid_mesh(4), 0.0035)
 
 
 @lru_cache
 def lobes() -> dict[str, Any]:
-    """Two lobes of 30 mm radius, side by side along y, with a saddle between them."""
+    """Return two lobes of 30 mm radius along y, with a saddle between them."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
@@ -85,7 +85,7 @@ def lobes() -> dict[str, Any]:
 
 @lru_cache
 def bowl() -> dict[str, Any]:
-    """A block of 100 x 100 mm whose top is a hollow of 60 mm radius at its middle, z = r^2 / 2R."""
+    """Return a block of 100 x 100 mm with a concave top of 60 mm radius, z = r^2 / 2R."""
     import trimesh
 
     ticks = np.linspace(-0.05, 0.05, 41)
@@ -114,7 +114,7 @@ def bowl() -> dict[str, Any]:
 
 @lru_cache
 def cube() -> dict[str, Any]:
-    """A cube of 80 mm, as six sides of two triangles."""
+    """Return a cube of 80 mm, as six sides of two triangles."""
     import trimesh
 
     box = trimesh.creation.box(extents=(0.08, 0.08, 0.08))
@@ -136,7 +136,7 @@ MESHES: dict[str, Callable[[], dict[str, Any]]] = {
     "liver": liver,
 }
 DOME_UP = (0.5 * math.pi, 0.0, 0.0)
-"""Turns the liver's dome, where its y is up, to the user."""
+"""Rotation of the liver's dome, where its y is up, to the user."""
 
 
 @lru_cache
@@ -150,7 +150,7 @@ def desk_about(name: str) -> tuple[Desk, Shape]:
 
 
 def fresh(name: str) -> tuple[Desk, Shape]:
-    """A desk as new, and the shape: a mesh's is made once per run, which takes a second."""
+    """Return a new planner and the shape; a mesh's is made once per run, since it takes a second."""
     desk, shape = desk_about(name)
     new = copy.copy(desk)
     new.plan, new.seen = copy.copy(desk.plan), []
@@ -162,7 +162,7 @@ def fresh(name: str) -> tuple[Desk, Shape]:
 def walk(
     shape: Shape, start: Floats, heading: Floats, step_m: float, steps: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Points, normals (n, 3) and curvatures along the way (n,) of a straightest way."""
+    """Return points, normals (n, 3) and curvatures (n,) along a geodesic."""
     found = shape.closest(start)
     point, normal, way = found.point, found.normal, []
     for _ in range(steps):
@@ -176,7 +176,7 @@ def walk(
 
 
 def touch(desk: Desk, point: Floats, normal: Floats, depth_m: float = 0.001) -> PlannedStep:
-    """Come from above, touch, and rest there."""
+    """Approach from above, touch, and rest."""
     desk.rest(point + 0.03 * normal)
     desk.follow(point + np.linspace(0.03, -depth_m, 60)[:, None] * normal)
     return desk.rest(point - depth_m * normal, 40)
@@ -191,7 +191,7 @@ def reasons(planned: list[PlannedStep]) -> set[str]:
 
 
 def eased_path(corners: list[Floats], steps: int) -> Floats:
-    """Through corners, at rest at each, by the smooth step."""
+    """Return a path through corners, at rest at each, by the smoothstep function."""
     share = np.linspace(0.0, 1.0, steps)[1:, None]
     smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     legs = [a + smooth * (b - a) for a, b in pairwise(corners)]
@@ -202,10 +202,10 @@ def eased_path(corners: list[Floats], steps: int) -> Floats:
 
 
 @pytest.mark.parametrize(("frames", "depth_m"), [(600, 0.001), (180, 0.001), (300, 0.004)])
-def test_after_60_degrees_on_the_cylinder_arc_and_way_on_the_sheet_are_equal(
+def test_after_60_degrees_on_the_cylinder_arc_and_path_on_the_sheet_are_equal(
     frames: int, depth_m: float
 ) -> None:
-    """|arc AB - length A'B| <= 0.01 mm, of the sheet as it is sent to the arms."""
+    """|arc AB - length A'B| <= 0.01 mm for the sheet that is sent to the arms."""
     desk, _ = fresh("cylinder")
     first = touch(desk, RADIUS * FRONT, FRONT, depth_m)
     angle = np.radians(60.0) * eased_path([np.zeros(1), np.ones(1)], frames)[:, 0]
@@ -225,7 +225,7 @@ def test_after_60_degrees_on_the_cylinder_arc_and_way_on_the_sheet_are_equal(
 def test_a_closed_triangle_on_a_sphere_turns_the_sheet_by_its_solid_angle(
     corners_deg: tuple[float, float],
 ) -> None:
-    """To 0.01 degrees, of the sheet as it is sent to the arms."""
+    """The error is at most 0.01 degrees for the sheet that is sent to the arms."""
     radius = 0.05
     desk, _ = fresh("sphere")
     first = touch(desk, radius * FRONT, FRONT)
@@ -254,13 +254,14 @@ def test_a_closed_triangle_on_a_sphere_turns_the_sheet_by_its_solid_angle(
 
 
 TURNED_PER_S = 0.8
-"""A stroke so fast that the sheet turns by this, rad/s: half of what the edges' speed allows."""
+"""Rotation of the sheet by a fast stroke, rad/s: half of what the edges' speed allows."""
 
 
 def normal_errors_deg(
     desk: Desk, judge: Shape, start: Floats, heading: Floats, length_m: float
 ) -> Floats:
-    """How far off the sheet's normal is, along a stroke whose speed suits its tightest bend."""
+    """Return the errors of the sheet's normal along a stroke at a speed for its tightest bend,
+    degrees."""
     _, _, bends = walk(judge, start, heading, 5e-4, int(length_m / 5e-4))
     step_m = min(0.03, TURNED_PER_S / bends.max()) * STEP_S
     points, normals, _ = walk(judge, start, heading, step_m, int(length_m / step_m))
@@ -285,7 +286,8 @@ def normal_errors_deg(
 
 @pytest.mark.parametrize("heading", [(1.0, 0.2, 0.0), (0.3, 1.0, 0.0), (-0.6, 0.8, 0.0)])
 def test_on_a_mesh_the_sheets_normal_is_the_smooth_surfaces(heading: tuple[float, ...]) -> None:
-    """Within 0.5 degrees of the ellipsoid that was meshed, with bounded acceleration and jerk."""
+    """The error is at most 0.5 degrees from the meshed ellipsoid, with bounded acceleration and
+    jerk."""
     desk, _ = fresh("meshed")
     known = EllipsoidShape((0.05, 0.03, 0.02))
     errors = normal_errors_deg(desk, known, np.array([0.0, 0.0, 0.05]), np.array(heading), 0.012)
@@ -301,7 +303,8 @@ LIVER_STARTS = ((-0.012, 0.1, 0.006), (0.0, 0.1, 0.0), (-0.02, 0.1, -0.004))
 def test_on_the_real_mesh_the_sheets_normal_is_the_smooth_surfaces(
     start: tuple[float, ...], heading: tuple[float, ...]
 ) -> None:
-    """Within 0.5 degrees along a stroke of 12 mm, with bounded acceleration and jerk."""
+    """The error is at most 0.5 degrees along a stroke of 12 mm, with bounded acceleration and
+    jerk."""
     desk, shape = fresh("liver")
     errors = normal_errors_deg(desk, shape, np.array(start), np.array(heading), 0.012)
     assert errors.max() < 0.5
@@ -326,7 +329,7 @@ def limits(**changes: float) -> ContactLimits:
 
 
 def shown_to(shape: Shape, finger: Floats, **changes: float) -> ContactCommand:
-    """What is presented to a finger that is there from the first."""
+    """Return the step for a finger that starts at a position."""
     met = ContactStateMachine(shape, np.eye(3), limits(**changes))
     return met.step(finger, STILL, met.contact.object_from_sheet)
 
@@ -346,7 +349,7 @@ moves = st.lists(
 def test_no_transition_is_a_step_wherever_the_finger_goes(
     name: str, moves: list[tuple[tuple[float, float, float], int, str]]
 ) -> None:
-    """Leaps, losses, insides, ends: speed, acceleration and jerk of the sheet are bounded."""
+    """For any jump, loss or penetration the sheet's speed, acceleration and jerk are bounded."""
     desk, _ = fresh(name)
     here = np.array([0.0, 0.0, 0.1])
     for place, steps, way in moves:
@@ -383,7 +386,7 @@ def test_no_transition_is_a_step_wherever_the_finger_goes(
 def test_a_finger_inside_on_no_side_is_held_and_not_met(
     name: str, finger: tuple[float, float, float]
 ) -> None:
-    """On an axis, a centre, a medial plane: nothing is presented until the finger comes out."""
+    """On an axis, a centre or a medial plane there is no contact until the finger comes out."""
     desk, shape = fresh(name)
     home = desk.plan.motion.world_from_sheet
     held = desk.rest(np.array(finger), 20)
@@ -397,7 +400,7 @@ def test_a_finger_inside_on_no_side_is_held_and_not_met(
 
 
 def test_pushed_to_the_middle_the_side_is_kept_for_every_shape() -> None:
-    """Where all sides are as near the sheet stays the one that is touched, trembling or not."""
+    """Where all sides are equally near, the sheet stays at the present side, also with tremor."""
     noise = np.random.default_rng(2)
     for name in ("cylinder", "sphere", "ellipsoid", "plane", "box", "meshed", "lobes"):
         desk, shape = fresh(name)
@@ -459,8 +462,8 @@ def test_over_an_edge_the_sheet_is_presented_but_no_touch_begins() -> None:
     assert met.reason == "past_object_edge"
 
 
-def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
-    """The rim of z = r^2 / 2R stands r^2 / 2R over the bottom; it counts in full to 24 mm."""
+def test_a_concavity_is_reported_and_the_sheet_rests_on_its_rim() -> None:
+    """The rim of z = r^2 / 2R is r^2 / 2R above the bottom, up to 24 mm."""
     desk, shape = fresh("bowl")
     bottom = shape.closest(np.array([0.0, 0.0, 0.02]))
     waiting = desk.rest(np.array([0.0, 0.0, 0.04]), 200)
@@ -483,7 +486,7 @@ def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
 def test_out_of_sheet_it_holds_and_is_met_at_its_middle_again_after_a_lift(
     name: str, axis: int, side: str
 ) -> None:
-    """The finger goes to the end of the sheet, lifts, and comes again elsewhere."""
+    """The finger moves to the end of the sheet, lifts, and touches elsewhere."""
     desk, shape = fresh(name)
     most = (0.09, 0.09)[axis]
     begin, along = np.zeros(3), np.zeros(3)
@@ -577,27 +580,27 @@ def test_a_finger_that_is_none_is_held(
         ),
     ],
 )
-def test_a_shape_that_is_none_is_refused_with_the_measure(
+def test_a_shape_that_is_none_is_rejected_with_the_measure(
     geometry: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
         make_shape(geometry)
 
 
-def test_an_inverted_mesh_is_refused() -> None:
+def test_an_inverted_mesh_is_rejected() -> None:
     vertices, triangles = ellipsoid_mesh(2)
     with pytest.raises(MeshError, match="inside out"):
         SmoothMeshShape(vertices, triangles[:, ::-1], 0.01)
 
 
 @pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
-def test_an_object_that_turns_no_side_to_the_user_is_refused(turn_rad: float) -> None:
+def test_an_object_that_turns_no_side_to_the_user_is_rejected(turn_rad: float) -> None:
     with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
         Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
 
 
 def test_a_tilt_beyond_a_right_angle_is_cut() -> None:
-    """Two normals that both may be presented are never opposite."""
+    """Two normals that may both be rendered are never opposite."""
     shape = make_shape(SOLIDS["sphere"])
     for lean in (1.3, -1.3):
         met = shown_to(shape, 0.08 * np.array([0.0, math.sin(2 * lean), -0.9]), max_tilt_rad=3.0)
@@ -609,13 +612,13 @@ def test_a_tilt_beyond_a_right_angle_is_cut() -> None:
 
 
 def sheet_way_m(planned: list[PlannedStep]) -> float:
-    """How far the contact has gone on the sheet, step by step."""
+    """Return the path length of the contact on the sheet, step by step."""
     places = np.array([one.command.contact.position_sheet_m for one in planned])
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
 
 
 def object_way_m(planned: list[PlannedStep]) -> float:
-    """How far it has gone on the object."""
+    """Return the path length of the contact on the object."""
     points = np.array([one.command.contact.point for one in planned])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
@@ -623,7 +626,8 @@ def object_way_m(planned: list[PlannedStep]) -> float:
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "box", "meshed"])
 @pytest.mark.parametrize("deepest_share", [0.1, 0.4, 0.8])
 def test_stroking_while_pushing_neither_steps_nor_slips(name: str, deepest_share: float) -> None:
-    """A finger that strokes to and fro and pushes in and out at once, to a share of the radius."""
+    """A finger strokes back and forth and pushes in and out simultaneously, to a fraction of the
+    radius."""
     desk, shape = fresh(name)
     front = shape.closest(np.array([0.0, 0.0, 0.2]))
     thick = front.point[2]

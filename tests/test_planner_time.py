@@ -1,4 +1,4 @@
-"""Times that a planner and a bridge are given: late, stepped, from the future."""
+"""Test stamps that a planner and a bridge receive: late, stepped, in the future."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_after_a_step_back_the_filter_restarts(back_s: float) -> None:
 
 
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=60))
-def test_every_step_is_positive_whatever_the_stamps(stamps_ns: list[int]) -> None:
+def test_every_step_is_positive_for_any_stamps(stamps_ns: list[int]) -> None:
     timestamps = MonotonicTimestampFilter()
     for stamp_ns in stamps_ns:
         step_s = timestamps.update(stamp_ns, 0.02)

@@ -1,4 +1,4 @@
-"""`flexsheet precompute`: dents and the soft body's table, made before a scene is shown."""
+"""Test `flexsheet precompute`: indentation shapes and the soft body's table."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ SPACING_M = 0.005
 
 @pytest.fixture
 def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A small cylinder, that few shallow pushes on a coarse mesh do for; no dents are worked out:
-    they take longer than all else here."""
+    """Write a scene of a small cylinder with few shallow pushes on a coarse mesh, without
+    indentation shapes, which take longest."""
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
@@ -47,7 +47,8 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flexsheet(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
-    """Runs the command in this process: its exit code, and its words without line breaks."""
+    """Return a function that runs the command in this process: exit code, output without line
+    breaks."""
 
     def run(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
@@ -58,7 +59,7 @@ def flexsheet(
     return run
 
 
-def test_the_table_is_made_where_the_node_looks_for_it_and_once(
+def test_the_table_is_computed_once_in_the_nodes_cache(
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -91,7 +92,7 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
         ),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(
+def test_impossible_requests_are_rejected_with_an_error_text(
     scene_file: Path,
     tmp_path: Path,
     flexsheet: Callable[..., tuple[int, str]],

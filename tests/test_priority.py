@@ -1,4 +1,4 @@
-"""How far priorities may be raised, and what is said where they may not."""
+"""Test the allowed priorities, and the report if they are not allowed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
-    """Let the user have the capability or not, and this soft limit of niceness."""
+    """Set whether the user has the capability, and the soft limit of niceness."""
     monkeypatch.setattr(priority, "_has_cap_sys_nice", lambda: capable)
     monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
     monkeypatch.setattr(os, "getpriority", lambda which, who: 0)
@@ -32,13 +32,13 @@ def test_capability_and_limit_allow_precedence(
     assert min_nice_step() == least
 
 
-def test_a_launcher_that_gives_way_itself_allows_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_nice_launcher_allows_more(monkeypatch: pytest.MonkeyPatch) -> None:
     allow(monkeypatch, capable=False, limit=20)
     monkeypatch.setattr(os, "getpriority", lambda which, who: 5)
     assert min_nice_step() == -5
 
 
-def test_who_may_not_give_precedence_is_told_once_for_all_nodes(
+def test_a_missing_permission_for_priority_is_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     nodes = list(DEMO.nodes.values())

@@ -1,4 +1,5 @@
-"""Two passes: as the equations on a flat sheet, right on a dented one, nothing where it is none."""
+"""Test the two-pass correction: equal to the equations on a flat sheet, correct on a deformed
+one."""
 
 from __future__ import annotations
 
@@ -91,7 +92,7 @@ def test_on_a_flat_sheet_two_passes_are_the_equations(
 
 
 @pytest.mark.parametrize("depth_mm", [15, 29])
-def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: SceneRenderer, depth_mm: int) -> None:
+def test_on_a_deformed_sheet_the_image_is_correct(stage: SceneRenderer, depth_mm: int) -> None:
     tip = np.array([0.0, 0.0, -1e-3 * depth_mm])
     eye = SCENE.eyes.centre_world_m
     truth, sheet = true_sheet(tip), sheet_at(np.eye(4), tip)
@@ -109,7 +110,7 @@ def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: SceneRenderer, dep
 
 # Between only two places in a quarter of the sheet there is little to interpolate from.
 @pytest.mark.parametrize(("place", "rms_m"), [((0.0, 0.0), 4e-4), ((0.03, -0.04), 1e-3)])
-def test_the_dented_mesh_is_the_twins_sheet(place: tuple[float, float], rms_m: float) -> None:
+def test_the_deformed_mesh_is_the_simulated_sheet(place: tuple[float, float], rms_m: float) -> None:
     tip = np.array([*place, -0.02])
     mesh = deflected_mesh(sheet_at(np.eye(4), tip), few_dents())
     assert mesh.note == ""
@@ -134,7 +135,7 @@ def test_meshes_reach_to_the_corners_and_the_fingertip() -> None:
     assert pyramid_mesh(unpushed).vertices == pytest.approx(flat_mesh(unpushed).vertices)
 
 
-def test_a_push_out_of_range_is_drawn_and_said(stage: SceneRenderer) -> None:
+def test_a_push_out_of_range_is_drawn_and_reported(stage: SceneRenderer) -> None:
     picture = drawn(stage, "two_pass", sheet_at(np.eye(4), np.array([0.0, 0.0, -0.06])))
     assert picture.max() == 255
     assert "deeper than 30 mm" in stage.note
@@ -142,7 +143,7 @@ def test_a_push_out_of_range_is_drawn_and_said(stage: SceneRenderer) -> None:
     assert stage.note == ""
 
 
-def test_without_dent_shapes_four_triangles_are_taken_and_it_is_said(
+def test_without_indentation_shapes_four_triangles_are_used_and_reported(
     context: moderngl.Context,
 ) -> None:
     bare = SceneRenderer(SCENE, context, spacing_m=0.006)
@@ -165,7 +166,7 @@ def test_the_grid_is_projected_too(stage: SceneRenderer) -> None:
     assert grid[290, 410].max() < 60
 
 
-def test_a_new_shape_of_another_grid_is_drawn_anew(stage: SceneRenderer) -> None:
+def test_a_new_shape_of_another_grid_is_drawn_again(stage: SceneRenderer) -> None:
     tip = np.array([0.0, 0.0, -0.02])
     dented = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
     stage.basis = None
@@ -176,9 +177,7 @@ def test_a_new_shape_of_another_grid_is_drawn_anew(stage: SceneRenderer) -> None
     assert (dented != pyramid).any()
 
 
-def test_dent_shapes_are_kept_and_found_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_indentation_shapes_are_cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     solves = []
 
     def solve_few(rubber: object, **given: object) -> object:
@@ -218,7 +217,7 @@ def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
         assert (other != own) == differs
 
 
-def test_the_family_of_shapes_tells_them_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_family_of_shapes_distinguishes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
     shallow = SCENE.working_range.model_copy(update={"push_depth_m": 0.02})
     spec = SCENE.sheet.model_copy(update={"min_stretch_ratio": 1.04, "max_stretch_ratio": 1.06})

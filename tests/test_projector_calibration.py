@@ -1,4 +1,4 @@
-"""The projector's calibration: Gray code read back, optics recovered, bad pictures refused."""
+"""Test the projector's calibration: decoded Gray code, optics, and rejected images."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def halved(lens: Lens) -> Lens:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """The demo's scene with camera and projector of half the pixels, to be quick."""
+    """Return the demo's scene with half the pixels of camera and projector, for speed."""
     full = load_scene(SCENE_FILE)
     camera, projector = full.camera, full.projector
     return full.model_copy(
@@ -86,7 +86,7 @@ def true(scene: Scene) -> Projector:
 
 @pytest.fixture(scope="module")
 def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> ProjectorPoints:
-    """What the rig, its optics known, measures of the true projector's light."""
+    """Return the rig's measurement of the true projector's light, with known optics."""
     lit = LitSheet(scene, true_rig, true, seed=3)
     shown = make_patterns(scene.projector.width_px, scene.projector.height_px)
     views = [lit.pair(shown, pose) for pose in sheet_poses(4)]
@@ -107,7 +107,7 @@ def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
 
 
 def test_a_pixel_is_found_between_the_cameras_pixels() -> None:
-    """A camera that sees the projector's picture turned, shrunk and bent."""
+    """The camera sees the projector's image rotated, scaled and distorted."""
     shown = make_patterns(256, 192)
     rows, columns = np.mgrid[:110, :140].astype(np.float64)
 
@@ -144,7 +144,9 @@ def test_the_twins_projector_is_recovered(
     assert after.max() < 0.4e-3
 
 
-def test_points_that_make_no_calibration_are_refused(scene: Scene, points: ProjectorPoints) -> None:
+def test_points_that_make_no_calibration_are_rejected(
+    scene: Scene, points: ProjectorPoints
+) -> None:
     def some(keep: np.ndarray) -> ProjectorPoints:
         return ProjectorPoints(
             points.world[keep], points.pixels[keep], points.pose[keep], points.skew_m[keep]
@@ -171,7 +173,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
         calibrate_projector(some(points.pose < 0), scene.projector)
 
 
-def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
+def test_images_that_are_not_of_the_patterns_are_rejected(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
     with pytest.raises(DecodeError, match="expected 38 images, one per pattern, found 5"):
         decode_patterns(dark[:5], 400, 300)
@@ -190,7 +192,7 @@ def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
     assert np.abs(project_points(fit.projector, world) - wanted).max() < 0.2
 
 
-def test_corners_in_no_order_are_refused() -> None:
+def test_corners_in_no_order_are_rejected() -> None:
     guess = load_scene(SCENE_FILE).projector
     crossed = np.array([[599.0, 499], [199, 99], [199, 499], [599, 99]])
     with pytest.raises(ProjectorError, match="not a convex quadrangle"):
@@ -200,7 +202,7 @@ def test_corners_in_no_order_are_refused() -> None:
         fit_keystone(mirrored, 0.1, 0.1, guess)
 
 
-def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) -> None:
+def test_the_scene_keeps_its_comments_and_gets_the_projector(tmp_path: Path) -> None:
     scene = load_scene(SCENE_FILE)
     found = make_true_projector(scene.projector, seed=5)
     copy = tmp_path / "scene.yaml"
@@ -235,7 +237,7 @@ def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projector) -> None:
-    """What a pixel lights, and the pixel that lights it, agree through a bent lens."""
+    """The pixel of a lit point, and the point of a pixel, agree through a distorting lens."""
     vertices = np.array([[-0.12, -0.12, 0], [0.12, -0.12, 0], [0.12, 0.12, 0], [-0.12, 0.12, 0]])
     projector = TrueProjector(true, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     pixels = np.array([[200.0, 150.0], [20.5, 30.25], [380.0, 280.0]])

@@ -142,7 +142,7 @@ def test_each_limit_binds_where_it_should(wanted: SheetMotion, limit: str) -> No
     assert reach.margins[limit][1] < 0.0 < reach.margins[limit][0]
 
 
-def test_the_workspace_binds_where_the_arm_could_go_on() -> None:
+def test_the_workspace_limits_before_the_arm() -> None:
     arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.3, 0.1])})
     smaller = ArmGeometry(SCENE.model_copy(update={"arms": arms}), "left")
     where = places(sheet((0.0, 0.0, 0.09)), sheet((0.0, 0.0, 0.11)))
@@ -152,7 +152,7 @@ def test_the_workspace_binds_where_the_arm_could_go_on() -> None:
     assert compute_reach(LEFT, RIGHT, where, FRONT).reachable.all()
 
 
-def test_a_place_too_fast_to_follow_is_reached_all_the_same() -> None:
+def test_a_pose_too_fast_to_follow_is_still_reached() -> None:
     fast = np.array([[[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]])
     where = places(sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.0, 0.0)), twists=fast)
     reach = compute_reach(LEFT, RIGHT, where, FRONT)
@@ -163,13 +163,14 @@ def test_a_place_too_fast_to_follow_is_reached_all_the_same() -> None:
     assert reach.margins["tool speed"] == pytest.approx([1.0 - 0.3 / most, 1.0 - 0.2 / most])
 
 
-def test_no_places_are_all_reached() -> None:
+def test_an_empty_list_of_poses_is_reached() -> None:
     none = SheetPoses(np.empty((0, 4, 4)), np.empty(0), np.empty((0, 2, 6)))
     assert compute_reach(LEFT, RIGHT, none, FRONT).reachable.all()
 
 
 def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
-    """Both edges agree with the sheet along the path; no joint jumps or is too fast."""
+    """Assert that both edges agree with the sheet along the path, without fast or discontinuous
+    joints."""
     assert path.places.world_from_sheet[0] == pytest.approx(start.world_from_sheet)
     assert path.places.world_from_sheet[-1] == pytest.approx(goal.world_from_sheet)
     assert path.places.stretch_ratio[-1] == pytest.approx(goal.stretch_ratio)
@@ -197,7 +198,7 @@ def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(near, near, st.floats(-1.0, 1.0)), st.tuples(near, near, st.floats(-1.0, 1.0)))
-def test_a_way_between_two_places_keeps_the_edges_together(
+def test_a_path_between_two_poses_keeps_the_edges_together(
     here: tuple[float, ...], there: tuple[float, ...]
 ) -> None:
     start = sheet((0.0, here[0], here[1]), (here[2], 0.0, 0.0), 1.02)
@@ -205,14 +206,14 @@ def test_a_way_between_two_places_keeps_the_edges_together(
     assert_sound(plan_path(LEFT, RIGHT, start, goal), start, goal)
 
 
-def test_a_way_to_where_one_is_takes_no_time() -> None:
+def test_a_path_to_the_present_pose_takes_no_time() -> None:
     start = sheet((0.0, 0.0, 0.0))
     path = plan_path(LEFT, RIGHT, start, start)
     assert_sound(path, start, start)
     assert path.times_s[-1] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_way_begins_with_the_joints_given() -> None:
+def test_a_path_starts_with_the_given_joints() -> None:
     start, goal = sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.03, 0.05), (0.4, 0.0, 0.0))
     joints = find_best_reach(LEFT, RIGHT, places(start)).joints_rad[0]
     path = plan_path(LEFT, RIGHT, start, goal, left_rad=joints)
@@ -220,7 +221,7 @@ def test_a_way_begins_with_the_joints_given() -> None:
     assert path.via_m is None
 
 
-def test_where_the_straight_way_is_barred_it_goes_round() -> None:
+def test_a_blocked_straight_path_is_avoided() -> None:
     random = np.random.default_rng(0)
     for _ in range(101):  # the hundredth of these pairs has only a way round
         start, goal = (
@@ -247,14 +248,14 @@ def test_where_the_straight_way_is_barred_it_goes_round() -> None:
         (sheet((0.0, 0.0, 0.0), stretch=1.09), "left", "edge force"),
     ],
 )
-def test_a_way_that_no_arm_can_go_says_why(goal: SheetMotion, side: str, limit: str) -> None:
+def test_an_impossible_path_has_a_reason(goal: SheetMotion, side: str, limit: str) -> None:
     with pytest.raises(PathError, match=f"{side} arm") as caught:
         plan_path(LEFT, RIGHT, sheet((0.0, 0.0, 0.0)), goal)
     assert (caught.value.side, caught.value.limit) == (side, limit)
     assert 0.0 < caught.value.fraction <= 1.0
 
 
-def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_no() -> None:
+def test_an_arm_moved_through_the_wrists_singularity_continues_and_the_check_fails() -> None:
     # The bridge follows with a bounded error; a layout must keep clear of it all the same.
     present = find_best_reach(LEFT, RIGHT, places(turned_about_the_left_edge(0.0))).joints_rad[0]
     signs = []
@@ -269,7 +270,7 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
 
 
 def barred_scene() -> Scene:
-    """Return a scene whose left base is so far off that much is out of its reach."""
+    """Return a scene whose left base is so far away that many poses are not reachable."""
     return move_base(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
 
 
@@ -325,7 +326,7 @@ def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> N
     assert reach.reachable.all()
 
 
-def test_the_first_place_that_binds_is_the_nearest_to_the_front(barred: Layout) -> None:
+def test_the_first_limiting_pose_is_the_nearest_to_the_front(barred: Layout) -> None:
     samples, binding = barred.samples, barred.left.binding
     for one in make_layout_result(barred)["arms"]["left"]["binding"]:
         same = binding == LIMITS.index(one["limit"])
@@ -367,7 +368,7 @@ def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> 
     assert found.reachable is reachable
 
 
-def test_the_picture_is_drawn(barred: Layout, tmp_path: Path) -> None:
+def test_the_image_is_drawn(barred: Layout, tmp_path: Path) -> None:
     draw_layout(barred, tmp_path / "layout.png")
     assert (tmp_path / "layout.png").stat().st_size > 10_000
 
@@ -381,7 +382,7 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *ar
     return int(end.value.code or 0), out, err
 
 
-def test_the_command_says_reachable_by_its_exit_code(
+def test_the_commands_exit_code_is_the_reachability(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     picture = tmp_path / "layout.png"

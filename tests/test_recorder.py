@@ -1,4 +1,4 @@
-"""The recorder writes what came, counts what it cannot write, and loses little in a crash."""
+"""Test the recorder: complete bags, counted losses, and little loss in a crash."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ async def test_it_writes_what_came_with_times_and_attachments(tmp_path: Path) ->
     assert node.inputs["in/estop"].counts.messages == 2
 
 
-def test_which_topics_it_wants() -> None:
+def test_which_topics_it_subscribes_to() -> None:
     written = [TOPICS[name] for name in ("scene", "stereo", "fingertip")]
 
     def wants(**parameters: Any) -> list[str]:
@@ -122,7 +122,7 @@ async def test_a_bag_is_named_after_its_start(tmp_path: Path) -> None:
     assert name.removeprefix("run-").removesuffix(".mcap").isdigit()
 
 
-async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+async def test_a_path_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     node = recorder(VirtualClock(), bag=tmp_path / "file" / "a.mcap")
     with pytest.raises(BagError, match="file: cannot be created"):
@@ -134,7 +134,7 @@ async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -
     await node.close()
 
 
-async def test_a_disk_that_refuses_is_said_and_what_is_lost_is_counted(
+async def test_a_failing_disk_is_reported_and_losses_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = VirtualClock()
@@ -172,7 +172,7 @@ async def test_a_disk_that_refuses_is_said_and_what_is_lost_is_counted(
 
 @pytest.fixture
 def small_disk() -> Iterator[Path]:
-    """A disk of 48 MiB of its own."""
+    """Create a separate disk of 48 MiB."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     mounted = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(folder)],
@@ -188,10 +188,10 @@ def small_disk() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("keep_free_bytes", [8 << 20, 0])
-async def test_on_a_full_disk_the_bag_ends_readable_and_another_goes_on(
+async def test_on_a_full_disk_the_bag_ends_readable_and_another_follows(
     small_disk: Path, keep_free_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Looked at in time it ends with its index; filled up from one moment to the next, without."""
+    """Ended in time, the bag has an index; on a disk that is full suddenly, it has none."""
     # Chunks are cut by their size alone, however long the test takes.
     monkeypatch.setattr(bag, "FLUSH_PERIOD_S", DEADLINE_S)
     clock = VirtualClock()
@@ -244,7 +244,7 @@ def read_headers(reader: BagReader) -> Iterator[tuple[str, list[Any], Header]]:
 
 
 async def recorded(bag: Path, since_ns: float) -> int:
-    """Wait until a bag that grows has a finger of that time or later; return its sequence."""
+    """Wait until a growing bag has a finger of that time or later; return its sequence."""
     async with asyncio.timeout(DEADLINE_S):
         while True:
             with suppress(FileNotFoundError, BagError):
@@ -255,7 +255,7 @@ async def recorded(bag: Path, since_ns: float) -> int:
 
 
 async def test_killed_it_loses_at_most_what_came_since_the_last_flush(tmp_path: Path) -> None:
-    """Which is at most a second ago; what a reader found before is there afterwards."""
+    """This is at most one second; what a reader found before is still there."""
     assert FLUSH_PERIOD_S <= 1.0
     nodes = {
         "beacon": {"type": "tests.launch_nodes:Beacon", "parameters": {"rate_hz": 100}},

@@ -1,4 +1,5 @@
-"""Old names of public keys and fields: bags that have them are read, files get a clear error."""
+"""Test old names of public keys and fields: bags are read, files give an error with the new
+name."""
 
 from __future__ import annotations
 
@@ -167,11 +168,11 @@ def test_the_old_bag_is_read_with_todays_names() -> None:
 
 
 class Moment(Bookmark):
-    """Hold a bookmark as bags recorded it, under its old name."""
+    """Bookmark as bags recorded it, under its old name."""
 
 
 def with_old_names(message_type: type[Message], names: dict[str, str]) -> type[Message]:
-    """Make the type as it was recorded.  names: old names of fields by those of today."""
+    """Make the type as it was recorded; names: old names of fields by new ones."""
     hints = get_type_hints(message_type, include_extras=True)
     fields: dict[str, Any] = {
         names.get(name, name): (hints[name], field)
@@ -231,7 +232,7 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
         find_topic(old)
 
 
-def test_a_removed_method_in_a_scene_gets_an_error_that_says_to_remove_it(tmp_path: Path) -> None:
+def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path) -> None:
     content = YAML(typ="safe").load(SCENE_FILE.read_text())
     content["methods"] = {"kinematics": "closed_form_continuous"}
     file = tmp_path / "scene.yaml"

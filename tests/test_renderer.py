@@ -1,4 +1,4 @@
-"""The renderer: shader against numpy, pictures, packing, and the node's timing and holding."""
+"""Test the renderer: shader against numpy, images, packing, and the node's timing."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: SceneRe
             assert close[same].mean() > 0.999
 
 
-def test_uncorrected_silhouette_lies_where_the_projector_model_says(
+def test_uncorrected_silhouette_agrees_with_the_projector_model(
     scene: Scene, stage: SceneRenderer
 ) -> None:
     stage.deform(None)
@@ -111,7 +111,7 @@ def test_uncorrected_silhouette_lies_where_the_projector_model_says(
 def test_nearest_surface_hides_what_is_behind(
     context: moderngl.Context, stage: SceneRenderer
 ) -> None:
-    """Two crossing squares: depth decides, whatever the order of the triangles."""
+    """The squares cross: depth decides, independent of the order of the triangles."""
     canvas = Canvas(context, 80, 60)
     square = np.array([[-0.05, -0.05, 0.0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
     far = square + np.array([0.0, 0.0, -0.05])
@@ -157,8 +157,8 @@ def test_marks_are_drawn_on_the_object(stage: SceneRenderer) -> None:
     assert (ring[..., 2] > ring[..., 0].astype(int) + 80).any()
 
 
-def test_second_eye_sees_the_front_shifted_the_other_way(stage: SceneRenderer) -> None:
-    """The object lies behind the screen: the right eye sees it further right (mirrored: left)."""
+def test_second_eye_sees_the_front_shifted_the_other_direction(stage: SceneRenderer) -> None:
+    """The object is behind the screen: the right eye sees it further right (mirrored: left)."""
     stage.deform(None)
     shown = Display(correction="none", stereo="side_by_side", shading="flat")
     picture = stage.draw(shown, stage.sheet_at_rest(), DrawStyle(True, "object"), read=True)
@@ -240,7 +240,7 @@ def test_surface_follows_a_linear_displacement_of_a_coarse_skin() -> None:
 
 
 def test_a_skin_finer_in_front_is_followed_by_its_nearest_triangles() -> None:
-    """Beside many small triangles a large one is the nearest, though its middle is far."""
+    """Beside many small triangles a large one is the nearest, although its centre is far."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     small = np.concatenate([[-0.02, -0.01, 0.0] + 0.02 * (corners - [k, 0, 0]) for k in range(40)])
     vertices = np.concatenate([corners, small])
@@ -299,7 +299,7 @@ def test_finger_pushes_only_below_and_over_the_sheet(
 
 
 class Bench(NodeHarness[Renderer, VirtualClock]):
-    """A renderer and the paper's scene."""
+    """Renderer with the paper's scene."""
 
     def __init__(self, **parameters: object) -> None:
         given = RendererParameters(spacing_m=0.006, **parameters)
@@ -383,10 +383,10 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
     assert len(bench.sent) == 2
 
 
-async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
+async def test_a_frame_contains_the_unlit_fraction_of_the_sheet(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Make the frame of a folded sheet (tests/test_renderer_failures.py)."""
+    """The frame is that of a folded sheet (tests/test_renderer_failures.py)."""
     monkeypatch.setattr(
         "flexsheet.nodes.renderer.scene_renderer.occluded_fraction",
         lambda mesh, eye, projector: 0.25,
@@ -406,7 +406,7 @@ async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench:
     assert 29 <= len(bench.sent) <= 31
 
 
-async def test_timer_keeps_the_picture_alive_only_when_idle(bench: Bench) -> None:
+async def test_timer_keeps_the_image_alive_only_when_idle(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     await bench.finger(0.0, 0.0, 0.1)
     bench.forward(34)
@@ -418,7 +418,7 @@ async def test_timer_keeps_the_picture_alive_only_when_idle(bench: Bench) -> Non
 
 
 async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
-    """And the next one at once when a finger comes, or the sheet goes."""
+    """The next one follows immediately when a finger comes or the sheet moves."""
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))
     _, body = skin_and_body(0.0)
@@ -445,7 +445,7 @@ async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
     assert len(bench.sent) == begun + 3
 
 
-async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:
+async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
     await bench.arms(pose)
@@ -546,7 +546,8 @@ async def test_a_new_scene_is_drawn_and_a_bad_one_is_reported(bench: Bench) -> N
 
 
 async def test_a_silent_solver_leaves_the_object_as_it_was(bench: Bench) -> None:
-    """The dent does not flicker when the solver is late; the fingertip draws meanwhile."""
+    """The indentation does not flicker when the solver is late; the fingertip is drawn
+    meanwhile."""
     skin, body = skin_and_body(0.01)
     await bench.step("scene", bench.scene)
     await bench.step("skin", skin)

@@ -1,4 +1,4 @@
-"""The correction family: errors at the eye as each method's range says, and what is compared."""
+"""Test the correction family: errors at the eye within the stated range of each method."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_plane_is_corrected_by_all_but_none(points: list[Point]) -> None:
         assert error(points, method, -50, 0) < 0.2
 
 
-def test_only_two_passes_onto_the_dents_shape_hold_a_dent(points: list[Point]) -> None:
+def test_only_two_passes_onto_the_deformed_shape_are_correct_for_it(points: list[Point]) -> None:
     uncorrected = error(points, "none", 0, 25)
     assert error(points, "one_plane", 0, 25) == pytest.approx(uncorrected, abs=0.02)
     for method in ("four_triangles", "two_pass_triangles"):
@@ -59,7 +59,7 @@ def test_the_floor_corrects_nothing_and_is_no_choice(points: list[Point]) -> Non
     assert not is_in_range("floor", tilt_deg=0, push_mm=0)
 
 
-def test_a_projector_of_other_pixels_lights_the_same_place() -> None:
+def test_a_projector_of_other_pixels_lights_the_same_point() -> None:
     large = scale_projector(SCENE, 1280, 720)
     middle = projector_homography(large) @ [0.0, 0.0, 1.0]
     assert middle[:2] / middle[2] == pytest.approx([639.5, 359.5])

@@ -1,4 +1,5 @@
-"""Where drawing fails: behind the eye, before the sheet, without an area, folded, nowhere."""
+"""Test the limits of drawing: behind the eye, in front of the sheet, degenerate, folded,
+infinite."""
 
 from __future__ import annotations
 
@@ -69,8 +70,8 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
     half.release()
 
 
-def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> None:
-    """A sheet 25 mm behind the object's front is no obstacle to the equations or two passes."""
+def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRenderer) -> None:
+    """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
     rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
@@ -87,9 +88,9 @@ def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> 
 
 
 def folded(overhang_m: float) -> SheetMesh:
-    """A sheet that goes on above, then back below itself by an overhang, then on, in the y axis.
+    """Return a sheet with a fold along y that overlaps itself by an overhang.
 
-    Seen from far off along z its middle strip is turned over.
+    Seen along z, its middle strip is reversed.
     """
     y = np.array([-0.1, 0.02, 0.02 - overhang_m, 0.1])
     z = np.array([0.0, 0.0, -0.02, -0.02])
@@ -98,7 +99,7 @@ def folded(overhang_m: float) -> SheetMesh:
     return SheetMesh(np.array(points), np.array(triangles, np.int32).reshape(-1, 3))
 
 
-def test_what_folds_take_is_measured() -> None:
+def test_light_lost_at_folds_is_measured() -> None:
     far_eye, far_light = np.array([0.0, 0.0, 1e3]), np.array([0.0, 0.0, -1e3])
     turned = folded(0.04)
     # 40 mm turned over, and 40 in their shadow, of 120 + 40 + 120.
@@ -108,10 +109,10 @@ def test_what_folds_take_is_measured() -> None:
     assert occluded_fraction(pyramid_mesh(sheet_at(SCENE, np.eye(4), tip)), EYE, PROJECTOR) == 0.0
 
 
-def test_a_folded_sheet_is_drawn_and_told(
+def test_a_folded_sheet_is_drawn_and_reported(
     stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The projector lights what is nearest to it; of two places on its ray one has the light."""
+    """The projector lights the nearest point; of two points on its ray one gets the light."""
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
     stage.note = ""
     picture = drawn(stage, "two_pass", stage.sheet_at_rest())
@@ -135,7 +136,7 @@ def test_triangles_without_area_are_nothing(
     assert stage.occluded_fraction < 0.001
 
 
-def test_what_is_nowhere_is_refused(stage: SceneRenderer) -> None:
+def test_non_finite_positions_are_rejected(stage: SceneRenderer) -> None:
     lost = np.full((4, 4), np.nan)
     rest = stage.sheet_at_rest()
     nowhere = SheetPose(lost, rest.corners, None)

@@ -1,5 +1,5 @@
-"""Two eyes: parallax in every mode, where the eyes are, the projector's lens, and the foretelling
-of the light."""
+"""Test two eyes: parallax in every mode, eye positions, the projector's lens, predicted display
+times."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ async def frame_of(bench: Bench, mode: StereoMode, *, swap_eyes: bool = False) -
 
 
 def middle_m(picture: NDArray[np.uint8], *, columns: float = 1.0) -> float:
-    """World x of the middle of what is bright in the middle rows; 2 px/mm, mirrored."""
+    """Return the world x of the centre of the bright part of the middle rows; 2 px/mm, mirrored."""
     rows = picture.shape[0] // 2 + np.arange(-5, 5)
     bright = np.nonzero(picture[rows].astype(int).sum(axis=0) > 5 * 255)[0]
     return -((bright.min() + bright.max() + 1) / 2.0 * columns - 0.5 - 399.5) / 2000.0
 
 
 def eyes_pictures(mode: StereoMode, frames: list[Frame]) -> tuple[float, float]:
-    """World x of the object's front as the left and the right eye's picture has it."""
+    """Return the world x of the object's front in the left and the right eye's image."""
     picture = frames[0].pixels[0]
     height, width = picture.shape[:2]
     if mode == "side_by_side":
@@ -78,10 +78,10 @@ def eyes_pictures(mode: StereoMode, frames: list[Frame]) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("mode", ["side_by_side", "top_bottom", "anaglyph", "frame_sequential"])
-async def test_what_lies_behind_the_screen_has_uncrossed_parallax(
+async def test_a_point_behind_the_screen_has_uncrossed_parallax(
     bench: Bench, mode: StereoMode
 ) -> None:
-    """The right eye sees it to the right of where the left one does, by b d / (d + e)."""
+    """The right eye sees it to the right of the left one's image, by b d / (d + e)."""
     wanted = 0.064 * -FRONT_M / (0.4 - FRONT_M)
     for swap_eyes, sign in ((False, 1.0), (True, -1.0)):
         frames = [await frame_of(bench, mode, swap_eyes=swap_eyes) for _ in range(2)]
@@ -99,7 +99,7 @@ async def test_frame_sequential_names_the_eye_of_each_frame(bench: Bench) -> Non
     assert (await frame_of(bench, "mono")).eye == "both"
 
 
-async def test_the_picture_follows_a_tracked_eye_and_goes_back_when_it_is_stale(
+async def test_the_image_follows_a_tracked_eye_and_goes_back_when_it_is_stale(
     bench: Bench,
 ) -> None:
     assert np.isclose(middle_m((await frame_of(bench, "mono")).pixels[0][..., 0]), 0, atol=3e-4)
@@ -162,7 +162,7 @@ def context() -> moderngl.Context:
 
 
 @pytest.mark.parametrize("correction", ["none", "one_plane", "two_pass"])
-def test_the_lens_bends_the_picture_as_opencv_says(
+def test_the_lens_distorts_the_image_like_opencv(
     context: moderngl.Context, correction: Correction
 ) -> None:
     scene = load_scene()
@@ -193,7 +193,7 @@ def test_the_lens_bends_the_picture_as_opencv_says(
     assert off.mean() < 0.2 * unbent.mean()
 
 
-def test_a_lens_that_folds_the_picture_is_refused() -> None:
+def test_a_lens_that_folds_the_image_is_rejected() -> None:
     assert clip_lens(load_scene().projector.lens, 800, 600) is None
     assert clip_lens(LENS, 800, 600) is not None
     folded = LENS.model_copy(update={"distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)})
@@ -227,10 +227,10 @@ def test_light_is_foretold_from_how_long_drawing_took() -> None:
 
 
 @given(st.floats(0.2e-3, 30e-3), st.floats(0.0, 1.0), st.sampled_from([1 / 60, 1 / 120, 1 / 48]))
-def test_light_is_foretold_to_the_refresh_that_the_picture_makes(
+def test_the_display_time_is_predicted_to_the_refresh(
     draw_s: float, phase: float, period_s: float
 ) -> None:
-    """Against a projector that swaps at multiples of its period after a picture is drawn."""
+    """The simulated projector swaps at multiples of its period after an image is drawn."""
     lead = DisplayLatencyEstimator(
         first_s=0.016, display_latency_s=0.5 * period_s, period_s=period_s
     )
@@ -250,7 +250,7 @@ def answer(at_ms: int, displacement: float, **changes: object) -> tuple[SoftBody
     return body, Header(1, at_ms * MS, at_ms * MS, "here", "fem_solver", 1)
 
 
-def test_the_dent_is_carried_on_to_the_light() -> None:
+def test_the_indentation_is_extrapolated_to_the_display_time() -> None:
     dent = SkinExtrapolator()
     assert dent.extrapolate(1000 * MS, "here") == (None, 0)
     for at_ms in (1000, 1016, 1033):
@@ -268,7 +268,7 @@ def test_the_dent_is_carried_on_to_the_light() -> None:
         assert np.allclose(body.displacement_world_m, 1.033e-3, atol=1e-8)
 
 
-def test_a_dent_of_another_method_is_not_carried_on_from() -> None:
+def test_an_indentation_of_another_method_is_not_extrapolated() -> None:
     dent = SkinExtrapolator()
     dent.add(*answer(1000, 0.0))
     dent.add(*answer(1033, 1e-3, method="nonlinear_table"))

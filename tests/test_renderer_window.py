@@ -1,4 +1,4 @@
-"""The window, in a process of its own: a display that goes away takes its clients along."""
+"""Test the window in a separate process, since a display that ends also ends its clients."""
 
 from __future__ import annotations
 

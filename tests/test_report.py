@@ -1,4 +1,4 @@
-"""`bag report`: what it says of a session is so, whatever the session lacks."""
+"""Test `bag report`: correct contents, also for incomplete sessions."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def page(bag: Path) -> str:
 
 
 @given(st.lists(st.floats(2e-5, 50.0), min_size=1, max_size=200), st.floats(0.01, 1.0))
-def test_a_spread_knows_quantiles_to_a_cell(durations: list[float], fraction: float) -> None:
+def test_a_histogram_has_quantiles_to_a_cell(durations: list[float], fraction: float) -> None:
     spread = Spread(Grid(0, 1.0, 2))
     for duration in durations:
         spread.add(1, duration)
@@ -244,7 +244,7 @@ def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
     assert numbers["events"]["counts"] == {}
 
 
-def test_what_was_wrong_is_said_and_the_worst_first(numbers: dict[str, Any]) -> None:
+def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None:
     found = find_problems(numbers)
     said = " ".join(one.text for one in found)
     for part in (
@@ -272,7 +272,7 @@ def test_the_numbers_are_json(numbers: dict[str, Any]) -> None:
 
 
 class Reader(HTMLParser):
-    """What of a page can be checked: tags, headings, pictures, what is fetched."""
+    """Parser of the tested parts of a page: tags, headings, images, loaded resources."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -305,7 +305,7 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_stands_alone_and_can_be_read_without_eyes(page: str) -> None:
+def test_the_page_is_self_contained_and_accessible(page: str) -> None:
     reader = Reader()
     reader.feed(page)
     assert reader.open == []
@@ -321,12 +321,12 @@ def test_the_page_stands_alone_and_can_be_read_without_eyes(page: str) -> None:
     assert set(reader.links) <= set(reader.ids)
 
 
-def test_words_from_the_bag_are_words(page: str) -> None:
+def test_texts_from_the_bag_are_escaped(page: str) -> None:
     assert "<b>first touch</b>" not in page
     assert "&lt;b&gt;first touch&lt;/b&gt;" in page
 
 
-def test_pictures_are_the_sessions(page: str) -> None:
+def test_images_are_those_of_the_session(page: str) -> None:
     images = re.findall(r'alt="([^"]*)" src="data:image/jpeg;base64,([^"]*)"', page)
     left = [(text, data) for text, data in images if "left camera" in text]
     levels = []
@@ -341,7 +341,7 @@ def test_pictures_are_the_sessions(page: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", COLOURS)
-def test_text_stands_out_as_much_as_wcag_aa_asks(scheme: str) -> None:
+def test_text_has_the_contrast_of_wcag_aa(scheme: str) -> None:
     colours = COLOURS[scheme]
     for ground in ("ground", "panel"):
         for ink in ("text", "quiet", "link", "bad", "doubtful", "good"):
@@ -442,7 +442,7 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
 
 
 def test_a_single_value_is_a_point_of_the_chart() -> None:
-    """A bag with one frame had a latency chart without anything in it."""
+    """A bag with one frame had an empty latency chart."""
     nan = np.nan
     axes: Any = Figure().subplots()
     seconds = np.arange(6.0)

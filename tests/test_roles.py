@@ -1,4 +1,4 @@
-"""Roles of nodes: decided by what a class declares or publishes, never by the name of its type."""
+"""Test the roles of nodes, which depend on class declarations and ports, not on type names."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from flexsheet.nodes.recorder.node import Recorder
 
 
 class OwnBridge(Node):
-    """A laboratory's own bridge: another class, with other parameters."""
+    """Bridge of another class, with other parameters."""
 
     parameters: NodeParameters
     arm: Output[ArmState]
 
 
 class OwnRecorder(Recorder):
-    """A laboratory's recorder."""
+    """Recorder of another class."""
 
 
 def plan_with(folder: Path, bridge: dict[str, object], **more: object) -> ResolvedGraph:

@@ -1,4 +1,4 @@
-"""Rolling without slip or spin, judged by geometry that is known in closed form."""
+"""Test rolling without slip or spin on geometries with closed-form results."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def test_axes_are_turned_by_the_least_rotation(
 
 
 @pytest.mark.parametrize("steps", [12, 600])
-def test_arc_and_way_on_the_sheet_are_equal_on_a_cylinder(steps: int) -> None:
-    """Within 0.01 mm after 60 degrees, whether the finger is seen 600 times on the way or 12."""
+def test_arc_and_path_on_the_sheet_are_equal_on_a_cylinder(steps: int) -> None:
+    """The error is at most 0.01 mm after 60 degrees, with 600 samples or 12."""
     radius = 0.0353553
     shape = CylinderShape(radius, 0.12)
     angles = np.radians(60.0) * np.arange(1, steps + 1) / steps
@@ -92,7 +92,7 @@ def test_arc_and_way_on_the_sheet_are_equal_on_a_cylinder(steps: int) -> None:
     assert back.position_sheet_m == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-def test_the_way_is_a_straight_line_on_the_unrolled_cylinder() -> None:
+def test_the_path_is_a_straight_line_on_the_unrolled_cylinder() -> None:
     """A helix is a straight line on the sheet: 30 mm along, 40 degrees around."""
     radius = 0.04
     shape = CylinderShape(radius, 0.2)
@@ -236,7 +236,7 @@ class Bowl(Convex):
         return 0.002 * radius_m / 0.03
 
 
-def test_over_a_hollow_the_sheet_stands_off_by_the_rim_and_depth_counts_from_there() -> None:
+def test_over_a_concavity_the_sheet_is_offset_by_the_rim() -> None:
     bottom = np.array([0.0, 0.0, -0.06])
     contact = SheetContact(bottom, FRONT, -np.diag([1.0, 1.0, 0.0]) / 0.06, np.eye(3), np.zeros(2))
     lift = compute_rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for its rise only

@@ -110,7 +110,7 @@ def test_the_drawn_surface_is_the_objects_own(case: Case) -> None:
     assert np.abs(np.ptp(points, axis=0) - np.ptp(true.vertices, axis=0)).max() < 2e-4
 
 
-def test_a_dent_is_followed_with_no_triangle_turned_over(case: Case) -> None:
+def test_an_indentation_is_followed_without_inverted_triangles(case: Case) -> None:
     surface, body = case.stage._surface, case.body(case.dent(0.02, (0.005, -0.004)))
     follower = DeformationTransfer(
         surface, case.skin.vertices_world_m.astype(float), case.skin.triangles
@@ -130,7 +130,7 @@ def test_a_dent_is_followed_with_no_triangle_turned_over(case: Case) -> None:
     assert np.degrees(np.arccos(np.quantile(cosines, 0.1))) < 6.0
 
 
-def test_the_twins_body_follows_the_same_dent(case: Case) -> None:
+def test_the_simulated_body_follows_the_same_indentation(case: Case) -> None:
     """Drawn and true object, meshed and moved by different code, have the same dented front."""
     true, displacement = TrueBody(case.scene), case.dent(0.02)
     vertices, triangles = case.skin.vertices_world_m.astype(float), case.skin.triangles
@@ -248,7 +248,7 @@ async def test_the_eye_sees_what_it_ought_to(chain: Chain) -> None:
 
 
 @pytest.mark.parametrize("case", [path for path in SCENES if path.stem == "organ"], indirect=True)
-async def test_a_dented_object_is_seen_as_dented(chain: Chain, case: Case) -> None:
+async def test_a_deformed_object_is_seen_as_deformed(chain: Chain, case: Case) -> None:
     rest = await chain.picture("soft")
     body = case.body(case.dent(0.02) + SHIFT_M)
     moved = await chain.picture("soft", ("skin", case.skin), ("soft_body", body))

@@ -59,7 +59,7 @@ def test_the_arms_reach_the_whole_working_range(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_front_touches_the_imaginary_screen_and_places_are_straightest_ways(name: str) -> None:
+def test_the_front_touches_the_imaginary_screen_and_points_are_on_geodesics(name: str) -> None:
     here = scene(name)
     front = map_to_surface(here, np.zeros((1, 3)))[0]
     assert front == pytest.approx(np.zeros(3), abs=1.5e-3)
@@ -78,7 +78,7 @@ def test_the_front_touches_the_imaginary_screen_and_places_are_straightest_ways(
     assert leans.max() < here.working_range.tilt_rad + 0.02
 
 
-def test_on_a_cylinder_and_a_sphere_places_are_known_in_closed_form() -> None:
+def test_on_a_cylinder_and_a_sphere_points_have_a_closed_form() -> None:
     rng = np.random.default_rng(0)
     places = rng.uniform([-0.025, -0.025, -0.005], [0.025, 0.025, 0.03], (200, 3))
     along, arc, height = places.T
@@ -129,7 +129,7 @@ def test_every_gesture_can_be_made_on_every_scene(name: str) -> None:
             assert -0.0065 < heights.min() < -0.0009
 
 
-def test_the_papers_stroke_is_refused_where_there_is_no_cylinder() -> None:
+def test_the_papers_stroke_is_rejected_where_there_is_no_cylinder() -> None:
     with pytest.raises(ExperimentError, match=r'scene "sphere": object\.geometry\.shape'):
         gesture_path("stroke-10", scene("sphere"))
 

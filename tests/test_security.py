@@ -1,4 +1,4 @@
-"""Nobody is heard who should not be: strangers, forgers, replays, garbage."""
+"""Test that unauthorised peers are rejected: unknown keys, forgeries, replays, invalid data."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def free_port() -> int:
 
 @dataclass
 class Ear:
-    """A subscriber's record."""
+    """Record of a subscriber."""
 
     heard: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Ear:
 
 
 class Street:
-    """Main publishes at a tcp endpoint of its own; anybody may try to listen or to be it."""
+    """Publisher of main at a tcp endpoint; other processes try to subscribe or to replace it."""
 
     def __init__(self, known: Hosts) -> None:
         self.known = known
@@ -94,7 +94,7 @@ class Street:
         return ear
 
     async def speak(self, publisher: Publisher, until_: Callable[[], object]) -> None:
-        """Publish numbered e-stops until something has come true."""
+        """Publish numbered e-stops until a condition holds."""
         while not until_():
             self.sent += 1
             header = replace(HEADER, sequence=self.sent)
@@ -111,7 +111,7 @@ async def street() -> AsyncIterator[Street]:
             close()
 
 
-async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> None:
+async def test_an_unknown_key_receives_nothing_and_is_reported(street: Street) -> None:
     mouth = street.mouth()
     friend, stranger = street.ear(street.rings["left"]), street.ear(street.rings["stranger"])
     without = street.ear(None)
@@ -123,8 +123,8 @@ async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> Non
 
 
 @pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
-async def test_only_the_host_of_the_plan_is_heard(street: Street, impostor: str) -> None:
-    """Another host, even one of the plan, sits at main's endpoint: it lacks main's key."""
+async def test_only_the_host_of_the_plan_is_accepted(street: Street, impostor: str) -> None:
+    """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
     if impostor == "without":
         mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{street.port}"])
         street.closers.append(mouth.close)
@@ -200,7 +200,7 @@ async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(stre
 
 
 class Meddler(Cut):
-    """On the wire between two hosts: keeps what passes, and can change, repeat or replay it."""
+    """Proxy between two hosts that stores data, and can change, repeat or replay them."""
 
     def __init__(self, target_port: int) -> None:
         super().__init__(target_port)
@@ -223,7 +223,7 @@ class Meddler(Cut):
         writer.transport.abort()
 
 
-async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
+async def test_changed_repeated_or_replayed_data_are_rejected(
     street: Street, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
@@ -258,8 +258,8 @@ async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
 
 
 async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
-    """All bytes that a subscriber sent open no connection again: the session's keys were made
-    for it, by both ends."""
+    """All bytes that a subscriber sent open no connection again: both ends create the session's
+    keys."""
     mouth = street.mouth()
     sent: list[bytes] = []
 
@@ -295,10 +295,10 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
     assert len(answer) < 300
 
 
-async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
+async def test_messages_of_250_mib_are_counted_and_others_continue(
     street: Street,
 ) -> None:
-    """Each topic has its own limit; what is longer is refused, and its memory is given back."""
+    """Each topic has its limit; longer messages are rejected, and their memory is freed."""
     foreign = ForeignPublisher(f"tcp://127.0.0.1:{street.port}")
     street.closers.append(foreign.close)
     ear = Ear()
@@ -329,7 +329,7 @@ async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
     assert process.memory_info().rss - before < 300 << 20
 
 
-async def test_nothing_speaks_beyond_loopback_without_keys() -> None:
+async def test_nothing_is_sent_beyond_loopback_without_keys() -> None:
     for address in ("192.0.2.1", "0.0.0.0", "*", "[::]", "eth0", "example.org"):
         with pytest.raises(BusError, match="beyond loopback and there are no keys"):
             Publisher(FINGER, [f"tcp://{address}:7777"])
@@ -368,7 +368,7 @@ def plain(frames: list[Any]) -> list[bytes]:
 
 
 def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, list[bytes]]]:
-    """For ever: what must not be taken by one who has heard HEADER's message; no two alike."""
+    """Yield different messages endlessly that a receiver of HEADER's message must reject."""
     other: Message = stop("x") if not isinstance(message, EStop) else finger(1.0)
     good = plain(encode(message, HEADER))
     head = msgpack.unpackb(good[0], strict_map_key=False)
@@ -411,7 +411,7 @@ def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, li
 
 
 @pytest.mark.parametrize("topic", ["estop", "sheet_target", "stereo"])
-def test_of_a_hundred_thousand_forgeries_none_is_taken(topic: str) -> None:
+def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
     message = {"estop": stop("good"), "sheet_target": target(), "stereo": pictures(3)}[topic]
     ear = Ear()
     subscriber = Subscriber(

@@ -1,4 +1,4 @@
-"""Key pairs: their files, the command, the launch file, and graphs that run with them."""
+"""Test key pairs: their files, the command, the launch file, and graphs with keys."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ nodes:
 
 @pytest.fixture(autouse=True)
 def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A directory of runs of the test's own, with a short path."""
+    """Create a directory of runs for the test, with a short path."""
     with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as folder:
         monkeypatch.setenv(runs.ROOT_VARIABLE, folder)
         yield
@@ -95,7 +95,7 @@ def test_a_secret_that_others_may_read_is_not_used(keys: Path, mode: int) -> Non
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
-def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
+def test_a_secret_of_another_user_is_not_used(keys: Path) -> None:
     make(keys, "main")
     os.chown(keys / "main.secret", 12345, -1)
     with pytest.raises(SecurityError, match="belongs to another user"):
@@ -103,7 +103,7 @@ def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "x" * 39, "x" * 41, "é" * 40, "~" * 40, "x" * 5000])
-def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
+def test_an_invalid_key_is_reported(keys: Path, text: str) -> None:
     make(keys, "main")
     (keys / "main.secret").write_text(text)
     with pytest.raises(SecurityError, match="does not contain a key"):
@@ -113,7 +113,7 @@ def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
 
 @pytest.mark.parametrize("first", ".-:+=^!/*?&<>()[]{}@%0")
 def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
-    """Some of its characters mean something in YAML, each at another place."""
+    """Some characters of keys have a meaning in YAML, depending on the position."""
     file = tmp_path / "graph.yaml"
     file.write_text(
         'nodes: {beacon: {type: "tests.launch_nodes:Beacon"}}\n'
@@ -239,7 +239,7 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
 
 
 async def heard(plan: ResolvedGraph, graph: RunningGraph) -> None:
-    """Until a tool on main has heard the beacon on left."""
+    """Wait until a tool on main has received the beacon on left."""
     fingers: list[TwinFinger] = []
     said: list[str] = []
     subscriber = make_subscriber(

@@ -1,4 +1,4 @@
-"""What each key allows: from a launch file through plan and runner to a node that hears or not."""
+"""Test the permissions of each key, from the launch file to the node."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BRIDGE = "arm_right_bridge"
 
 
 class Hand(Node):
-    """A console of its own kind, on an arm's computer."""
+    """Console of another class, on an arm's computer."""
 
     parameters: NodeParameters
     estop: Output[EStop]
@@ -80,7 +80,7 @@ def test_the_plans_that_come_with_it_believe_each_host_its_own_writers_only(name
 
 
 def lab(folder: Path, **left: Any) -> ResolvedGraph:
-    """launch/three.yaml on loopback with keys, and a hand on the left arm's computer."""
+    """Load launch/three.yaml on loopback with keys, and a console on the left arm's computer."""
     spec = YAML(typ="safe").load(LAUNCH / "three.yaml")
     spec["scene"] = str(LAUNCH / spec["scene"])
     calibration = LAUNCH / "calibrations" / "twin-bumblebee.yaml"
@@ -98,7 +98,7 @@ def lab(folder: Path, **left: Any) -> ResolvedGraph:
 
 
 class Street:
-    """The right arm's bridge as its runner connects it, and whoever speaks to it."""
+    """The right arm's bridge with its runner's connections, and its peers."""
 
     def __init__(self, plan: ResolvedGraph) -> None:
         self.plan, run = plan, runs.create_run()
@@ -125,7 +125,8 @@ class Street:
 
     @contextmanager
     def mouth(self, topic: str, *, at: tuple[str, str], key: str) -> Iterator[Publisher]:
-        """Speaks on `topic` where the plan has (topic, writer) `at`, with the key of a host."""
+        """Open a publisher of `topic` at the endpoint `at` (topic, writer), with the key of a
+        host."""
         writer = self.plan.writer(*at)
         assert writer is not None
         assert writer.tcp is not None
@@ -138,7 +139,7 @@ class Street:
     async def say(
         self, mouth: Publisher, writer: str, message: Message, enough: Callable[[], object]
     ) -> None:
-        """Again and again, until it is enough."""
+        """Publish repeatedly until a condition holds."""
 
         def said() -> bool:
             self.sequence += 1
@@ -154,7 +155,7 @@ class Street:
         await self.say(mouth, writer, message, lambda: (writer, repr(message)) in self.heard)
 
     async def is_refused(self, mouth: Publisher, writer: str, message: Message, port: str) -> None:
-        """And counted."""
+        """Assert that a message is rejected and counted."""
         first = self.rejected(port)
         self.heard.clear()
         await self.say(mouth, writer, message, lambda: self.rejected(port) >= first + 10)
@@ -176,7 +177,7 @@ def street_of(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 async def test_an_arm_s_computer_cannot_command_the_other_arm(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Left is taken over: all it has is its key, its place, and any address it can sit at."""
+    """The compromised left host has its key, its address, and any free address."""
     mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
     left, forged = arm_state("left"), target()
     with street_of(lab(folder), monkeypatch) as street:
@@ -199,7 +200,7 @@ async def test_an_arm_s_computer_cannot_command_the_other_arm(
 async def test_who_may_reset_a_stop_and_let_the_arms_move(
     folder: Path, monkeypatch: pytest.MonkeyPatch, may: bool | None
 ) -> None:
-    """A hand on left: it stops whenever it likes; for the rest the launch file must let it."""
+    """The console on left can always stop; other permissions depend on the launch file."""
     with street_of(lab(folder, may_reset_estop=may), monkeypatch) as street:
         words: tuple[tuple[str, Message, Message], ...] = (
             ("estop", EStop(engaged=True, reason="a hand"), EStop(engaged=False, reason="gone")),
@@ -220,7 +221,7 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
 
 
 @pytest.mark.parametrize("may", [None, True], ids=["as it comes", "may"])
-def test_a_console_that_may_not_reset_says_who_may(folder: Path, may: bool | None) -> None:
+def test_a_console_that_may_not_reset_names_hosts_that_may(folder: Path, may: bool | None) -> None:
     plan = lab(folder, may_reset_estop=may)
     (folder / "plan.json").write_text(plan.model_dump_json())
     sent: list[Message] = []

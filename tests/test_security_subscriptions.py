@@ -1,4 +1,4 @@
-"""A peer can neither fill a publisher's memory nor keep it from publishing."""
+"""Test that a peer can neither fill a publisher's memory nor prevent its publishing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ ROOT = Path(__file__).resolve().parent.parent
 ATTACK_BYTES = 24_000_000
 ATTACKERS = 4
 MAX_GROWTH_KB = 256_000
-"""What is stored before the guard's thread runs on a busy computer; the attack would take 1 GB."""
+"""Memory that is used before the guard's thread runs on a busy computer; the attack would use 1 GB.
+"""
 
 MAX_CONNECTIONS_OF_ATTACKER = 12
 DEADLINE_S = 60
@@ -105,7 +106,7 @@ def zmtp_frame(flags: int, body: bytes) -> bytes:
 
 
 class AttackedPublisher:
-    """A publisher in a process of its own, whose peak memory is its own."""
+    """Publisher in a separate process, for its peak memory."""
 
     def __init__(self, topic: str, *ring: str) -> None:
         self._process = subprocess.Popen(
@@ -123,7 +124,7 @@ class AttackedPublisher:
 
 @contextmanager
 def subscribed(endpoint: str, street: Street | None = None) -> Iterator[zmq.Socket[bytes]]:
-    """An honest subscriber that has received a message."""
+    """Return a normal subscriber that has received a message."""
     with zmq.Context() as context, context.socket(zmq.SUB) as opened:
         opened.setsockopt(zmq.LINGER, 0)
         opened.setsockopt(zmq.SUBSCRIBE, b"")
@@ -148,7 +149,7 @@ def receive_exactly(opened: socket.socket, count: int) -> bytes:
 
 @contextmanager
 def connected_plainly(endpoint: str) -> Iterator[socket.socket]:
-    """A connection that speaks ZMTP without ZeroMQ, after the handshake."""
+    """Open a connection with a plain ZMTP handshake, without ZeroMQ."""
     address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((address, int(port)), timeout=DEADLINE_S) as opened:
         opened.sendall(GREETING + zmtp_frame(COMMAND, READY))

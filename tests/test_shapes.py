@@ -1,4 +1,4 @@
-"""Shapes with a formula: nearest points and distances hold, and what is undefined is decided."""
+"""Test shapes with a formula: nearest points, distances, and defined results in singular cases."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_curvature_is_how_the_normal_turns(shape: Shape) -> None:
 
 
 @solids
-def test_the_foot_moves_as_its_jacobian_says(shape: Shape) -> None:
+def test_the_foot_moves_by_its_jacobian(shape: Shape) -> None:
     queries = every(6)
     found = shape.closest(queries)
     keep = where_smooth(found) & (found.height_m > 1e-3)
@@ -135,7 +135,7 @@ def test_the_foot_moves_as_its_jacobian_says(shape: Shape) -> None:
 
 
 @solids
-def test_one_goes_on_as_many_do(shape: Shape) -> None:
+def test_single_and_batch_queries_agree(shape: Shape) -> None:
     queries = every(7)
     before = shape.closest(queries + 2e-4).point
     many = shape.closest(queries, previous=before)
@@ -147,7 +147,7 @@ def test_one_goes_on_as_many_do(shape: Shape) -> None:
 
 
 @solids
-def test_a_convex_solid_rises_nowhere_and_its_tightest_curvature_is_known(shape: Shape) -> None:
+def test_a_convex_solid_has_no_concavity_and_a_known_curvature(shape: Shape) -> None:
     found = shape.closest(every(8, 40))
     for point, normal, operator in zip(
         found.point, found.normal, found.shape_operator, strict=True
@@ -211,7 +211,7 @@ def test_the_planes_rim() -> None:
         (SOLIDS["capsule"], (0.01, 0.0, 0.0)),
     ],
 )
-def test_where_several_points_are_as_near_the_front_or_the_earlier_one_is_taken(
+def test_of_equally_near_points_the_front_or_the_earlier_one_is_returned(
     shape: Shape, point: tuple[float, float, float]
 ) -> None:
     query = np.array(point)
@@ -265,7 +265,7 @@ def test_one_is_as_many(shape: Shape) -> None:
 
 
 @solids
-def test_bad_queries_are_refused_and_far_ones_answered(shape: Shape) -> None:
+def test_bad_queries_are_rejected_and_far_ones_answered(shape: Shape) -> None:
     for bad in ([np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [2e6, 0.0, 0.0]):
         with pytest.raises(ValueError, match="NaN, infinity or positions beyond"):
             shape.closest(bad)
@@ -291,7 +291,7 @@ def test_bad_queries_are_refused_and_far_ones_answered(shape: Shape) -> None:
         {"shape": "rounded_box", "size_m": (0.1, 0.1, 0.02), "edge_radius_m": 0.011},
     ],
 )
-def test_measures_that_make_no_solid_are_refused(measures: dict[str, object]) -> None:
+def test_measures_that_make_no_solid_are_rejected(measures: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"length|half the minimum"):
         make_shape(measures)
 

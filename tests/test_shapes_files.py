@@ -1,4 +1,4 @@
-"""Scenes of every shape: meshes are read, repaired or refused; who handles none says so."""
+"""Test scenes of every shape: meshes are read, repaired or rejected."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[s
         ),
     ],
 )
-def test_mistakes_are_told_with_file_key_value_and_remedy(
+def test_errors_name_file_key_value_and_remedy(
     tmp_path: Path, geometry: dict[str, Any], words: str
 ) -> None:
     path = scene_file(tmp_path, geometry)
@@ -136,7 +136,7 @@ def written(folder: Path, mesh: trimesh.Trimesh, name: str = "mesh.obj") -> Path
     return folder / name
 
 
-def test_what_can_be_repaired_is_and_it_is_told(tmp_path: Path) -> None:
+def test_repairs_are_made_and_reported(tmp_path: Path) -> None:
     good = ball()
     faces = np.array(good.faces)
     flipped = faces.copy()
@@ -171,14 +171,14 @@ def test_what_can_be_repaired_is_and_it_is_told(tmp_path: Path) -> None:
     ],
     ids=["hole", "large", "small", "cut", "single"],
 )
-def test_what_is_no_solid_is_refused(
+def test_what_is_no_solid_is_rejected(
     tmp_path: Path, mesh: trimesh.Trimesh, metres_per_unit: float, words: str
 ) -> None:
     with pytest.raises(MeshError, match=words):
         read_mesh(written(tmp_path, mesh), metres_per_unit, None)
 
 
-def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_meshes_are_rejected(tmp_path: Path) -> None:
     for name, content in (("a.obj", b""), ("b.obj", b"v 1 2\nf 9 9"), ("c.stl", b"\x00" * 90)):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(
@@ -194,12 +194,12 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
         read_mesh(tmp_path / "huge.stl", 0.001, None)
 
 
-def test_too_long_a_smoothing_is_refused(tmp_path: Path) -> None:
+def test_too_long_a_smoothing_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"smoothing_m: .*reduce it"):
         read_mesh(written(tmp_path, trimesh.creation.box((40, 40, 40))), 0.001, 0.2)
 
 
-def test_the_real_mesh_is_taken_as_it_is() -> None:
+def test_the_real_mesh_is_used_unchanged() -> None:
     if not LIVER.is_file():
         pytest.skip(f"the real mesh is not there: {LIVER}")
     mesh = read_mesh(LIVER, 0.01, None)
@@ -209,7 +209,7 @@ def test_the_real_mesh_is_taken_as_it_is() -> None:
         read_mesh(LIVER, 1.0, None)
 
 
-def test_who_handles_cylinders_only_says_so(tmp_path: Path) -> None:
+def test_methods_for_cylinders_only_reject_others(tmp_path: Path) -> None:
     with pytest.raises(UnfitGeometryError, match=r'object.geometry.shape: "mesh" .* "cylinder"'):
         require_cylinder(mesh_scene(tmp_path))
 

@@ -1,4 +1,4 @@
-"""Meshes as smooth shapes: errors against known surfaces, no rattle, no jump, bad ones refused."""
+"""Test meshes as smooth shapes: errors against known surfaces, continuity, rejected meshes."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_gradient_and_curvature_by_differences(shape: object) -> None:
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:
-    """Normals (steps, 3) on a straightest way over the surface, and where it is on an edge."""
+    """Return normals (steps, 3) on a geodesic over the surface, and whether they are on an edge."""
     here = shape.closest(start)
     point, normal = here.point, here.normal
     heading = np.cross(normal, [0.36, 0.48, 0.8])
@@ -183,7 +183,7 @@ def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tu
 
 
 def worst_turn(normals: Floats, edges: Floats, step_m: float) -> float:
-    """The largest second derivative of the normal by arc length (1/m^2), edges left out."""
+    """Return the largest second derivative of the normal by arc length (1/m^2), without edges."""
     second = np.linalg.norm(np.diff(normals, 2, axis=0), axis=1) / step_m**2
     off = ~(edges[2:] | edges[1:-1] | edges[:-2])
     return float(second[off].max())
@@ -305,8 +305,8 @@ def test_one_is_as_many() -> None:
 
 
 @pytest.mark.parametrize("make", [lambda: smooth_ellipsoid(AXES, 3), smooth_cube, liver])
-def test_one_goes_on_as_many_do(make: Callable[[], SmoothMeshShape]) -> None:
-    """Also from starts far off, over edges and inside: the same place by the same descent."""
+def test_single_and_batch_queries_agree(make: Callable[[], SmoothMeshShape]) -> None:
+    """Single and batch queries give the same point, also from far off, over edges and inside."""
     shape = make()
     rng = np.random.default_rng(4)
     begun = shape.closest(rng.uniform(-0.05, 0.05, (120, 3)))
@@ -335,7 +335,7 @@ def test_a_mesh_that_is_convex_hardly_rises() -> None:
     assert max(rises) < 2e-5
 
 
-def test_what_is_no_solids_surface_is_refused() -> None:
+def test_what_is_no_solids_surface_is_rejected() -> None:
     vertices, triangles = cube()
     with pytest.raises(MeshError, match="cannot bound a solid"):
         SmoothMeshShape(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), 0.01)
@@ -363,7 +363,7 @@ def test_what_is_no_solids_surface_is_refused() -> None:
         check_mesh(np.zeros((4, 2)), triangles)
 
 
-def test_parts_that_touch_in_one_vertex_are_refused() -> None:
+def test_parts_that_touch_in_one_vertex_are_rejected() -> None:
     vertices, triangles = cube()
     other = vertices + 0.04
     shared = int(np.flatnonzero((vertices == 0.02).all(axis=1))[0])
@@ -375,7 +375,7 @@ def test_parts_that_touch_in_one_vertex_are_refused() -> None:
         check_mesh(np.concatenate([vertices, other]), np.concatenate([triangles, moved]))
 
 
-def test_a_fold_is_refused() -> None:
+def test_a_fold_is_rejected() -> None:
     # A thin blade whose two sides meet at two degrees.
     vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0.05, 0], [0.05, 0.05, 0.0005]])
     triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -1,4 +1,4 @@
-"""The sheet's force rule and its geometry."""
+"""Test the sheet's force rule and geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate sheet`: what it finds again, says of bad rows, and keeps in its file."""
+"""Test `flexsheet calibrate sheet`: estimated values, invalid rows, and its file."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def pushes_of(
     edges: bool = False,
     seed: int = 1,
 ) -> list[MeasuredPush]:
-    """What a gauge would say of a sheet that has this law."""
+    """Simulate a gauge's measurements of a sheet with this force model."""
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:
@@ -107,7 +107,7 @@ def test_errors_are_within_stated_deviations_without_outliers() -> None:
         assert 0.0 < deviation < 0.2 * true
 
 
-def test_mooneys_share_is_found_where_the_sheet_is_stretched_far() -> None:
+def test_mooneys_fraction_is_found_at_large_stretch() -> None:
     law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=900.0,
@@ -139,7 +139,7 @@ def test_edge_forces_reduce_the_uncertainty() -> None:
         ),
     ],
 )
-def test_rows_that_do_not_determine_the_fit_are_refused(
+def test_rows_that_do_not_determine_the_fit_are_rejected(
     rows: list[MeasuredPush], words: str
 ) -> None:
     with pytest.raises(SheetModelFitError, match=words):
@@ -239,7 +239,7 @@ def test_errors_in_rows_name_the_line(tmp_path: Path, text: str, said: str) -> N
     assert said in str(caught.value)
 
 
-def test_a_file_that_is_not_there_or_not_text_is_said(tmp_path: Path) -> None:
+def test_a_missing_or_binary_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="cannot be read"):
         read_rows(tmp_path / "none.csv", SCENE.sheet, RADIUS)
     (tmp_path / "rows.csv").write_bytes(b"\xff\xfe\x00depth")
@@ -296,7 +296,7 @@ def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_p
         ({"left_oot": []}, "left_oot"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(
+def test_a_file_that_does_not_fit_is_rejected(
     twin_calibration: SheetCalibration, tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
     file = tmp_path / "sheet.yaml"
@@ -306,7 +306,7 @@ def test_a_file_that_does_not_fit_is_refused(
 
 
 @pytest.mark.parametrize("content", ["- 1\n", "a: 1\n", "a: [\n", "version: 1\nscene: lab\n"])
-def test_a_foreign_file_is_refused(tmp_path: Path, content: str) -> None:
+def test_a_foreign_file_is_rejected(tmp_path: Path, content: str) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(content)
     with pytest.raises(
@@ -317,13 +317,13 @@ def test_a_foreign_file_is_refused(tmp_path: Path, content: str) -> None:
         load_sheet_calibration(tmp_path / "none.yaml")
 
 
-def test_another_sheets_calibration_is_refused(twin_calibration: SheetCalibration) -> None:
+def test_another_sheets_calibration_is_rejected(twin_calibration: SheetCalibration) -> None:
     other = SCENE.sheet.model_copy(update={"width_m": 0.3})
     with pytest.raises(CalibrationMismatchError, match=r"width_m 0\.24, the scene"):
         make_force_model(other, twin_calibration)
 
 
-def test_the_command_fits_rows_and_tells(tmp_path: Path) -> None:
+def test_the_command_fits_rows_and_reports(tmp_path: Path) -> None:
     rows = tmp_path / "rows.csv"
     lines = ["stretch_ratio,depth_mm,force_n"]
     for push in pushes_of(ScaledSheetModel(NOMINAL), noise_n=0.002):

@@ -1,4 +1,5 @@
-"""The sheet's laws: their scaling, their slopes, their ranges, and the twin's membrane as judge."""
+"""Test the sheet's force models: scaling, slopes, ranges, and the simulated membrane as
+reference."""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ def force(
 
 
 def true_push(stretch: float, depth: float, place: SheetPosition = CENTRE) -> tuple[float, float]:
-    """Force and edge force by the twin, on a mesh that is good to 1.5 % and quick."""
+    """Return force and edge force by the simulator, on a mesh with an error of 1.5 %."""
     return simulate_push(SHEET, stretch, depth, place, RADIUS, cells=24)
 
 
@@ -77,7 +78,7 @@ def true_forces() -> Floats:
 
 
 @pytest.mark.parametrize(("law", "bound"), [(SIMPLE[0], 0.28), (SIMPLE[1], 0.10)])
-def test_within_its_range_a_law_is_as_exact_as_it_says(
+def test_within_its_range_a_law_has_the_stated_accuracy(
     law: SheetForceModel, bound: float, true_forces: Floats
 ) -> None:
     judged = 0
@@ -89,7 +90,7 @@ def test_within_its_range_a_law_is_as_exact_as_it_says(
     assert judged >= 2
 
 
-def test_outside_its_range_the_linear_law_is_wrong_and_says_so() -> None:
+def test_outside_its_range_the_linear_law_is_wrong_and_flagged() -> None:
     law = SIMPLE[0]
     for stretch, depth in ((1.04, 0.002), (1.04, 0.040), (1.0, 0.020)):
         true = true_push(stretch, depth)[0]
@@ -109,7 +110,7 @@ def test_outside_its_range_the_linear_law_is_wrong_and_says_so() -> None:
         (1.05, 0.01, CENTRE, 0.02),
     ],
 )
-def test_the_scaled_law_says_where_it_ends(
+def test_the_scaled_law_reports_its_range(
     stretch: float, depth: float, place: SheetPosition, radius: float
 ) -> None:
     law = ScaledSheetModel(RUBBER)
@@ -184,7 +185,7 @@ def test_left_is_as_right_and_up_as_down(place: SheetPosition, stretch: float) -
 
 
 @pytest.mark.parametrize("law", SIMPLE)
-def test_no_depth_presses_nothing_and_what_is_not_finite_is_refused(law: SheetForceModel) -> None:
+def test_no_depth_presses_nothing_and_what_is_not_finite_is_rejected(law: SheetForceModel) -> None:
     assert force(law, 1.05, 0.0) == 0.0
     assert force(law, 1.05, -0.01) == 0.0
     for stretch, depth, x in ((np.nan, 0.01, 0.0), (1.05, np.inf, 0.0), (1.05, 0.01, np.nan)):
@@ -215,7 +216,7 @@ def test_an_inverse_ends_where_its_grid_does() -> None:
     assert flat == pytest.approx([0.0, 0.4])
 
 
-def test_a_table_gives_back_its_entries_and_takes_over_the_law_between() -> None:
+def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
     base = ScaledSheetModel(RUBBER)
 
     def measured(stretch: float, depths: Floats, place: SheetPosition) -> Floats:
@@ -272,7 +273,7 @@ def test_a_table_of_one_entry_is_a_factor() -> None:
         ([1.02, 1.05], np.full((2, 1, 1, 1), np.nan), "finite"),
     ],
 )
-def test_a_table_that_is_none_is_refused(
+def test_a_table_that_is_none_is_rejected(
     stretches: list[float], ratios: Floats, words: str
 ) -> None:
     one = np.array([0.01])
@@ -280,7 +281,7 @@ def test_a_table_that_is_none_is_refused(
         TabulatedSheetModel(ScaledSheetModel(RUBBER), np.array(stretches), one, one, one, ratios)
 
 
-def test_edge_force_knows_the_sheets_form_and_mooneys_rubber() -> None:
+def test_edge_force_depends_on_the_sheets_form_and_mooneys_rubber() -> None:
     forces = [flat_edge_force_n(RUBBER, stretch) for stretch in (0.9, 1.0, 1.02, 1.05, 1.1)]
     assert forces[0] == forces[1] == 0.0
     assert forces[2:] == pytest.approx([5.07, 12.3, 23.4], rel=0.01)
@@ -292,7 +293,7 @@ def test_edge_force_knows_the_sheets_form_and_mooneys_rubber() -> None:
 @pytest.mark.parametrize(
     "numbers", [(0.0, 0.24, 0.001, 1e6, 0.0), (0.24, 0.24, np.nan, 1e6, 0.0), (0.24,) * 4 + (1.0,)]
 )
-def test_rubber_that_is_none_is_refused(numbers: tuple[float, ...]) -> None:
+def test_rubber_that_is_none_is_rejected(numbers: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match=r"above 0|mooney_share"):
         Rubber(*numbers)
 

@@ -1,4 +1,4 @@
-"""Dent shapes: the solved ones again, those between them, and what is out of range."""
+"""Test indentation shapes: solved ones, interpolated ones, and the range."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_any_push_has_a_finite_shape_of_bounded_depth(
 
 
 @pytest.mark.parametrize(("x", "y"), [(-1, 1), (1, -1), (-1, -1)])
-def test_mirrored_places_have_mirrored_shapes(shapes: IndentationBasis, x: int, y: int) -> None:
+def test_mirrored_points_have_mirrored_shapes(shapes: IndentationBasis, x: int, y: int) -> None:
     place = (0.03, 0.05)
     shape, other = (shapes.grid(1.05, at) for at in (place, (x * place[0], y * place[1])))
     assert other == pytest.approx(shape[::y, ::x] * [x, y])
@@ -119,7 +119,7 @@ def test_what_is_out_of_range_is_named(shapes: IndentationBasis) -> None:
     assert "too close to the sheet's edge" in shapes.invalid_reason(1.05, (0.11, 0.0), 0.02)
 
 
-def test_a_sheet_of_another_modulus_dents_alike() -> None:
+def test_a_sheet_of_another_modulus_has_the_same_shape() -> None:
     stiff = replace(RUBBER, young_modulus_pa=3e6, thickness_m=0.002)
     soft, hard = (
         solve_indentation(

@@ -1,4 +1,4 @@
-"""The sheet's own finite elements: theory, the twin's other elements, and hard cases."""
+"""Test the sheet's finite elements: theory, the simulator's elements, and hard cases."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_mooneys_rubber_softens_when_stretched() -> None:
         ({"finger_radius_m": -1.0}, "above 0"),
     ],
 )
-def test_pushes_that_are_none_are_refused(changed: dict[str, object], words: str) -> None:
+def test_pushes_that_are_none_are_rejected(changed: dict[str, object], words: str) -> None:
     asked: dict[str, object] = {
         "stretch_ratio": 1.05,
         "depths_m": [0.01],
@@ -157,7 +157,7 @@ def test_pushes_that_are_none_are_refused(changed: dict[str, object], words: str
         push_path(RUBBER, **asked)  # type: ignore[arg-type]  # one of them is wrong on purpose
 
 
-def test_an_equilibrium_that_is_not_found_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_equilibrium_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(membrane, "MAX_ITERATIONS", 1)
     with pytest.raises(NoEquilibriumError, match="residual"):
         push_path(RUBBER, stretch_ratio=1.05, depths_m=[0.02], finger_radius_m=RADIUS, cells=12)

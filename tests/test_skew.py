@@ -1,4 +1,4 @@
-"""A moving finger in two pictures that were not taken at once."""
+"""Test a moving finger in two images with different exposure times."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_an_unknown_velocity_is_in_the_covariance() -> None:
 
 
 async def test_the_node_undoes_the_skew_that_a_pair_states() -> None:
-    """8 ms at up to 90 mm/s: two millimetres off if it is not told."""
+    """8 ms at up to 90 mm/s are two millimetres without the compensation."""
     scene = bench_scene()
     camera = twin_camera(scene, CLUTTER["none"])
 

@@ -1,4 +1,4 @@
-"""What the hour of use calls a leak."""
+"""Test the detection of leaks in the soak benchmark."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.soak import MIB, Sample, findings, process_report
 
 
 @pytest.mark.parametrize(("own_mib_per_h", "leaks"), [(0.0, False), (20.0, True)])
-def test_a_leak_is_judged_by_memory_that_no_other_shares(own_mib_per_h: float, leaks: bool) -> None:
+def test_a_leak_is_detected_by_private_memory(own_mib_per_h: float, leaks: bool) -> None:
     samples = [
         Sample(
             time_s=10.0 * i, pid=1, uss=round(MIB * (50.0 + own_mib_per_h * i / 360.0)),

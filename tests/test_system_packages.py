@@ -1,4 +1,4 @@
-"""System packages: installed where that is possible, else named in one line; apt may fail."""
+"""Test system packages: installed if possible, else named in one line; apt can fail."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexsheet.launch.health import system
 
 
 class Apt:
-    """Stands for apt-get and for what it installs; `broken` packages cannot be had."""
+    """Substitute for apt-get and its packages; `broken` packages cannot be installed."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *broken: str, root: bool = True) -> None:
         self.commands: list[list[str]] = []

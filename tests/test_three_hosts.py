@@ -1,4 +1,4 @@
-"""Three computers, with keys, on a network that fails: judged by what the arms' joints did."""
+"""Test three computers with keys on a failing network, by the true joints of the arms."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ MAX_LENGTH_M = 0.24 * 1.15
 TURNED_RAD = 0.15
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
-"""Joints lag behind what was commanded, and with them the last word of a stop."""
+"""Lag of the joints, and of the last message before a stop."""
 OFF_M = 0.01
 MARGIN_NS = 1_500_000_000
-"""What is said once a second and lost at the beginning was last heard so long before."""
+"""Margin for a message that is published once a second and lost at the start of a fault."""
 PATIENT: dict[str, Any] = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
-"""A test's computers are busier than a lab's."""
+"""Time-outs for a test's computers, which are busier than a lab's."""
 
 pytestmark = pytest.mark.timeout(600)
 
 
 @dataclass
 class Troubles:
-    """When something was brought about, until all was well again; ns."""
+    """Time spans of faults until the recovery, ns."""
 
     spans: dict[str, Span] = field(default_factory=dict)
 
@@ -55,7 +55,7 @@ class Troubles:
 
 
 def judge_words(lab: Lab) -> None:
-    """No limit was violated, whatever happened, by the bridges' words."""
+    """Assert that the bridges reported no violation of a limit."""
     states = [state for _, state in lab.seen]
     assert states
     assert isinstance(states[0], ArmState)
@@ -79,7 +79,7 @@ def judge_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
 
 
 def judge_bags(lab: Lab, troubles: Troubles) -> None:
-    """The same by the arms' true joints, and by what came of the strokes."""
+    """Assert the same for the arms' true joints, and that the strokes were followed."""
     scene = lab.plan().scene_message()
     assert scene is not None
     arms = read_arm(lab.folder, "left", scene), read_arm(lab.folder, "right", scene)
@@ -128,7 +128,7 @@ async def test_arms_that_stroke_stop_at_a_cut_cable_and_move_when_told_so() -> N
 
 
 @pytest.mark.long
-async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> None:
+async def test_stroking_arms_stop_at_failures_and_move_when_enabled() -> None:
     troubles = Troubles()
     async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
         await last_weeks_plan_is_refused(lab)
@@ -162,7 +162,7 @@ async def end_launchers(lab: Lab) -> None:
 
 
 async def last_weeks_plan_is_refused(lab: Lab) -> None:
-    """One computer is started with an old launch file; both sides say so, and it is fixed."""
+    """Start one computer with an old launch file; both sides report it, and it is fixed."""
     old = lab.launch_file.with_name("last-week.yaml")
     old.write_text(lab.launch_file.read_text().replace("watchdog_s: 0.8", "watchdog_s: 0.7"))
     theirs, ours = load_graph(old).hash, lab.plan().hash
@@ -181,7 +181,7 @@ async def last_weeks_plan_is_refused(lab: Lab) -> None:
 
 
 async def told_to_move(lab: Lab) -> None:
-    """By a command, which refuses until both are there."""
+    """Enable the arms by the command, which fails until both are present."""
     for _ in range(10):
         code, words = await lab.run("main", "arms", "ready", "--json")
         if code == 0:
@@ -193,7 +193,8 @@ async def told_to_move(lab: Lab) -> None:
 
 
 async def stand_until_told(lab: Lab) -> None:
-    """What failed is there again: the sheet may still be relaxed, then no arm moves."""
+    """Assert that arms rest after a recovery, except for relaxing the sheet, until they are
+    enabled."""
 
     def rest() -> bool:
         newest = [[s for t, s in lab.seen[-800:] if t == f"arm_{side}"] for side in SIDES]
@@ -245,7 +246,7 @@ async def the_doctor_asks_all(lab: Lab) -> None:
 
 
 async def a_stop_outlives_all_launchers(lab: Lab) -> None:
-    """Said beside an arm, where nobody may reset it; then all is killed and restarted."""
+    """Stop beside an arm, where the reset is not allowed; then kill and restart everything."""
     code, words = await lab.run("left", "arms", "stop", "--reason=a hand in the sheet")
     assert code == 0, words
     for process in lab.launchers.values():

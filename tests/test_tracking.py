@@ -1,4 +1,4 @@
-"""Filters, and which measured points they are given."""
+"""Test the tracking filters and the gating of measured points."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def new_tracker(name: str = "singer_tremor") -> Tracker:
 
 
 def followed(filter_: Filter, path: Path, frames: int, *, seed: int = 0) -> list[Estimate]:
-    """Estimates after each of the frames of a noisily measured path."""
+    """Return the estimates after each of the frames of a noisily measured path."""
     generator = np.random.default_rng(seed)
     estimates: list[Estimate] = []
     for frame in range(frames):
@@ -106,7 +106,7 @@ def test_the_path_ahead_begins_where_the_finger_is(name: str) -> None:
 
 
 def lag_s(name: str, lead_s: float) -> float:
-    """How far behind a steady finger the prediction is on average."""
+    """Return the mean lag of the prediction behind a uniform finger."""
     filter_ = method(name)
     errors = [
         filter_.predict(estimate, np.array([lead_s]))[0] - steady(estimate.at_ns * 1e-9 + lead_s)
@@ -143,7 +143,8 @@ def test_a_resting_finger_is_known_better_than_it_is_measured(name: str) -> None
 
 @pytest.mark.parametrize("name", ["constant_acceleration", "singer_tremor"])
 def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
-    """The normalised error squared of a hand that moves as the model says is about one per axis."""
+    """The normalised squared error is about one per axis for a finger that moves as in the
+    model."""
     filter_ = method(name)
     assert isinstance(filter_, Kalman)
     generator = np.random.default_rng(5)
@@ -179,7 +180,7 @@ def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
     assert (0.6 if filter_.tremor else 0.3) < np.mean(squares) < 1.4
 
 
-def test_tremor_is_predicted_by_the_hand_and_not_the_wrong_way_by_the_others() -> None:
+def test_tremor_is_predicted_by_its_model_and_not_amplified_by_others() -> None:
     def trembling(time_s: float) -> Floats:
         return np.array([5e-5 * np.sin(2 * np.pi * 9.3 * time_s), 0.0, 0.0])
 
@@ -249,7 +250,7 @@ def test_a_swing_is_met_between_the_points() -> None:
         )
 
 
-def test_a_path_of_one_point_is_refused() -> None:
+def test_a_path_of_one_point_is_rejected() -> None:
     with pytest.raises(ValueError, match="two or more are needed"):
         interpolate_path(np.zeros((1, 3)), 0.01, 0.0)
 
@@ -279,7 +280,7 @@ def test_points_that_do_not_agree_begin_no_track() -> None:
             pytest.fail("three random points in a row look like a finger")
 
 
-def test_a_jump_is_refused_and_forgotten() -> None:
+def test_a_jump_is_rejected_and_forgotten() -> None:
     tracker = new_tracker()
     feed(tracker, steady, range(60))
     assert (
@@ -347,8 +348,8 @@ def test_nothing_beyond_a_fingers_reach_enters(way_m: float) -> None:
 
 
 @pytest.mark.parametrize("name", TRACKING_METHODS)
-def test_a_late_point_mends_the_track(name: str) -> None:
-    """Fed out of order, a track ends as if all had come in order."""
+def test_a_late_point_corrects_the_track(name: str) -> None:
+    """Points out of order give the same track as points in order."""
     generator = np.random.default_rng(2)
     points = [
         steady(frame * FRAME_NS * 1e-9) + 1e-5 * generator.standard_normal(3) for frame in range(40)
@@ -380,8 +381,8 @@ def test_a_late_jump_a_doubled_point_and_an_ancient_one_change_nothing() -> None
 
 
 @pytest.mark.parametrize("off_m", [0.003, 0.01, 0.02])
-def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
-    """What would have been too fast in its turn is no better for coming late."""
+def test_a_late_point_is_gated_like_one_in_time(off_m: float) -> None:
+    """A point that is too fast in order is also rejected when it is late."""
     tracker = new_tracker()
     feed(tracker, still, range(58))
     for frame in (59, 60):
@@ -398,7 +399,7 @@ def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
 
 
 def test_a_late_point_where_none_is_missing_is_left_out() -> None:
-    """A clock that steps back by about a frame would otherwise squeeze a finger's way together."""
+    """A clock that steps back by about a frame would otherwise compress the finger's path."""
     tracker = new_tracker()
     feed(tracker, steady, range(60))
     before = tracker.estimate
@@ -452,7 +453,7 @@ def test_half_the_frames_are_enough() -> None:
 
 
 def wandering(time_s: float) -> Floats:
-    """Half a millimetre at 0.6 Hz and tremor at 9.6 Hz, on every axis in a phase of its own."""
+    """Return half a millimetre at 0.6 Hz and tremor at 9.6 Hz, with a different phase per axis."""
     phases = np.array([0.0, 1.0, 2.0])
     slow = np.sin(2 * np.pi * 0.6 * time_s + phases)
     quick = np.sin(2 * np.pi * 9.6 * time_s + 2 * phases)
@@ -463,8 +464,8 @@ def reaching(time_s: float) -> Floats:
     return np.array([0.05 * np.sin(2 * np.pi * 0.5 * time_s), 0.0, 0.0])
 
 
-def test_methods_are_as_good_as_they_say_in_their_range() -> None:
-    """A dearer method is better where it matters: the longer the lead and the livelier the hand."""
+def test_methods_have_the_stated_accuracy_in_their_range() -> None:
+    """More expensive methods are better for longer horizons and more dynamic fingers."""
     family = make_tracking_family(
         lambda scene: {
             "rest": TruePathCase(wandering, 6.0, resting=True),

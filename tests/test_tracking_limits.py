@@ -1,4 +1,4 @@
-"""Each way in which a fingertip can be lost: a little of it does no harm, much of it is said."""
+"""Test each disturbance of the tracking: a mild one has no effect, a severe one is reported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.tracking_endurance import evaluate_sequence, follow
 from benchmarks.tracking_limits import FAILURES, measure
 
 SIGMAS = 6.0
-"""No valid fingertip is off by more of its stated standard deviations."""
+"""Maximum error of a valid fingertip, in reported standard deviations."""
 
 MILD = {
     "one-view": 2.5,
@@ -29,7 +29,7 @@ MILD = {
 }
 FRAME_MS = 1000.0 / 60.0
 CONFIRMED_MS = 2.0 * FRAME_MS
-"""From the first picture to the third, which begins a track."""
+"""Time from the first image to the third, which starts a track."""
 
 SEVERE = {
     "one-view": (0.5, {"merged", "inconsistent"}, CONFIRMED_MS),
@@ -68,7 +68,7 @@ def test_a_little_of_it_does_no_harm(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEVERE)
-def test_much_of_it_is_said_and_soon_over(name: str) -> None:
+def test_a_severe_disturbance_is_reported_and_recovered(name: str) -> None:
     severity, reasons, recovery_ms = SEVERE[name]
     row = measure(name, severity, repetitions=1)
     assert row.valid_share == 0.0
@@ -90,7 +90,7 @@ def test_much_of_it_is_said_and_soon_over(name: str) -> None:
         ("clock", -20.0, {"late"}, 1),
     ],
 )
-def test_bad_times_cost_a_few_frames_and_no_wrong_place(
+def test_bad_times_cost_a_few_frames_and_no_wrong_position(
     name: str, severity: float, reasons: set[str], lost: int | None
 ) -> None:
     row = measure(name, severity, repetitions=1)
@@ -107,10 +107,10 @@ def test_bad_times_cost_a_few_frames_and_no_wrong_place(
 @pytest.mark.parametrize(
     "sequences", [((2, 450),), pytest.param(((2, 900), (3, 600)), marks=pytest.mark.long)]
 )
-def test_in_a_crowd_no_other_mark_is_taken_for_the_finger(
+def test_no_clutter_is_confused_with_the_finger(
     sequences: tuple[tuple[int, int], ...],
 ) -> None:
-    """A short form of `benchmarks.tracking_endurance`.  sequences: seeds and numbers of frames."""
+    """This is a short form of `benchmarks.tracking_endurance`.  sequences: seeds and numbers of frames."""
     count = 0
     for seed, frames in sequences:
         seen, _ = asyncio.run(follow(seed, frames))

@@ -1,4 +1,4 @@
-"""From two pixels to a point: the methods against each other, an optimiser, and their breaking."""
+"""Test triangulation: methods against an optimiser, and their failures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def geometry(scene: Scene) -> StereoGeometry:
 
 
 def turned_rig() -> Floats:
-    """right_from_left of cameras that converge and are a little rolled, as real ones are."""
+    """Return right_from_left of cameras that converge and are slightly rolled, as real ones."""
     return rigid.transform(rigid.rotation_from_rpy([0.02, -0.15, 0.03]), [-0.12, 0.004, 0.01])
 
 
@@ -154,7 +154,7 @@ def test_the_covariance_is_that_of_noisy_pixels(geometry: StereoGeometry) -> Non
     assert along_view == pytest.approx(rule, rel=0.15)
 
 
-def test_marks_that_do_not_belong_together_show_in_the_reprojection(
+def test_mismatched_markers_have_a_large_reprojection_error(
     geometry: StereoGeometry,
 ) -> None:
     left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
@@ -195,13 +195,13 @@ def calibration_of(scene: Scene, **changes: object) -> StereoCalibration:
     return calibration.model_copy(update=changes)
 
 
-def test_a_calibration_replaces_the_optics_but_not_the_place(scene: Scene) -> None:
+def test_a_calibration_replaces_the_optics_but_not_the_pose(scene: Scene) -> None:
     geometry = StereoGeometry.of(scene.camera, calibration_of(scene))
     assert geometry.matrices[0][0, 0] == 600.0
     assert np.allclose(geometry.world_from_left[:3, 3], scene.camera.world_from_left.position_m)
 
 
-def test_a_calibration_of_another_camera_is_refused(scene: Scene) -> None:
+def test_a_calibration_of_another_camera_is_rejected(scene: Scene) -> None:
     with pytest.raises(CalibrationMismatchError, match=r'device "other".*"twin-bumblebee"'):
         StereoGeometry.of(scene.camera, calibration_of(scene, device="other"))
     with pytest.raises(CalibrationMismatchError, match=r"1024x480 px.*640x480 px"):
@@ -209,7 +209,7 @@ def test_a_calibration_of_another_camera_is_refused(scene: Scene) -> None:
 
 
 WIDE = np.array([-0.32, 0.12, 0.0008, -0.0006, 0.01])
-"""Distortion of a wide lens, as such rigs have."""
+"""Distortion of a wide-angle lens."""
 
 
 @given(ray=st.tuples(st.floats(-0.6, 0.6), st.floats(-0.45, 0.45)), depth=st.floats(0.1, 5.0))
@@ -230,7 +230,7 @@ def test_a_ray_through_a_wide_lens_and_back_with_its_slope(
 
 
 def test_a_pixel_beyond_what_the_lens_draws_has_no_ray() -> None:
-    """This lens presses all of space into 400 px around its centre; beyond it folds back."""
+    """This lens maps all of space into 400 px around its centre; beyond it is not invertible."""
     matrix = camera.camera_matrix(540.0, 540.0, 320.0, 240.0)
     barrel = np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
     assert undistort_pixel(np.array([400.0, 240.0]), matrix, barrel) is not None
@@ -265,7 +265,7 @@ def test_rays_that_do_not_meet_before_the_cameras_have_no_approach() -> None:
 def test_a_covariance_grows_as_the_rays_become_parallel(
     geometry: StereoGeometry, depth_m: float
 ) -> None:
-    """Depth errors grow with the square of the depth; stated ones must as well, and not less."""
+    """Depth errors grow with the square of the depth; reported ones must grow at least as fast."""
     truth = rigid.apply(geometry.world_from_left, np.array([0.0, 0.0, depth_m]))
     left, right = geometry.project(truth)
     exact = found_behind(geometry, left, right, "dlt", 0.01)
@@ -278,7 +278,7 @@ def test_a_covariance_grows_as_the_rays_become_parallel(
 
 
 def test_uneven_noise_is_carried_to_the_point(geometry: StereoGeometry) -> None:
-    """A mark drawn out along x is uncertain there; the point's covariance must say so."""
+    """A marker that is elongated along x is uncertain there, as the point's covariance must be."""
     truth, generator = np.array([0.03, -0.02, 0.01]), np.random.default_rng(4)
     left, right = geometry.project(truth)
     spreads = (np.diag([0.3, 0.05]) ** 2, np.diag([0.05, 0.2]) ** 2)

@@ -1,4 +1,4 @@
-"""The triangulator as a node: pictures in, fingertips out, and every reason why there is none."""
+"""Test the triangulator node: images in, fingertips out, and every reason for an invalid one."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def camera(scene: Scene) -> TwinCamera:
 
 
 class Bench(NodeHarness[Triangulator, VirtualClock]):
-    """A triangulator that gets images by hand."""
+    """Triangulator with images from the test."""
 
     def __init__(self, camera: TwinCamera, **parameters: Any) -> None:
         super().__init__(
@@ -95,7 +95,7 @@ class Bench(NodeHarness[Triangulator, VirtualClock]):
         return self.sent[-1]
 
     def pictures(self, *tips: tuple[float, float, float]) -> tuple[Image, Image]:
-        """Pictures of so many fingers at once: the brighter of each pixel."""
+        """Return images of several fingers: the maximum of each pixel."""
         left, right = self.camera.picture(lambda _: np.array([0, 0, 5.0]), exposure_s=0.004)
         for tip in tips:
             pair = self.camera.picture(lambda _, tip=tip: np.array(tip), exposure_s=0.004)
@@ -149,7 +149,7 @@ async def test_each_reason_and_back_again(scene: Scene, camera: TwinCamera) -> N
             assert np.linalg.norm(shown.position_world_m - HERE) < 3e-4
 
 
-async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
+async def test_a_second_marker_far_from_a_followed_one_does_not_disturb(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -161,7 +161,7 @@ async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
     assert lost.reason == "two_markers"
 
 
-async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alone(
+async def test_a_marker_outside_the_volume_is_tracked_only_when_it_is_the_only_one(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -174,7 +174,7 @@ async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alon
     assert np.linalg.norm(shown[-1].position_world_m - FAR) < 3e-4
 
 
-async def test_a_mark_seen_beside_the_finger_is_not_taken_for_it(
+async def test_a_marker_seen_beside_the_finger_is_not_confused_with_it(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -190,7 +190,7 @@ async def test_a_mark_seen_beside_the_finger_is_not_taken_for_it(
     assert np.linalg.norm(again[-1].position_world_m - HERE) < 3e-4
 
 
-async def test_late_pictures_are_counted_and_a_new_camera_is_not_late(
+async def test_late_images_are_counted_and_a_new_camera_is_not_late(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
@@ -222,7 +222,9 @@ async def test_a_part_of_the_sensor_gives_the_same_fingertip(
     assert np.allclose(whole.position_world_m, cut.position_world_m, atol=1e-6)
 
 
-async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCamera) -> None:
+async def test_images_of_another_camera_are_rejected_by_name(
+    scene: Scene, camera: TwinCamera
+) -> None:
     bench = await Bench(camera).start(scene)
     header = Header(1, 1, 1, "virtual", "camera", 1)
     full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
@@ -231,7 +233,7 @@ async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCa
             "webcam",
             full,
             (0, 0),
-            'images of device "webcam"; the scene\'s camera is "twin-bumblebee"',
+            'images of device "webcam"; expected the scene\'s camera "twin-bumblebee"',
         ),
         ("twin-bumblebee", wide, (0, 0), "left image of 752x480 px at column 0, row 0"),
         ("twin-bumblebee", full, (0, 8), "left image of 640x480 px at column 0, row 8"),
@@ -250,7 +252,7 @@ async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCa
     assert bench.sent == []
 
 
-async def test_nothing_is_said_before_there_is_a_scene(camera: TwinCamera) -> None:
+async def test_nothing_is_published_before_there_is_a_scene(camera: TwinCamera) -> None:
     bench = Bench(camera)
     pair = StereoPair(
         device="any",
@@ -264,7 +266,7 @@ async def test_nothing_is_said_before_there_is_a_scene(camera: TwinCamera) -> No
 
 
 def calibration_of(rig: StereoCamera) -> StereoCalibration:
-    """What a perfect calibration would find."""
+    """Return an exact calibration of the rig."""
     return StereoCalibration(
         device=rig.device,
         date="2026-01-01T00:00:00+00:00",
@@ -280,7 +282,7 @@ def calibration_of(rig: StereoCamera) -> StereoCalibration:
     )
 
 
-async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
+async def test_a_calibration_file_is_used_and_a_foreign_one_rejected(
     tmp_path: Path, scene: Scene, camera: TwinCamera
 ) -> None:
     own = calibration_of(scene.camera)
@@ -301,7 +303,8 @@ async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
 
 
 def stroke() -> tuple[Floats, Floats]:
-    """Section V of the paper: 60 degrees around the cylinder in 10 s, its first 4 s."""
+    """Return the stroke of section V of the paper: 60 degrees around the cylinder in 10 s, its
+    first 4 s."""
     times_s = np.linspace(0.0, 4.0, 200)
     angle = np.radians(6.0) * times_s
     radius_m = 0.0353553
@@ -311,7 +314,8 @@ def stroke() -> tuple[Floats, Floats]:
 
 
 def fast_reach() -> tuple[Floats, Floats]:
-    """To and fro over 0.2 m with a peak speed of 1.2 m/s, as reaching hands do."""
+    """Return a motion back and forth over 0.2 m with a peak speed of 1.2 m/s, as of reaching
+    hands."""
     ends = np.array([[-0.09, -0.03, 0.08], [0.08, 0.05, 0.0]])
     share = np.concatenate([0.5 - 0.5 * np.cos(np.linspace(0, np.pi, 60)[i:]) for i in (0, 1)])
     share[60:] = 1.0 - share[60:]
@@ -326,10 +330,8 @@ def fast_reach() -> tuple[Floats, Floats]:
 async def test_from_the_twins_pixels_to_the_true_fingertip(
     tmp_path: Path, scene: Scene, path: Callable[[], tuple[Floats, Floats]], limit_mm: float
 ) -> None:
-    """The design asks for 0.3 mm rms near the sheet.
-
-    With the rig as it is: what a calibration gets wrong is no noise, and not in the covariance.
-    """
+    """The design requires 0.3 mm rms near the sheet. The error includes that of the calibration,
+    which is not in the covariance."""
     clock, truths, found = VirtualClock(10**9), list[TwinFinger](), list[Fingertip]()
 
     def keep(topic: Topic, message: Message, header: Header) -> None:

@@ -1,4 +1,4 @@
-"""Choosing methods for a scene: the cheapest that is good enough, else the nearest miss."""
+"""Test the selection of methods for a scene: the fastest sufficient one, else the nearest."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_cheapest_that_is_good_enough_everywhere_is_chosen() -> None:
     assert chosen_of(points, margin=0.05).method == "cheap"
 
 
-def test_a_method_out_of_its_range_is_not_taken_however_exact() -> None:
+def test_a_method_out_of_its_range_is_not_selected_even_if_exact() -> None:
     points = [point("cheap", 0.0, in_range=False), point("dear", 0.5)]
     assert chosen_of(points).method == "dear"
 
@@ -84,19 +84,19 @@ def test_cases_that_the_scene_does_not_ask_for_do_not_count() -> None:
     assert chosen_of(points).meets
 
 
-def test_of_methods_that_take_the_same_time_the_more_exact_is_chosen() -> None:
+def test_of_methods_with_equal_time_the_more_exact_is_selected() -> None:
     points = [point("cheap", 0.5, took=1.0e-3), point("dear", 0.1, took=1.05e-3)]
     assert chosen_of(points).method == "dear"
 
 
 @pytest.mark.parametrize("error", [float("nan"), float("inf")])
-def test_what_nothing_can_judge_is_not_good_enough(error: float) -> None:
+def test_a_method_without_a_reference_is_not_sufficient(error: float) -> None:
     found = chosen_of([point("cheap", 0.1), point("cheap", error, depth=2)])
     assert not found.meets
     assert found.wrong == ({"depth_mm": 2},)
 
 
-def test_where_none_is_good_enough_the_nearest_miss_is_taken() -> None:
+def test_if_none_is_sufficient_the_nearest_is_selected() -> None:
     points = [
         point("cheap", 3.0),
         point("cheap", 4.0, depth=2),
@@ -110,7 +110,7 @@ def test_where_none_is_good_enough_the_nearest_miss_is_taken() -> None:
 
 
 def test_a_method_that_is_meant_for_little_is_no_near_miss() -> None:
-    """However exact it is there, it gives no answer that could be near anywhere else."""
+    """It is exact in its range, but has no results elsewhere."""
     points = [
         point("cheap", 1.1),
         *(point("cheap", 0.1, depth=depth, in_range=False) for depth in (2, 3)),
@@ -126,7 +126,7 @@ def family(name: str, methods: Sequence[str]) -> Family:
 
 @pytest.fixture
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Families "quick" and "slow" in place of a node's own; which were measured is told."""
+    """Substitute families "quick" and "slow" for a node's own; return the measured ones."""
     there = {"quick": family("made-up", ["cheap"]), "slow": family("made-up", ["cheap", "dear"])}
     monkeypatch.setattr(tune, "load_family", there.__getitem__)
     return []
@@ -141,7 +141,7 @@ STAGED = Tunable(
     ("cheap_error", "methods", "chosen"),
     [(0.1, ["cheap"], "cheap"), (2.0, ["cheap", "dear"], "dear")],
 )
-def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
+def test_slow_methods_are_measured_only_if_no_other_is_sufficient(
     stand_ins: list[str], cheap_error: float, methods: list[str], chosen: str
 ) -> None:
     def measured(asked: Family, scene: Scene, wanted: Callable[[Trial], bool]) -> Sequence[Point]:
@@ -162,7 +162,7 @@ def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
     return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
 
 
-def test_a_sentence_says_why() -> None:
+def test_a_sentence_gives_the_reason() -> None:
     met = choice_of([point("cheap", 4.2), point("dear", 0.25)])
     assert met.explain() == (
         "made-up: dear (1 ms), error 0.25, tolerance 1 mm; "
@@ -173,7 +173,7 @@ def test_a_sentence_says_why() -> None:
     assert alone.explain().endswith("no method is faster")
 
 
-def test_a_miss_is_said_with_how_far_it_misses() -> None:
+def test_an_insufficient_method_is_reported_with_its_excess() -> None:
     missed = choice_of([point("cheap", 4.2), point("dear", 2.5), point("dear", 0.1, depth=2)])
     assert not missed.met
     assert missed.explain() == (
@@ -314,7 +314,7 @@ def test_files_are_named_from_where_a_scene_goes(tmp_path: Path, quote: str) -> 
 
 
 def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
-    """From a folder that may only be read, which the tests' user may be above."""
+    """The scene is in a read-only folder, except for root."""
     here, there = tmp_path / "here", tmp_path / "far" / "there: b"
     here.mkdir()
     there.mkdir(parents=True)
@@ -337,7 +337,7 @@ def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
     assert {path.name for path in here.iterdir()} == {"scene.yaml", "organ.obj"}
 
 
-def test_a_files_name_that_cannot_be_put_in_is_refused(tmp_path: Path) -> None:
+def test_a_files_name_that_cannot_be_put_in_is_rejected(tmp_path: Path) -> None:
     source = tmp_path / "scene.yaml"
     text = (SCENES / "palpation.yaml").read_text()
     source.write_text(text.replace("organ.obj", r'"orga\x6e.obj"'))
@@ -383,7 +383,7 @@ def test_a_real_family_is_tuned_by_the_command(tmp_path: Path) -> None:
     assert load_scene(out).methods.triangulation == only["setting"]
 
 
-def test_a_miss_has_an_exit_code_of_its_own(
+def test_an_insufficient_method_has_a_separate_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     missed = choice_of([point("cheap", 2.0)])
@@ -403,7 +403,7 @@ def test_an_unknown_family_is_named_with_the_nearest() -> None:
     )
 
 
-def test_every_choice_that_can_be_made_is_one_that_a_scene_can_say() -> None:
+def test_every_choice_has_a_scene_key() -> None:
     for tunable in tune.TUNABLES:
         for setting in tunable.settings.values():
             assert Methods.model_validate({tunable.key: setting})
@@ -425,7 +425,7 @@ def test_families_ask_for_the_scenes_own_cases_only() -> None:
 
 
 @pytest.mark.parametrize(("name", "missed"), [("light-touch", False), ("demanding", True)])
-def test_scenes_that_come_tuned_say_whether_it_is_enough(name: str, missed: bool) -> None:
+def test_tuned_scenes_report_whether_they_are_sufficient(name: str, missed: bool) -> None:
     text = (SCENES / f"{name}.yaml").read_text()
     methods = Methods.model_validate(YAML(typ="safe").load(text)["methods"])
     assert methods.tracking is not None
@@ -437,7 +437,7 @@ def with_methods(**methods: object) -> Scene:
     return SCENE.model_copy(update={"methods": Methods.model_validate(methods)})
 
 
-async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
+async def test_a_node_follows_the_scene_if_set_to_auto() -> None:
     def node(**parameters: Any) -> Triangulator:
         given = TriangulatorParameters(**parameters)
         return Triangulator(given, name="eye", clock=VirtualClock(), send=lambda *_: None)
@@ -473,7 +473,7 @@ def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path:
 SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
 
 
-def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_path: Path) -> None:
+def test_a_missing_force_table_is_replaced_and_reported(tmp_path: Path) -> None:
     law, told = load_force_model(SCENE, "table", tmp_path)
     assert law.name == "scaled"
     assert "flexsheet precompute" in told
@@ -481,7 +481,7 @@ def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_pat
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.2, False), (3.9, False), (4.1, True), (40.0, True)])
-def test_a_busy_machine_is_told_of(
+def test_a_busy_machine_is_reported(
     monkeypatch: pytest.MonkeyPatch, load: float, busy: bool
 ) -> None:
     monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""The twin's arms: their kinematics, servo and refusals."""
+"""Test the simulated arms: kinematics, servo and rejected commands."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def controller() -> Controller:
         [],
     ],
 )
-def test_what_is_not_a_new_command_is_refused(registers: list[int]) -> None:
+def test_what_is_not_a_new_command_is_rejected(registers: list[int]) -> None:
     arm = controller()
     assert not arm.receive_command(registers)
     assert arm.refused == 1
@@ -194,8 +194,8 @@ def test_a_stop_keeps_to_the_path_and_ends_as_soon_as_the_slowest_joint_can(
 
 
 @pytest.mark.parametrize("how", ["stop", "idle", "watchdog", "fault"])
-def test_however_an_arm_is_stopped_it_stays_on_its_way(how: str) -> None:
-    """Fast and slow joints end together: a straight line in the joints remains one."""
+def test_a_stopped_arm_stays_on_its_path(how: str) -> None:
+    """Fast and slow joints end together: a straight line in joint space remains straight."""
     arm, way = controller(), np.array([0.08, -0.01, 0.02, 0.1, -0.05, 0.03])
     for number in range(20):
         assert arm.receive_command(command(number + 2, JOINTS + way * number / 10.0))
@@ -250,7 +250,7 @@ async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
 
 
 async def switch_on(joints_file: Path) -> TwinArmsNode:
-    """Start the node and give it a scene."""
+    """Start the node with a scene."""
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
     parameters = TwinArmsParameters(left_port=0, right_port=0, joints_file=str(joints_file))
     node = TwinArmsNode(parameters, name="twin", clock=VirtualClock(), send=lambda *_: None)
@@ -260,7 +260,7 @@ async def switch_on(joints_file: Path) -> TwinArmsNode:
     return node
 
 
-async def test_a_restarted_arm_stands_where_it_stood(tmp_path: Path) -> None:
+async def test_a_restarted_arm_keeps_its_joints(tmp_path: Path) -> None:
     first = await switch_on(tmp_path / "joints")
     left = first.servers["left"].controller
     at_start, right_joints = left.servo.joints_rad, first.servers["right"].controller.servo
@@ -307,7 +307,7 @@ def test_a_gear_has_play_when_its_motor_turns_back() -> None:
 
 
 def test_the_play_of_the_gears_is_the_arms_repeatability() -> None:
-    """A pose come to from all sides: as the maker's +-0.02 mm, neither much better nor worse."""
+    """Poses approached from all sides differ by about the manufacturer's +-0.02 mm."""
     random = np.random.default_rng(3)
     play = TwinArmsParameters().backlash_rad
     places = []
@@ -359,7 +359,7 @@ def test_stopping_forgets_what_was_still_to_be_done() -> None:
     assert arm.servo.joints_rad == pytest.approx(JOINTS, abs=1e-12)
 
 
-async def test_the_node_speaks_the_real_time_control_when_told_to() -> None:
+async def test_the_node_can_use_the_real_time_control() -> None:
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
     node = TwinArmsNode(
         TwinArmsParameters(left_port=0, right_port=0, protocol="mxt"),

@@ -1,4 +1,4 @@
-"""The twin's rig and what it sees: boards, clutter, and how much the pixels can tell at best."""
+"""Test the simulated rig and its images: boards, clutter, and the bound of the information."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def sheet(scene: Scene) -> StereoCamera:
-    """A data sheet: ideal lenses, straight rig."""
+    """Return the scene of the data sheet: ideal lenses, straight rig."""
     lens = Lens(fx_px=540.0, fy_px=540.0, cx_px=319.5, cy_px=239.5)
     assert scene.camera.left == scene.camera.right == lens
     return scene.camera
@@ -110,10 +110,10 @@ def chessboard(rig: StereoCamera) -> TwinBoard:
 
 
 def crossing_misfit(p: Floats, image: NDArray[np.float32], middle: Floats) -> Floats:
-    """Two smeared edges that cross at p[:2], against the picture in a round window.
+    """Return the misfit of two blurred edges that cross at p[:2] to the image in a round window.
 
-    Slanting edges smear otherwise than this has it, alike on both sides of the corner: a window
-    that lies round the corner keeps that from shifting it.
+    Oblique edges are blurred differently than in this model, but symmetrically about the corner. A
+    window centred on the corner therefore has no bias.
     """
     rows, columns = (slice(round(at) - 5, round(at) + 6) for at in (middle[1], middle[0]))
     y, x = np.mgrid[rows, columns]
@@ -126,7 +126,7 @@ def crossing_misfit(p: Floats, image: NDArray[np.float32], middle: Floats) -> Fl
 
 
 def fitted_corner(image: NDArray[np.float32], near: Floats, along: Floats, down: Floats) -> Floats:
-    """The crossing (2,) of the two edges that run `along` and `down` the board, near a pixel."""
+    """Return the crossing (2,) of the edges along the board's axes near a pixel."""
     angles = [np.arctan2(along[1], along[0]), np.arctan2(down[1], down[0])]
     guess = np.array([*near, *angles, 1.0, 80.0, 60.0, 0.0, 0.0])
     for _ in range(2):
@@ -148,7 +148,7 @@ def test_corners_lie_where_the_optics_put_them(chessboard: TwinBoard) -> None:
             assert off.max() < 0.01
 
 
-def test_a_chessboard_is_found_whole_in_both_noisy_pictures(chessboard: TwinBoard) -> None:
+def test_a_chessboard_is_found_whole_in_both_noisy_images(chessboard: TwinBoard) -> None:
     for pose in chessboard.poses(6):
         for image, corners in zip(chessboard.pair(pose), chessboard.corners(pose), strict=True):
             found, seen = cv2.findChessboardCorners(image, (9, 6))
@@ -195,14 +195,14 @@ def test_poses_are_near_and_far_tilted_to_all_sides_and_reach_every_edge(
             assert nearest < (110 if shared else 210)
 
 
-def test_a_boards_pictures_come_from_the_seed(rig: StereoCamera) -> None:
+def test_a_boards_images_come_from_the_seed(rig: StereoCamera) -> None:
     pose = TwinBoard(rig, CHESSBOARD, seed=1).poses(1)[0]
     pictures = [TwinBoard(rig, CHESSBOARD, seed=seed).pair(pose)[0] for seed in (1, 1, 2)]
     assert np.array_equal(pictures[0], pictures[1])
     assert not np.array_equal(pictures[0], pictures[2])
 
 
-def test_boards_that_cannot_be_drawn_are_refused(rig: StereoCamera, chessboard: TwinBoard) -> None:
+def test_boards_that_cannot_be_drawn_are_rejected(rig: StereoCamera, chessboard: TwinBoard) -> None:
     for change, said in (
         ({"marker_m": None}, "needs marker_m"),
         ({"marker_m": 0.03}, "does not fit"),
@@ -234,7 +234,7 @@ def plain(rig: StereoCamera) -> TwinCamera:
 
 
 def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats]:
-    """The light (height, width) that the mark adds to each view."""
+    """Return the light (height, width) that the marker adds to each view."""
     lit, unlit = (
         camera.levels(still, exposure_s=0.004, marker=marker, time_s=time_s)
         for marker in (True, False)
@@ -244,7 +244,7 @@ def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats
 
 
 def of_the_clutter(camera: TwinCamera, plain: TwinCamera, time_s: float = 0.0) -> list[Floats]:
-    """What clutter changes in each view of a camera whose background is the plain one's."""
+    """Return the change of each view by clutter, for a camera with a plain background."""
     return [
         np.asarray(a, float) - b
         for a, b in zip(
@@ -256,7 +256,7 @@ def of_the_clutter(camera: TwinCamera, plain: TwinCamera, time_s: float = 0.0) -
 
 
 def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
-    """Centre (2,) and variance (2,) of a light in pixels."""
+    """Return centre (2,) and variance (2,) of a light in pixels."""
     y, x = np.mgrid[: light.shape[0], : light.shape[1]]
     centre = np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
     off = np.array([(light * (x - centre[0]) ** 2).sum(), (light * (y - centre[1]) ** 2).sum()])
@@ -265,7 +265,7 @@ def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
 
 @given(offset=st.tuples(*[st.floats(-0.06, 0.06)] * 2))
 @settings(max_examples=10, deadline=None)
-def test_a_second_mark_is_where_it_was_asked_for(
+def test_a_second_marker_is_at_the_requested_position(
     rig: StereoCamera, plain: TwinCamera, offset: tuple[float, float]
 ) -> None:
     if np.hypot(*offset) < 0.015:
@@ -283,7 +283,7 @@ def test_a_second_mark_is_where_it_was_asked_for(
 
 
 @pytest.mark.parametrize("overlap", [-0.5, 0.0, 0.5])
-def test_a_highlight_touches_the_mark_by_as_much_as_asked(
+def test_a_highlight_overlaps_the_marker_as_requested(
     rig: StereoCamera, plain: TwinCamera, overlap: float
 ) -> None:
     camera = looking(rig, touching_highlight(overlap, radius_m=0.0015))
@@ -297,7 +297,7 @@ def test_a_highlight_touches_the_mark_by_as_much_as_asked(
 
 @given(share=st.floats(0.0, 1.0))
 @settings(max_examples=12, deadline=None)
-def test_an_occluder_hides_the_share_of_the_mark_that_was_asked_for(
+def test_an_occluder_hides_the_requested_fraction_of_the_marker(
     rig: StereoCamera, plain: TwinCamera, share: float
 ) -> None:
     camera = looking(rig, covered(share, views="right"))
@@ -307,7 +307,7 @@ def test_an_occluder_hides_the_share_of_the_mark_that_was_asked_for(
     assert seen[1].sum() / whole[1].sum() == pytest.approx(1.0 - share, abs=0.06)
 
 
-def test_a_wholly_covered_mark_leaves_nothing_in_that_view(rig: StereoCamera) -> None:
+def test_a_wholly_covered_marker_leaves_nothing_in_that_view(rig: StereoCamera) -> None:
     left, right = of_the_mark(looking(rig, covered(1.0, views="right")))
     assert left.max() > 100
     assert np.abs(right).max() < 0.1
@@ -315,7 +315,7 @@ def test_a_wholly_covered_mark_leaves_nothing_in_that_view(rig: StereoCamera) ->
 
 @given(defocus_px=st.floats(0.0, 4.0))
 @settings(max_examples=10, deadline=None)
-def test_out_of_focus_the_mark_spreads_as_optics_say_and_keeps_its_light(
+def test_out_of_focus_the_marker_spreads_as_in_optics_and_keeps_its_light(
     rig: StereoCamera, plain: TwinCamera, defocus_px: float
 ) -> None:
     even = Sensor(finger_level=0.0, background_level=0.0, texture_level=0.0, aperture_m=0.03)
@@ -332,12 +332,12 @@ def test_out_of_focus_the_mark_spreads_as_optics_say_and_keeps_its_light(
     assert np.allclose(grown, defocus_px**2, rtol=0.05, atol=0.02)
 
 
-def test_a_defocus_beyond_infinity_is_refused() -> None:
+def test_a_defocus_beyond_infinity_is_rejected() -> None:
     with pytest.raises(ValueError, match="aperture_m above"):
         Sensor(aperture_m=0.001).out_of_focus(3.0, 0.5, 540.0)
 
 
-def test_over_exposure_brightens_all_and_fills_the_mark(rig: StereoCamera) -> None:
+def test_over_exposure_brightens_all_and_fills_the_marker(rig: StereoCamera) -> None:
     lab = CLUTTER["lab"]
     once, thrice = (
         looking(rig, lab, Sensor(exposure=factor, background_level=40.0)) for factor in (1.0, 3.0)
@@ -353,7 +353,7 @@ def test_over_exposure_brightens_all_and_fills_the_mark(rig: StereoCamera) -> No
     assert counts[1] > 25
 
 
-def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> None:
+def test_the_sheets_texture_is_in_its_plane(rig: StereoCamera) -> None:
     camera = looking(rig, Clutter(sheet=Sheet()))
     generator = np.random.default_rng(1)
     seen: list[list[float]] = [[], []]
@@ -368,7 +368,7 @@ def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> N
     assert camera.eyes[0].background[row, column] < 0.8 * Sheet().level
 
 
-def test_a_lamps_image_may_stand_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
+def test_a_lamps_image_may_be_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
     place = (-0.09, 0.05, 0.0)
     spot = Highlight(FixedPoint(place), 0.0015, 300.0, views="left")
     camera = looking(rig, Clutter(highlights=(spot,)))
@@ -389,7 +389,7 @@ def test_what_moves_is_where_its_path_is_at_that_time(rig: StereoCamera, plain: 
             assert np.abs(centre_and_spread(light)[0] - place).max() < 0.05
 
 
-def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) -> None:
+def test_an_occluder_passes_before_the_marker_and_away_again(rig: StereoCamera) -> None:
     ends = [Moving((-0.1, y, 0.05), (0.1, 0.0, 0.0)) for y in (-0.3, 0.3)]
     camera = looking(rig, Clutter(occluders=(Occluder(ends[0], ends[1], 0.01),)))
     light = [of_the_mark(camera, time_s)[0].max() for time_s in np.arange(0.0, 2.0, 0.1)]
@@ -399,7 +399,7 @@ def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) ->
 
 
 def test_a_long_thing_that_the_lens_bends_is_drawn_whole(rig: StereoCamera) -> None:
-    """Across its middle it is as wide as it is, with the ground on both sides of it."""
+    """In its middle it has its full width, with the ground on both sides."""
     ends = FixedPoint((-0.22, 0.35, -0.05)), FixedPoint((-0.22, -0.35, 0.35))
     camera = looking(rig, Clutter(occluders=(Occluder(*ends, radius_m=0.012, level=200.0),)))
     seen = camera.levels(still, exposure_s=0.004)
@@ -431,7 +431,7 @@ def test_joined_windows_cover_each_pixel_once(corners: list[tuple[int, int, int,
     assert (joined >= touched).all()
 
 
-def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera) -> None:
+def test_images_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera) -> None:
     def film(seed: int) -> list[tuple[Image, Image]]:
         camera = looking(rig, CLUTTER["crowded"], seed=seed)
         before = camera.levels(lambda _: np.array([9.0, 0.0, 0.0]), exposure_s=0.004)
@@ -444,8 +444,8 @@ def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera)
     assert not np.array_equal(film(1), film(2))
 
 
-def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
-    """Neither as bright over six pixels as half of the mark's height, nor as large."""
+def test_no_clutter_is_similar_to_a_marker(rig: StereoCamera) -> None:
+    """No clutter is as bright over six pixels as half of the marker's height, or as large."""
     camera = looking(rig, CLUTTER["lab"])
     for image in camera.picture(still, exposure_s=0.004, marker=False):
         bright = (image > 140).astype(np.uint8)
@@ -467,12 +467,13 @@ BESIDE = np.array([0.05, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def disc(rig: StereoCamera) -> TwinCamera:
-    """A mark on even ground, beside the finger."""
+    """Return a marker on uniform ground, beside the finger."""
     return looking(rig, sensor=EVEN).with_changes(marker_offset_m=BESIDE)
 
 
 def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
-    """With even noise n, contrast C, radius r, blur s << r: variance 2 s n^2 / (sqrt(pi) r C^2).
+    """With uniform noise n, contrast C, radius r and blur s << r, the variance is 2 s n^2 /
+    (sqrt(pi) r C^2).
 
     The rim's gradient C g(d) n_x, squared, integrates over the rim to C^2 pi r / (2 sqrt(pi) s).
     """
@@ -492,7 +493,8 @@ def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera
 
 
 def disc_misfit(p: Floats, image: Image, x0: int, y0: int) -> Floats:
-    """A smeared disc (x, y, radius, spread, ground, height) against the picture, in deviations."""
+    """Return the misfit of a blurred disc (x, y, radius, blur, ground, height) in standard
+    deviations."""
     y, x = np.mgrid[y0 - 8 : y0 + 9, x0 - 8 : x0 + 9]
     inside = (p[2] - np.hypot(x - p[0], y - p[1])) / p[3]
     level = p[4] + p[5] * ndtr(inside)
@@ -513,7 +515,7 @@ def test_a_most_likely_fit_reaches_the_bound_and_does_not_beat_it(disc: TwinCame
 
 
 def test_the_position_bound_follows_from_the_views(disc: TwinCamera) -> None:
-    """Along the view, depth errs by Z^2 / (f B) of the disparity's error."""
+    """Along the view, the depth error is Z^2 / (f B) times that of the disparity."""
     bound = fingertip_bound(disc, still, exposure_s=0.0)
     eye = disc.eyes[0]
     _, depth_m = eye.see(TIP + BESIDE)
@@ -537,7 +539,7 @@ def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) ->
     assert size(disc.with_changes(sensor=dim)) > 2.0 * plain
 
 
-def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -> None:
+def test_a_saturated_pixel_has_no_information_and_a_dark_one_all_of_it() -> None:
     sensor = Sensor()
     told = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
     noise_sq = np.array([100.0, 230.0, 255.0]) / 40.0 + 2.25 + 1.0 / 12.0
@@ -547,7 +549,7 @@ def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -
     assert told[3] < 1e-12
 
 
-def test_there_is_no_bound_where_the_mark_cannot_be_seen(rig: StereoCamera) -> None:
+def test_there_is_no_bound_if_the_marker_is_not_visible(rig: StereoCamera) -> None:
     for place, said in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
         with pytest.raises(BoundError, match=said):
             fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)

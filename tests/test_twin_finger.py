@@ -1,4 +1,4 @@
-"""The twin's finger and camera: the truth is a pure function of time, and the pixels show it."""
+"""Test the simulated finger and camera: the truth is a function of time, and the images show it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def motion_along(
 
 
 def path_time(motion: FingerMotion, path_time_s: float) -> float:
-    """Seconds since the path was given at which `path_time_s` is reached."""
+    """Return the seconds since the start of the path at which `path_time_s` is reached."""
     return path_time_s - motion.at(0.0).path_time_s
 
 
@@ -82,7 +82,7 @@ def test_position_is_continuous_and_velocity_is_its_slope(
         assert np.allclose(slope, motion.at(time_s).velocity, atol=1e-3)
 
 
-def test_a_path_given_in_mid_motion_takes_over_without_a_step() -> None:
+def test_a_path_given_in_mid_motion_starts_without_a_step() -> None:
     first = motion_along([0.0, 1.0], [[0.0, 0.0, 0.1], [0.1, 0.0, 0.05]], wander_m=1e-3)
     at_s = path_time(first, 0.5)
     second = first.followed_by(
@@ -127,7 +127,7 @@ def test_speed_stays_below_the_paths_own() -> None:
         ([0.0, 0.01], [[0.0, 0, 0], [0.1, 0, 0]], r"speed 10 m/s after times_s\[0\]"),
     ],
 )
-def test_paths_that_cannot_be_followed_are_refused(
+def test_paths_that_cannot_be_followed_are_rejected(
     times: list[float], points: list[list[float]], said: str
 ) -> None:
     with pytest.raises(FingerPathError, match=said):
@@ -171,7 +171,8 @@ def write_recording(path: Path, text: str) -> Path:
 
 
 def check_recorded(path: FingerPath, scene: Scene) -> None:
-    """Such a path is followed, stays in the volume, reaches the surface, presses and leaves it."""
+    """Assert that a recorded path is followed within the volume, and touches, presses and
+    leaves."""
     radius_m = scene.object.geometry.radius_m
     points = path.positions_world_m
     assert (points >= scene.finger.volume_min_m).all()
@@ -218,7 +219,7 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "a path needs two"),
     ],
 )
-def test_a_bad_recording_is_refused(tmp_path: Path, scene: Scene, text: str, said: str) -> None:
+def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, said: str) -> None:
     with pytest.raises(FingerPathError, match=said):
         recorded_path(write_recording(tmp_path / "hand.csv", text), scene)
     with pytest.raises(FingerPathError, match="cannot be read"):
@@ -248,7 +249,7 @@ def test_the_twins_own_optics_agree_with_opencv(
 
 
 def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
-    """Centre of what is brighter than any finger, within 12 px of a place."""
+    """Return the centre of the light brighter than any finger, within 12 px of a position."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     weight = np.maximum(image.astype(float) - 110.0, 0.0)
     weight[np.hypot(x - near[0], y - near[1]) > 12] = 0.0
@@ -256,10 +257,10 @@ def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("speed_m_per_s", [0.0, 0.1, 1.5])
-def test_the_marks_light_is_centred_on_the_fingertip(
+def test_the_markers_light_is_centred_on_the_fingertip(
     camera: TwinCamera, speed_m_per_s: float
 ) -> None:
-    """The share of the mark in each pixel: its light over that of black ground under it."""
+    """The light is compared with the marker over black ground."""
     generator = np.random.default_rng(5)
     velocity = speed_m_per_s * np.array([0.8, 0.6, 0.0])
     for _ in range(10):
@@ -278,7 +279,7 @@ def test_the_marks_light_is_centred_on_the_fingertip(
             assert np.abs(centre - eye.see(tip)[0]).max() < 0.02
 
 
-def test_noise_is_new_in_each_picture_and_as_large_as_stated(camera: TwinCamera) -> None:
+def test_noise_is_new_in_each_image_and_as_large_as_stated(camera: TwinCamera) -> None:
     def still(_: float) -> Floats:
         return np.array([0.0, 0.0, 0.02])
 
@@ -290,7 +291,7 @@ def test_noise_is_new_in_each_picture_and_as_large_as_stated(camera: TwinCamera)
     assert len({picture.tobytes() for picture in pictures}) == len(pictures)
 
 
-def test_the_background_is_textured_and_darker_than_any_mark(camera: TwinCamera) -> None:
+def test_the_background_is_textured_and_darker_than_any_marker(camera: TwinCamera) -> None:
     left, right = camera.picture(lambda _: np.array([0.0, 0.0, 5.0]), exposure_s=0.004)
     for image in (left, right):
         assert image.shape == (480, 640)
@@ -306,7 +307,7 @@ def test_a_finger_out_of_sight_is_not_drawn(camera: TwinCamera, place: list[floa
 
 
 class Sent:
-    """What a node sent, by topic."""
+    """Messages of a node by topic."""
 
     def __init__(self) -> None:
         self.messages: list[tuple[str, Any, Header]] = []
@@ -384,7 +385,7 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
 
 
 class SkippingClock(SystemClock):
-    """The machine's clock, which a test can push ahead as a stalled process would find it."""
+    """Real clock with jumps, as a stalled process would experience."""
 
     ahead_ns = 0
 

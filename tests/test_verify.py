@@ -1,4 +1,4 @@
-"""`bag verify` of every node: what it did live is done again, though it was late; or why not."""
+"""Test `bag verify` of every node: replayed results equal live ones, or the reason why not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plan_of(folder: Path) -> ResolvedGraph:
 
 @dataclass
 class Live:
-    """Nodes of the demo on one clock, each late now and then, and a recorder that is not."""
+    """Nodes of the demo on one clock, with random delays, and a recorder without."""
 
     plan: ResolvedGraph
     writer: BagWriter
@@ -65,13 +65,13 @@ class Live:
         self.writer.write(topic, message, header, self.clock.now_ns() + 1000)
 
     def say(self, topic: str, message: Message, sequence: int, writer: str) -> None:
-        """What a node said that does not take part."""
+        """Publish a message of a node that does not run."""
         now_ns = self.clock.now_ns()
         header = Header(sequence, now_ns - 4_000_000, now_ns, "lab", writer, 5)
         self.send(TOPICS[topic], message, header)
 
     async def hand(self, topic: str, *names: str) -> None:
-        """Give the newest message of a topic to nodes; time passes meanwhile."""
+        """Pass the newest message of a topic to nodes, while time passes."""
         for name in names:
             entry = self.newest.get(topic)
             if entry is not None and self.handed.get((topic, name)) is not entry:
@@ -85,7 +85,7 @@ class Live:
 
 
 async def live(folder: Path) -> Path:
-    """A finger that comes and presses, as it went through the graph."""
+    """Record a finger that approaches and presses."""
     bag, plan = folder / "live.mcap", plan_of(folder)
     scene = plan.scene_message()
     assert scene is not None
@@ -147,13 +147,13 @@ def test_what_a_node_did_live_it_does_again_to_the_last_bit(bag: Path, name: str
     assert result.topics[output].compared >= FRAMES // 2
 
 
-def test_pictures_are_drawn_again_to_the_last_pixel(bag: Path) -> None:
+def test_images_are_drawn_again_to_the_last_pixel(bag: Path) -> None:
     result = verify(bag, "renderer")
     assert result.repeatable, result
     assert result.topics["frame"].replayed > 3
 
 
-def test_without_the_nodes_word_the_recorders_order_is_another(bag: Path, tmp_path: Path) -> None:
+def test_without_the_execution_log_the_recorders_order_differs(bag: Path, tmp_path: Path) -> None:
     old = rewritten(bag, tmp_path / "old.mcap", log=False)
     result = verify(old, "planner")
     assert result.same_bytes
@@ -186,10 +186,10 @@ def rewritten(
         ("arm_left_bridge", "commands an arm"),
         ("twin_arms", "over TCP"),
         ("twin_finger", "takes images by its own clock"),
-        ("recorder", "wrote this bag"),
+        ("recorder", "recorded this bag"),
     ],
 )
-def test_nodes_that_cannot_be_stepped_say_why(bag: Path, name: str, why: str) -> None:
+def test_nodes_that_cannot_be_replayed_give_a_reason(bag: Path, name: str, why: str) -> None:
     with pytest.raises(BagError, match=f"{name} cannot be replayed: .*{why}"):
         verify(bag, name)
 

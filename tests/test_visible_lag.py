@@ -1,4 +1,4 @@
-"""How late what is drawn is when its light leaves, from pictures whose lag is known."""
+"""Test the lag of displayed images, with images of known lag."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def angle(times_s: Floats) -> Floats:
 
 
 def axes(times_s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Contact point, y and z axis (n, 3) of a sheet that is tangent where the finger is."""
+    """Return contact point, y and z axis (n, 3) of a sheet that is tangent at the finger."""
     a, zero = angle(times_s), np.zeros(len(times_s))
     normal = np.column_stack([zero, np.sin(a), np.cos(a)])
     return RADIUS * normal - [0, 0, RADIUS], np.column_stack([zero, np.cos(a), -np.sin(a)]), normal
@@ -81,7 +81,7 @@ def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
 
 
 @pytest.mark.parametrize("lag_s", [-0.007, 0.0, 0.012])
-def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
+def test_the_lag_of_marker_sheet_and_indentation_is_reported(lag_s: float) -> None:
     pictures = stroke.DrawnFrames([], [], [])
     for light_s in np.arange(0.1, 12.0, 1 / 15):
         pictures.add(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
@@ -91,7 +91,7 @@ def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
     assert told["object"] == pytest.approx(20.0)
 
 
-def test_too_few_pictures_tell_no_lag() -> None:
+def test_too_few_images_give_no_lag() -> None:
     pictures = stroke.DrawnFrames([], [], [])
     pictures.add(frame(3.0, 0.0, 0.0, 0.0))
     pictures.add(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))

@@ -1,4 +1,4 @@
-"""An eighth of a thick sphere, meshed with the solver's own lattice, for tests."""
+"""Mesh an eighth of a thick sphere with the solver's lattice, for tests."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ INNER, OUTER = 1.0, 2.0
 
 
 def eighth(layers: int) -> tuple[Floats, Ints]:
-    """Nodes and elements between the spheres, x, y, z >= 0: this many cells of the lattice across
-    the wall and twice as many along each arc; edges on the spheres curved."""
+    """Return nodes and elements between the spheres for x, y, z >= 0, with curved edges on the
+    spheres.
+
+    layers: number of lattice cells across the wall; each arc has twice as many.
+    """
     cells = 2 * layers
     vertices, tetrahedra = make_lattice((cells, cells, cells))
     u = vertices / (CELL * cells)
@@ -42,12 +45,12 @@ def eighth(layers: int) -> tuple[Floats, Ints]:
 
 
 def symmetry(nodes: Floats) -> Ints:
-    """Degrees of freedom across the planes of symmetry."""
+    """Return the degrees of freedom across the planes of symmetry."""
     return np.flatnonzero((nodes == 0.0).ravel())
 
 
 def faces_at(nodes: Floats, elements: Ints, radius: float) -> Ints:
-    """Six-node faces on a sphere, outward."""
+    """Return the outward six-node faces on a sphere."""
     faces = boundary_faces(elements)
     there = np.isclose(np.linalg.norm(nodes, axis=1), radius, rtol=1e-9)
     return faces[there[faces].all(axis=1)]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 DEADLINE_S = 120.0
-"""Only a failing test waits so long: a machine with far more to do than it can is no failure."""
+"""Timeout that only a failing test reaches, even on a busy machine."""
 
 NOTHING_COMES_S = 0.3
 """Time to wait before concluding that an event does not occur."""
