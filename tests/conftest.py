@@ -39,14 +39,13 @@ SKIPPED_FILE = "SKIPPED_FILE"
 
 def pytest_configure(config: pytest.Config) -> None:
     """Create the folder that the processes of this run share, for `tests/shared.py`."""
-    if not hasattr(config, "workerinput"):
+    if FOLDER_VARIABLE not in os.environ:
         os.environ[FOLDER_VARIABLE] = tempfile.mkdtemp(prefix="flexsheet-tests-")
+        config.add_cleanup(remove_shared_folder)
 
 
-def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove that folder."""
-    if not hasattr(config, "workerinput"):
-        shutil.rmtree(os.environ.pop(FOLDER_VARIABLE))
+def remove_shared_folder() -> None:
+    shutil.rmtree(os.environ.pop(FOLDER_VARIABLE))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -72,10 +72,10 @@ def longer(opcode: int, length: int) -> Callable[[bytes], bytes]:
 
 
 def bomb(data: bytes) -> bytes:
-    """Insert a chunk of 4 GB of zeros, compressed to some hundred KB, after the first header."""
+    """Insert a chunk of 1 GB of zeros, compressed to some ten KB, after the first header."""
     packer = zstandard.ZstdCompressor(level=1).compressobj()
-    packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(4096)) + packer.flush()
-    body = struct.pack("<QQQI", 0, 1, 4096 << 20, 0) + struct.pack("<I", 4) + b"zstd"
+    packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1024)) + packer.flush()
+    body = struct.pack("<QQQI", 0, 1, 1024 << 20, 0) + struct.pack("<I", 4) + b"zstd"
     body += struct.pack("<Q", len(packed)) + packed
     return _behind_header(data, struct.pack("<BQ", 0x06, len(body)) + body)
 

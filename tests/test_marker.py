@@ -264,7 +264,18 @@ def test_no_image_breaks_the_search(seed: int) -> None:
             assert np.linalg.eigvalsh(marker.covariance).min() > 0
 
 
-def test_the_marker_family_distinguishes_the_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+FEW_CASES = ((3.2, 2.0, 0.0, 0.0), (3.2, 1.0, 4.0, 0.0), (6.0, 1.0, 0.0, 3.0), (1.6, 4.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "cases",
+    [FEW_CASES, pytest.param(benchmarks.MARKER_CASES, marks=pytest.mark.long)],
+    ids=["few", "all"],
+)
+def test_the_marker_family_distinguishes_the_methods(
+    cases: tuple[tuple[float, float, float, float], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmarks, "MARKER_CASES", cases)
     monkeypatch.setattr(benchmarks, "MARKER_IMAGES", 12)
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]

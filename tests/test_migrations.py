@@ -19,6 +19,7 @@ from flexsheet.messages.migrations import find_migration, is_compatible
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Fingertip, Frame, TwinFinger
+from tests.examples import examples
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")
@@ -208,6 +209,7 @@ def test_a_migration_that_gives_a_wrong_field_is_an_error(
         list(BagReader(changed))
 
 
+@examples(40)
 @given(st.recursive(st.none() | st.booleans() | st.integers() | st.text(),
                     lambda parts: st.lists(parts) | st.dictionaries(
                         st.sampled_from(["$ref", "properties", "required", "enum", "anyOf",

@@ -101,6 +101,16 @@ def stands(states: list[ArmState]) -> bool:
     return float(np.ptp([state.joints_rad for state in states], axis=0).max()) < 1e-3
 
 
+def followed_rad(lab: Lab, side: str, begin: int) -> float:
+    """How far that joint turned which turned most while its arm followed."""
+    joints_rad = [
+        state.joints_rad
+        for topic, state in lab.seen[begin:]
+        if topic == f"arm_{side}" and isinstance(state, ArmState) and state.mode == "follow"
+    ]
+    return float(np.ptp(joints_rad, axis=0).max()) if joints_rad else 0.0
+
+
 async def next_states(lab: Lab, side: str, count: int) -> list[ArmState]:
     topic, begin = f"arm_{side}", len(lab.seen)
 
@@ -118,6 +128,11 @@ async def test_arms_that_stroke_stop_at_a_cut_cable_and_move_when_told_so() -> N
         lab.stroke()
         await lab.until(lambda: lab.modes() == {"idle"}, "both arms to stand")
         await told_to_move(lab)
+        begin = len(lab.seen)
+        await lab.until(
+            lambda: all(followed_rad(lab, side, begin) > 1.5 * TURNED_RAD for side in SIDES),
+            "both arms to turn the sheet",
+        )
         await a_cable_is_cut(lab)
         judge_words(lab)
         scene = lab.plan().scene_message()
