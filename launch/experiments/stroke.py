@@ -298,8 +298,12 @@ def read_recording(bag: Path) -> StrokeRecording:
         return make_motion(rows, f"arm {key}")
 
     true_arms = apply_apparatus(scene, apparatus).arms
+    delays_s = group_by_event(delays)
     if apparatus is not None:
-        pictures = pictures.shifted(round(1e9 * apparatus.projector.latency_offset_s))
+        late_s = apparatus.projector.latency_offset_s
+        pictures = pictures.shifted(round(1e9 * late_s))
+        if "light" in delays_s:
+            delays_s["light"] += late_s
     return StrokeRecording(
         scene=scene,
         fingertip=make_motion(fingertip, "fingertip"),
@@ -308,7 +312,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         windows_ns=_windows_ns(times_by_label),
         measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
         true_edges=(edges("true_left", true_arms.left), edges("true_right", true_arms.right)),
-        delays_s=group_by_event(delays),
+        delays_s=delays_s,
         drops=sum(losses.values()),
         pictures=pictures,
     )
