@@ -18,8 +18,10 @@ from flexsheet.messages.apparatus import Apparatus, FingerTruth, nominal_apparat
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
-from flexsheet.nodes.arm_bridge.target_period import MIN_INTERVALS, TargetPeriod
+from flexsheet.nodes.models.measured_period import MIN_INTERVALS, MeasuredPeriod
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.twin.arms import Controller
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
@@ -412,11 +414,22 @@ def test_the_true_sheet_has_the_slipped_width() -> None:
 
 
 def test_a_bridge_learns_the_period_of_another_camera() -> None:
-    period = TargetPeriod(1.0 / 60.0)
+    period = MeasuredPeriod(1.0 / 60.0)
     for number in range(1, 20):
         assert period.add(round(number * 1e9 / 58.0)) == 1.0 / 60.0
-    period = TargetPeriod(1.0 / 60.0)
+    period = MeasuredPeriod(1.0 / 60.0)
     learnt = [period.add(round(number * 1e9 / 15.0)) for number in range(1, 20)]
     assert learnt[MIN_INTERVALS - 2] == 1.0 / 60.0
     assert learnt[-1] == pytest.approx(1.0 / 15.0, rel=1e-6)
     assert period.add(round(30e9)) == pytest.approx(1.0 / 15.0, rel=1e-6), "an interruption"
+
+
+async def test_a_track_outlasts_a_missed_image_at_any_rate() -> None:
+    harness = build_node(Triangulator, TriangulatorParameters())
+    await harness.step("scene", SCENE)
+    for number in range(1, 20):
+        harness.node._adapt_timeout(round(number * 1e9 / 60.0))
+    assert harness.node.tracker.settings.track_timeout_s == 0.1
+    for number in range(1, 20):
+        harness.node._adapt_timeout(round(1e9 + number * 1e9 / 15.0))
+    assert harness.node.tracker.settings.track_timeout_s == pytest.approx(2.5 / 15.0, rel=1e-6)

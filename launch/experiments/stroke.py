@@ -174,6 +174,7 @@ class StrokeRecording:
     Edges are rows (9,): middle of the clamped edge, its y axis, its z axis, in the world.
     delays_s: from the middle of an exposure to each event that it caused, by event.
     drops: lost or refused messages, without those that a `latest` reader skipped.
+    apparatus: where the truth came from.
     """
 
     scene: Scene
@@ -185,6 +186,7 @@ class StrokeRecording:
     true_edges: tuple[SampledMotion, SampledMotion]
     delays_s: dict[str, Floats]
     drops: int
+    apparatus: str = "nominal"
     pictures: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
 
     def arm_delays_s(self) -> Floats:
@@ -314,6 +316,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         true_edges=(edges("true_left", true_arms.left), edges("true_right", true_arms.right)),
         delays_s=delays_s,
         drops=sum(losses.values()),
+        apparatus="nominal" if apparatus is None else apparatus.origin,
         pictures=pictures,
     )
 
@@ -605,6 +608,7 @@ def stroke_result(
     lag = lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {
         "seconds": seconds,
+        "apparatus": recording.apparatus,
         "valid_ratio": len(errors.seconds) / len(errors.true_seconds),
         "delta_d_mm": summary(errors.delta_d_m, 1e3),
         "delta_theta_deg": summary(errors.delta_theta_rad, np.degrees(1.0)),

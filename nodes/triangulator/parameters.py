@@ -55,7 +55,8 @@ class TriangulatorParameters(NodeParameters):
         default=60.0, description="maximum acceleration of a finger; points beyond it are rejected"
     )
     track_timeout_s: Positive = Field(
-        default=0.1, description="time without a point after which the track is lost"
+        default=0.1,
+        description="time without a point after which the track is lost; at least 2.5 image pairs",
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
         default=3, description="number of consistent points that begin a track"
