@@ -127,11 +127,11 @@ class LogUniform:
     high: float
 
     def draw(self, random: np.random.Generator) -> float:
-        return self.low * (self.high / self.low) ** float(random.random())
+        return float(self.low * (self.high / self.low) ** float(random.random()))
 
     def at(self, sigmas: float) -> float:
         share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
-        return self.low * (self.high / self.low) ** share
+        return float(self.low * (self.high / self.low) ** share)
 
     def text(self, scale: float) -> str:
         return f"log-U({self.low * scale:.4g}, {self.high * scale:.4g})"
