@@ -57,8 +57,8 @@ class CameraTruth(Part):
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
-    left: LensTruth = LensTruth()
-    right: LensTruth = LensTruth()
+    left: LensTruth = Field(default_factory=LensTruth)
+    right: LensTruth = Field(default_factory=LensTruth)
     right_position_offset_m: SmallTriple = Field(
         default=ZERO_3, description="of the right camera, in its own frame"
     )
@@ -112,8 +112,8 @@ class ArmTruth(Part):
 
 
 class ArmsTruth(Part):
-    left: ArmTruth = ArmTruth()
-    right: ArmTruth = ArmTruth()
+    left: ArmTruth = Field(default_factory=ArmTruth)
+    right: ArmTruth = Field(default_factory=ArmTruth)
 
 
 class SheetTruth(Part):
@@ -193,7 +193,7 @@ class ProjectorTruth(Part):
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
-    lens: LensTruth = LensTruth()
+    lens: LensTruth = Field(default_factory=LensTruth)
     latency_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
         default=0.0, description="true time of light minus the renderer's display_latency_s"
     )
@@ -222,12 +222,12 @@ class Apparatus(Message):
         default=None,
         description="devices from which the differences are counted; null: those of the scene",
     )
-    camera: CameraTruth = CameraTruth()
-    arms: ArmsTruth = ArmsTruth()
-    sheet: SheetTruth = SheetTruth()
-    finger: FingerTruth = FingerTruth()
-    eyes: EyesTruth = EyesTruth()
-    projector: ProjectorTruth = ProjectorTruth()
+    camera: CameraTruth = Field(default_factory=CameraTruth)
+    arms: ArmsTruth = Field(default_factory=ArmsTruth)
+    sheet: SheetTruth = Field(default_factory=SheetTruth)
+    finger: FingerTruth = Field(default_factory=FingerTruth)
+    eyes: EyesTruth = Field(default_factory=EyesTruth)
+    projector: ProjectorTruth = Field(default_factory=ProjectorTruth)
 
 
 def identify_scene(scene: Scene) -> str:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import ast
+import json
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
+from click.testing import Result
 from pydantic import BaseModel
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.apparatus import format_apparatus, load_apparatus, parse_draw
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -19,11 +24,13 @@ from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.nodes import NODES, NodeRole, node_class
 from flexsheet.nodes.node import Input, Node, parameters_of, ports_of, role_of
+from flexsheet.nodes.twin import tolerance_table
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,
     TRUTH_SECTIONS,
     Profile,
+    deviate_apparatus,
     expand_key,
     iterate_paths,
     list_differences,
@@ -117,7 +124,8 @@ def test_seeds_differ(scene: Scene) -> None:
 
 def test_a_new_row_changes_no_other_value(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     before = values_of(scene, 3)
-    monkeypatch.delitem(TOLERANCES, "camera.position_offset_m")
+    fewer = {key: row for key, row in TOLERANCES.items() if key != "camera.position_offset_m"}
+    monkeypatch.setattr(tolerance_table, "TOLERANCES", fewer)
     after = values_of(scene, 3)
     assert {path for path in before if before[path] != after[path]} == {"camera.position_offset_m"}
 
@@ -158,6 +166,20 @@ def test_the_mean_and_spread_of_a_row_are_those_of_its_draws() -> None:
         draws = np.array([given.draw(random) for _ in range(4000)])
         assert draws.mean() == pytest.approx(mean, abs=0.06 * sigma)
         assert draws.std() == pytest.approx(sigma, rel=0.05)
+
+
+@pytest.mark.parametrize("key", TOLERANCES)
+def test_one_row_can_deviate_alone(scene: Scene, key: str) -> None:
+    for profile in Profile:
+        for sigmas in (-3.0, 1.0):
+            given = deviate_apparatus(scene, key, sigmas, profile=profile)
+            changed = {path for path, *_ in list_differences(given)}
+            assert changed <= set(expand_key(key))
+    low, high = (
+        value_at(deviate_apparatus(scene, key, sigmas).model_dump(), expand_key(key)[0])
+        for sigmas in (-1.0, 1.0)
+    )
+    assert low == high or low < high
 
 
 def test_offsets_move_the_true_devices(scene: Scene) -> None:
@@ -340,3 +362,23 @@ def test_graphs_without_a_simulator_refuse_an_apparatus(tmp_path: Path) -> None:
         load_graph(launch_file, apparatus="seed:1")
     with pytest.raises(BadInputError, match="use the option --apparatus"):
         load_graph(DEMO, settings=["twin_eye.apparatus={scene: cylinder}"])
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["apparatus", *arguments])
+
+
+def test_the_command_samples_and_shows(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    made = run("sample", "--seed", "4", "--profile", "paper", "-o", str(file), "--json")
+    assert made.exit_code == 0, made.output
+    assert json.loads(made.stdout)["origin"] == "seed:4,paper"
+    shown = run("show", str(file), "--json")
+    rows = {row["parameter"]: row for row in json.loads(shown.stdout)["differences"]}
+    assert rows["camera.rate_hz"]["unit"] == "Hz"
+    assert rows["sheet.density_kg_per_m3"]["simulated"] is False
+    assert rows["arms.left.servo_lag_s"]["simulated"] is True
+    assert "sheet.modulus_ratio" in run("show", "seed:4").stdout
+    refused = run("sample", "--seed", "4", "--profile", "old", "-o", str(file))
+    assert isinstance(refused.exception, CommandError)
+    assert "modern or paper" in str(refused.exception)

@@ -23,9 +23,11 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from flexsheet.launch import cli
+from flexsheet.launch.plans.apparatus import load_apparatus
 from flexsheet.launch.plans.documents import read_document, validate
 from flexsheet.launch.plans.launch_file import LaunchFile
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
@@ -137,6 +139,9 @@ def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -
         check_nodes({name: one.model_dump() for name, one in spec.nodes.items()})
         if {"scene", "nodes"} <= keys:
             load_graph(file)
+    elif "scene" in keys and keys <= set(Apparatus.model_fields):
+        file.write_text(text)
+        load_apparatus(str(file), load_scene(SCENE))
     elif keys <= set(Scene.model_fields):
         whole = YAML(typ="safe").load(SCENE.read_text()) | dict(values)
         YAML(typ="safe").dump(whole, file)

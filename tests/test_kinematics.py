@@ -355,9 +355,7 @@ weird = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 @settings(max_examples=200)
 @given(arrays(np.float64, (4, 4), elements=weird), in_range)
-def test_joints_are_in_range_or_the_error_names_it(
-    pose: Floats, present: Floats
-) -> None:
+def test_joints_are_in_range_or_the_error_names_it(pose: Floats, present: Floats) -> None:
     for solve in (solve_next_joints, inverse_kinematics):
         try:
             with np.errstate(all="ignore"):

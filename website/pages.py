@@ -15,6 +15,7 @@ from website import (
     messages_page,
     parameters_page,
     registers_page,
+    tolerances_page,
 )
 from website.graph import DRAWINGS, svg
 
@@ -24,7 +25,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 def generate(docs: Path) -> dict[Path, str]:
     """Return the contents of all generated files by their path relative to `docs`.
 
-    docs: folder with arms.md and modbus.md, which are generated in part.
+    docs: folder with apparatus.md, arms.md and modbus.md, which are generated in part.
     """
     return {
         Path("messages.md"): messages_page.reference(),
@@ -33,6 +34,9 @@ def generate(docs: Path) -> dict[Path, str]:
         Path("errors.md"): errors_page.reference(),
         Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
+        Path("apparatus.md"): tolerances_page.page(
+            (docs / "apparatus.md").read_text(encoding="utf-8")
+        ),
         **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
     }
 

@@ -301,6 +301,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
             "rms_percent": float(np.sqrt(np.mean(errors_moving**2))),
             "worst_percent": float(np.abs(errors_moving).max()),
         },
+        "apparatus": "nominal" if recorded.apparatus is None else recorded.apparatus.origin,
         "bag": str(bag),
     }
 

@@ -179,6 +179,7 @@ class StrokeRecording:
     Edges are rows (9,): centre of the clamped edge, its y axis and its z axis, in the world.
     delays_s: from the middle of an exposure to each event that it caused, by event. drops: number
     of lost or refused messages, except those that a `latest` reader skipped.
+    apparatus: where the truth came from.
     """
 
     scene: Scene
@@ -190,6 +191,7 @@ class StrokeRecording:
     true_edges: tuple[SampledMotion, SampledMotion]
     delays_s: dict[str, Floats]
     drops: int
+    apparatus: str = "nominal"
     frames: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
 
     def arm_delays_s(self) -> Floats:
@@ -307,8 +309,12 @@ def read_recording(bag: Path) -> StrokeRecording:
         return make_motion(rows, f"arm {key}")
 
     true_arms = apply_apparatus(scene, apparatus).arms
+    delays_s = group_by_event(delays)
     if apparatus is not None:
-        pictures = pictures.shifted(round(1e9 * apparatus.projector.latency_offset_s))
+        late_s = apparatus.projector.latency_offset_s
+        pictures = pictures.shifted(round(1e9 * late_s))
+        if "light" in delays_s:
+            delays_s["light"] += late_s
     return StrokeRecording(
         scene=scene,
         fingertip=make_motion(fingertip, "fingertip"),
@@ -320,8 +326,9 @@ def read_recording(bag: Path) -> StrokeRecording:
             make_edges("true_left", true_arms.left),
             make_edges("true_right", true_arms.right),
         ),
-        delays_s=group_by_event(delays),
+        delays_s=delays_s,
         drops=sum(losses.values()),
+        apparatus="nominal" if apparatus is None else apparatus.origin,
         frames=frames,
     )
 
@@ -623,6 +630,7 @@ def stroke_result(
     lag = estimate_lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {
         "seconds": seconds,
+        "apparatus": recording.apparatus,
         "valid_ratio": len(errors.seconds) / len(errors.true_seconds),
         "delta_d_mm": summary(errors.delta_d_m, 1e3),
         "delta_theta_deg": summary(errors.delta_theta_rad, np.degrees(1.0)),

@@ -176,7 +176,9 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
                     twists_world=np.array(
                         [
                             rotation
-                            @ compute_rolling_twist(contact, scene.working_range.speed_m_per_s * direction)
+                            @ compute_rolling_twist(
+                                contact, scene.working_range.speed_m_per_s * direction
+                            )
                             for direction in (contact.axes[:, 0], contact.axes[:, 1])
                         ]
                     ),

@@ -19,7 +19,7 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.path_check import PathChecker
 from flexsheet.nodes.arm_bridge.report import LastExchange, make_arm_state
-from flexsheet.nodes.arm_bridge.target_period import TargetPeriod
+from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 
@@ -78,7 +78,7 @@ class ArmBridge(Node):
         self._scheduler = CommandScheduler(
             1.0 / given.rate_hz, target_period_s, 1.0 / given.resting_rate_hz
         )
-        self._target_period = TargetPeriod(target_period_s)
+        self._target_period = MeasuredPeriod(target_period_s)
 
     def _measure_target_period(self, source_ns: int) -> None:
         """Adapt to a camera with another rate than the scene's, unless the period is given."""

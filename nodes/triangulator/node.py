@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from flexsheet.messages.calibration import StereoCalibration, load_calibration
 from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
+from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.triangulator.data_association import DataAssociation
 from flexsheet.nodes.triangulator.filters import TRACKING_METHODS
@@ -30,6 +32,9 @@ from flexsheet.nodes.triangulator.triangulation import (
 
 PREDICTION_STEP_S = 0.01
 """Time between the points of the predicted path: ten per period of a 10 Hz tremor."""
+
+TIMEOUT_PERIODS = 2.5
+"""Least time-out of a track in periods of the camera: one image pair may be missed."""
 
 
 class Triangulator(Node):
@@ -82,7 +87,17 @@ class Triangulator(Node):
             track_timeout_s=p.track_timeout_s,
             confirm_frames=p.confirm_frames,
         )
+        self._period = MeasuredPeriod(1.0 / scene.camera.rate_hz)
         self._restart(self.epoch)
+
+    def _adapt_timeout(self, source_ns: int) -> None:
+        """Let a track outlast a missed image pair at the camera's measured rate."""
+        timeout_s = max(
+            self.parameters.track_timeout_s, TIMEOUT_PERIODS * self._period.add(source_ns)
+        )
+        if timeout_s != self.tracking.track_timeout_s:
+            self.tracking = replace(self.tracking, track_timeout_s=timeout_s)
+            self.tracker.settings = self.tracking
 
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
@@ -91,6 +106,7 @@ class Triangulator(Node):
         at_ns = header.source_ns
         if header.epoch != self.epoch:  # the camera has restarted, and its clock with it
             self._restart(header.epoch)
+        self._adapt_timeout(at_ns)
         detect_pair = partial(
             detect_all,
             pair.left,

@@ -55,7 +55,8 @@ class TriangulatorParameters(NodeParameters):
         default=60.0, description="maximum acceleration of a finger; faster points are rejected"
     )
     track_timeout_s: Positive = Field(
-        default=0.1, description="maximum time without a point before the track is lost"
+        default=0.1,
+        description="maximum time without a point before the track is lost; at least 2.5 image pairs",
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
         default=3, description="number of consecutive consistent points that start a track"

@@ -1,8 +1,8 @@
-"""The twin's arms behind the Mitsubishi real-time external control (MXT) over UDP.
+"""Simulate arms behind the Mitsubishi real-time external control (MXT) over UDP.
 
-Written on its own from `docs/mxt.md`; shares nothing with the bridge that it judges.  The robot
-program `Mxt 1,1,<filter>` is thought to be running.  What a real controller refuses, and how it
-says so, is known only in part: this one refuses more, and says nothing once its program has ended.
+This module was written from `docs/mxt.md` only, and shares nothing with the bridge that it tests.
+The robot program `Mxt 1,1,<filter>` is assumed to run.  It is known only in part what a real
+controller refuses.  This one refuses more, and does not answer after its program has ended.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ FILTER_S = 0.01
 """Time constant of the low-pass that the maker recommends for `Mxt`."""
 
 FIRST_STEP_RAD = 0.01
-"""The first set-point must be where the arm is."""
+"""Maximum distance of the first set-point from the arm's joints."""
 
 STEP_CYCLES = 2.0
-"""A set-point may be as far from the one before as full speed goes in so many cycles."""
+"""Maximum step between set-points, in cycles at full speed."""
 
 
 class MxtError(FlexsheetError):
-    """Why the robot program ends."""
+    """Raised when the robot program ends; the text gives the reason."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
 
 
 class MxtController:
-    """One arm's controller in its cycles of 7.1 ms, each of which takes one packet and answers it.
+    """Simulate one arm's controller, which takes and answers one packet per cycle.
 
     An error ends its program: the arm brakes, and no packet is answered until `restart`.  Errors
-    are a move without a first packet that only asks, a type of data that cannot be obeyed, numbers
-    that are no pose in range, a first set-point away from the arm, a leap, and `timeout_s` without
-    a packet.  filter_s: the low-pass that set-points go through ahead of the servos.
+    are: a move without a first packet that only asks; an unsupported data type; numbers that are
+    not a pose in range; a first set-point away from the arm; a jump; `timeout_s` without a packet.
+    filter_s: time constant of the low-pass on set-points.
     cycle_s, cycle_jitter_s: mean and standard deviation of a cycle.  latency_s: time from a
     set-point to its effect.
     """
@@ -107,16 +107,16 @@ class MxtController:
         self.restart()
 
     def restart(self) -> None:
-        """Clear the error and start the program again, as its operator would."""
+        """Clear the error and restart the program, as an operator does."""
         self.error = ""
         self._master: Address | None = None
         self._moved = False
         self._count = self._timeouts = self._missing = 0
 
     def receive_command(self, packet: bytes, sender: Address) -> None:
-        """A packet has come; the next cycle takes the newest.
+        """Store a packet; the next cycle takes the newest.
 
-        One of another length, and one of somebody else while external control is on, is ignored.
+        A packet of another length, or of another sender while external control is on, is ignored.
         """
         if len(packet) != _BYTES or (self._master not in (None, sender)):
             self.refused += 1
@@ -129,11 +129,11 @@ class MxtController:
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:
-        """How long until the next cycle."""
+        """Return the time until the next cycle."""
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
-        """Let `duration_s` pass, cycle by cycle; what they answer is put into `answers`."""
+        """Advance by `duration_s`, cycle by cycle; append their answers to `answers`."""
         while duration_s >= self.until_cycle_s():
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
@@ -167,7 +167,7 @@ class MxtController:
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """The set-point in force: the newest, unless the arm lags."""
+        """Return the set-point in effect: the newest, or an older one if the arm is late."""
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -200,14 +200,14 @@ class MxtController:
             self.answers.append((self._answer(command, receive_type, packet), sender))
 
     def _stay(self, sender: Address) -> None:
-        """A packet that only asks: the arm stays where it is, and the next set-point is a first."""
+        """Take a packet that only asks: the arm stops; the next set-point is a first one."""
         self._master = sender
         if self._moved:
             self.wanted_rad = self._filtered_rad = self.servo.joints_rad.copy()
             self._moved = False
 
     def _move(self, send_type: int, data: Floats, flags: int) -> None:
-        """Take a set-point; MxtError when it is one that ends the program."""
+        """Take a set-point; raise MxtError for one that ends the program."""
         if self._master is None:
             raise MxtError("a move ahead of the first packet")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
@@ -234,7 +234,7 @@ class MxtController:
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
-        """Type, eight numbers and two flags; type 0 for what this controller does not measure."""
+        """Return type, eight numbers and two flags; type 0 for what is not measured."""
         if wanted_type in _JOINTS:
             joints = self._seen(_JOINTS.index(wanted_type))
             return (wanted_type, *joints, 0.0, 0.0, 0, 0)
@@ -244,13 +244,13 @@ class MxtController:
         return (0, *([0.0] * 8), 0, 0)
 
     def _seen(self, what: int) -> Floats:
-        """The set-point, the same after the filter, or what the encoders say."""
+        """Return the set-point, the filtered set-point, or the joints by the encoders."""
         noise = self._noise_rad * self._random.standard_normal(6)
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
 
 
 def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> Floats:
-    """The joints (6,) that a packet's numbers ask for, near those before; MxtError."""
+    """Return the joints (6,) of a packet, near those before; raise MxtError if there are none."""
     if send_type not in (_POSES[0], _JOINTS[0]):
         raise MxtError(f"a set-point of type {send_type}")
     if not np.isfinite(data).all():
@@ -269,12 +269,12 @@ def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> 
 
 
 def pose_from(numbers: Floats) -> Floats:
-    """base_from_flange of x, y, z (mm) and turns about the fixed x, y, z axes (rad)."""
+    """Return base_from_flange of x, y, z (mm) and angles about the fixed x, y, z axes (rad)."""
     return transform_from_rpy(numbers[:3] * 1e-3, numbers[3:6])
 
 
 def numbers_of(pose: Floats) -> tuple[float, ...]:
-    """The six numbers of a pose: the inverse of `pose_from`."""
+    """Return the six numbers of a pose: inverse of `pose_from`."""
     turn = pose[:3, :3]
     b = math.atan2(-turn[2, 0], math.hypot(turn[0, 0], turn[1, 0]))
     a, c = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
@@ -282,19 +282,19 @@ def numbers_of(pose: Floats) -> tuple[float, ...]:
 
 
 def structure_flags(joints_rad: Floats) -> int:
-    """4 with the wrist ahead of the shoulder, 2 with the elbow up, 1 with J5 not negative."""
+    """Return the sum of 4 (wrist ahead of the shoulder), 2 (elbow up), 1 (J5 not negative)."""
     q2, q3 = float(joints_rad[1]), float(joints_rad[2])
     ahead = 0.25 * math.sin(q2) - 0.09 * math.cos(q2 + q3) + 0.16 * math.sin(q2 + q3)
     return (_RIGHT if ahead >= 0 else 0) | _ABOVE | (_NONFLIP if joints_rad[4] >= 0 else 0)
 
 
 class MxtServer:
-    """A UDP port in front of a controller."""
+    """Serve a controller on a UDP port."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called ahead of each packet and cycle, to bring the arm up to date."""
+        """`before` is called before each packet and cycle, to advance the arm's motion."""
         self.controller = controller
         self._address = (host, port)
         self._before = before
@@ -302,7 +302,7 @@ class MxtServer:
         self._due: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
-        """Listen; OSError when the port is taken."""
+        """Listen; raises OSError if the port is taken."""
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(
             lambda: _Packets(self._received), local_addr=self._address
@@ -310,7 +310,7 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """The port listened on (useful when it was given as 0)."""
+        """Return the port (useful when it was given as 0)."""
         if self._transport is None:
             raise RuntimeError("the arm's server does not listen")
         return int(self._transport.get_extra_info("sockname")[1])
@@ -328,7 +328,7 @@ class MxtServer:
         self._wait_for_cycle()
 
     def _wait_for_cycle(self) -> None:
-        """Answer when the cycle under way is over."""
+        """Answer at the end of the present cycle."""
         if self._due is None:
             loop = asyncio.get_running_loop()
             self._due = loop.call_later(self.controller.until_cycle_s(), self._flush)

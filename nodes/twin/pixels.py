@@ -166,7 +166,7 @@ class Eye:
 
 
 class TwinCamera:
-    """Draws stereo pairs of a rig, given as it really stands; the noise comes from `seed`."""
+    """Draw stereo pairs of a true rig; `seed` determines the noise."""
 
     def __init__(
         self,
@@ -225,7 +225,7 @@ class TwinCamera:
     ) -> tuple[Image, Image]:
         """Return the left and right image of a fingertip at `position(seconds from mid-exposure)`.
 
-        mark: whether the finger wears a marker.
+        marker: whether the finger wears a marker.
         time_s: time at mid-exposure of the clutter that moves.
         """
         left, right = (
@@ -462,7 +462,7 @@ class TwinCamera:
         return eye
 
     def _room(self, height: int, width: int) -> Singles:
-        """A dim, blotchy backdrop: two octaves of smooth noise, always well below the mark."""
+        """Return a dim background: two octaves of smooth noise, much darker than the marker."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
@@ -471,7 +471,7 @@ class TwinCamera:
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
-        """The sheet's levels, one per half grain: fine grain, blotches, one side lit more."""
+        """Return the sheet's levels, one per half grain: noise of two sizes, one side brighter."""
         size = [
             2 + int(np.ceil(4.0 * half_m / sheet.grain_m))
             for half_m in (sheet.half_height_m, sheet.half_width_m)

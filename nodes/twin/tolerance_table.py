@@ -127,11 +127,11 @@ class LogUniform:
     high: float
 
     def draw(self, random: np.random.Generator) -> float:
-        return self.low * (self.high / self.low) ** float(random.random())
+        return float(self.low * (self.high / self.low) ** float(random.random()))
 
     def at(self, sigmas: float) -> float:
         share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
-        return self.low * (self.high / self.low) ** share
+        return float(self.low * (self.high / self.low) ** share)
 
     def text(self, scale: float) -> str:
         return f"log-U({self.low * scale:.4g}, {self.high * scale:.4g})"
@@ -373,6 +373,40 @@ def sample_apparatus(
     return Apparatus.model_validate(values)
 
 
+def deviate_apparatus(
+    scene: Scene,
+    key: str,
+    sigmas: float,
+    *,
+    profile: Profile = Profile.MODERN,
+    calibrated: bool = False,
+) -> Apparatus:
+    """Return an apparatus that is nominal but for one row of the table, at `sigmas`.
+
+    All components of a vector, and both arms or lenses, are at the same quantile.  Raises KeyError
+    for a key that is not in the table.
+    """
+    row = TOLERANCES[key]
+    given = row.of(profile, calibrated=calibrated)
+    values = nominal_apparatus(scene).model_dump(mode="json")
+    values["origin"] = f"{key} at {sigmas:+g} sigma, {profile}"
+    period_s = 1.0 / scene.camera.rate_hz if profile in row.frame_periods else 1.0
+    for path in expand_key(key):
+        like = value_at(values, path)
+        each = (
+            given
+            if isinstance(given, tuple)
+            else (given,) * (len(like) if isinstance(like, list) else 1)
+        )
+        found = [one.at(sigmas) for one in each]
+        set_value(values, path, found if isinstance(like, list) else _timed(found[0], period_s))
+    return Apparatus.model_validate(values)
+
+
+def _timed(value: Any, period_s: float) -> Any:
+    return value if period_s == 1.0 else value * period_s
+
+
 def _draw_row(
     values: dict[str, Any], row: Tolerance, seed: int, profile: Profile, *, calibrated: bool
 ) -> None:
@@ -387,7 +421,7 @@ def _draw_row(
             drawn = max(common + row.pair.draw(random), 0.0)
         else:
             drawn = _draw(given, value_at(values, path), random)
-        set_value(values, path, drawn if period_s == 1.0 else drawn * period_s)
+        set_value(values, path, _timed(drawn, period_s))
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:

@@ -1,4 +1,4 @@
-"""Measure the period of the targets, which is that of the camera."""
+"""Measure the period of messages that come at the camera's rate."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ TOLERANCE_RATIO = 0.2
 """Deviation from the scene's period up to which the scene's counts."""
 
 
-class TargetPeriod:
-    """Hold the scene's period until the targets show another one."""
+class MeasuredPeriod:
+    """Hold the scene's period until the messages show another one."""
 
     def __init__(self, scene_period_s: float) -> None:
         self._scene_period_s = scene_period_s
@@ -23,7 +23,7 @@ class TargetPeriod:
         self._last_ns = 0
 
     def add(self, source_ns: int) -> float:
-        """Add a target with the stamp of its exposure; return the period (s)."""
+        """Add a message with the stamp of its exposure; return the period (s)."""
         interval_s = (source_ns - self._last_ns) * 1e-9
         self._last_ns = source_ns
         if 0.0 < interval_s <= MAX_PERIOD_S:

@@ -1,0 +1,54 @@
+"""Write the table of tolerances into docs/apparatus.md, between its marks."""
+
+from __future__ import annotations
+
+from flexsheet.nodes.twin.tolerance_table import (
+    NOT_SIMULATED,
+    TOLERANCES,
+    Profile,
+    Tolerance,
+    expand_key,
+)
+from website.registers_page import replace_block
+
+BEGIN = "<!-- tolerances: written by `make pages`; a test compares -->\n"
+END = "<!-- end of tolerances -->\n"
+
+
+def page(text: str) -> str:
+    """Return the page with the tolerances of the code; ValueError if a mark is missing."""
+    return replace_block(text, BEGIN, END, _render())
+
+
+def _render() -> str:
+    lines = [
+        "| parameter | unit | `modern` | `paper` | source | calibrated | source |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in TOLERANCES.values():
+        mark = " †" if any(path in NOT_SIMULATED for path in expand_key(row.key)) else ""
+        paper = "" if row.paper is None else _describe(row, Profile.PAPER, calibrated=False)
+        calibrated = "as before"
+        if row.calibrated is not None:
+            calibrated = _describe(row, Profile.MODERN, calibrated=True)
+        cells = [
+            f"`{row.key}`{mark}",
+            row.unit,
+            _describe(row, Profile.MODERN, calibrated=False),
+            paper,
+            row.source,
+            calibrated,
+            row.calibrated_source,
+        ]
+        lines.append(f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _describe(row: Tolerance, profile: Profile, *, calibrated: bool) -> str:
+    given = row.of(profile, calibrated=calibrated)
+    each = given if isinstance(given, tuple) else (given,)
+    scale = 1.0 if profile in row.frame_periods else row.scale
+    text = "; ".join(one.text(scale) for one in each)
+    if row.pair is not None:
+        text += f"; each arm + {row.pair.text(row.scale)}"
+    return text
