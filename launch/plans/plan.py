@@ -57,7 +57,11 @@ from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
 def load_graph(
-    path: Path, *, settings: Sequence[str] = (), record: Path | None = None, console: bool = False,
+    path: Path,
+    *,
+    settings: Sequence[str] = (),
+    record: Path | None = None,
+    console: bool = False,
     apparatus: str | None = None,
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.

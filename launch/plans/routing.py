@@ -24,7 +24,11 @@ FIRST_PORT, PORT_COUNT = 20_000, 10_000
 
 
 def list_writers(
-    spec: LaunchFile, entries: list[NodeEntry], document: Document, *, has_scene: bool,
+    spec: LaunchFile,
+    entries: list[NodeEntry],
+    document: Document,
+    *,
+    has_scene: bool,
     has_apparatus: bool,
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of every topic, in the order of the file."""
