@@ -89,7 +89,14 @@ TUNABLES = (
         "tracking",
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
+        _by_name(
+            "none",
+            "one_euro",
+            "constant_velocity",
+            "constant_acceleration",
+            "singer_tremor",
+            "adaptive",
+        ),
     ),
     Tunable(
         "sheet-force",

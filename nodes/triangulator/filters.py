@@ -9,7 +9,6 @@ with covariances (3, 3) m^2.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -342,28 +341,3 @@ def _white_noise(order: int, dt: float) -> Floats:
             [dt**3 / 6, dt**2 / 2, dt],
         ]
     )
-
-
-TREMOR_SIGMA_M = 3.5e-5
-"""Standard deviation per axis of the tremor of a finger that is held out or moves slowly."""
-
-TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
-    "none": Unfiltered,
-    "one_euro": OneEuro,
-    "constant_velocity": lambda max_speed: Kalman(
-        2, 0.005, 3.0, max_speed, unmodelled_tremor_m=2.0 * TREMOR_SIGMA_M
-    ),
-    "constant_acceleration": lambda max_speed: Kalman(
-        3,
-        0.1,
-        10.0,
-        max_speed,
-        acceleration_decay_per_s=10.0,
-        unmodelled_tremor_m=2.0 * TREMOR_SIGMA_M,
-    ),
-    "singer_tremor": lambda max_speed: Kalman(
-        3, 0.08, 10.0, max_speed, acceleration_decay_per_s=10.0, tremor=Tremor(TREMOR_SIGMA_M)
-    ),
-}
-"""Filters by name, made for a finger's maximum speed (m/s).  Their noises predict a wandering,
-trembling hand best over 20-50 ms without lag in reaches and taps (`flexsheet chart tracking`)."""
