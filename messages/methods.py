@@ -16,7 +16,12 @@ T = TypeVar("T", bound=str | float)
 MarkerMethod = Literal["moments", "weighted_centroid", "subpixel_fit"]
 TriangulationMethod = Literal["dlt"]
 TrackingMethod = Literal[
-    "none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"
+    "none",
+    "one_euro",
+    "constant_velocity",
+    "constant_acceleration",
+    "singer_tremor",
+    "adaptive",
 ]
 SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]

@@ -13,9 +13,9 @@ from flexsheet.nodes.triangulator.data_association import (
     SOLE_CANDIDATE_TIME_S,
     DataAssociation,
 )
-from flexsheet.nodes.triangulator.filters import TRACKING_METHODS
 from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ class Bench:
 
     def __init__(self) -> None:
         settings = TrackingSettings(max_speed_m_per_s=1.5)
-        self.tracker = Tracker(TRACKING_METHODS["singer_tremor"](1.5), settings)
+        self.tracker = Tracker(TRACKING_METHODS["adaptive"](1.5), settings)
         self.association = DataAssociation()
         self.random = np.random.default_rng(1)
         self.time_s = 10.0

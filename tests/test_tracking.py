@@ -15,9 +15,10 @@ from ruamel.yaml import YAML
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
-from flexsheet.nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter, Kalman, Tremor
+from flexsheet.nodes.triangulator.filters import Estimate, Filter, Kalman, Tremor
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
+from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]
@@ -27,14 +28,14 @@ SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(max_speed_m_per_s=1.5)
-KALMAN = ["constant_velocity", "constant_acceleration", "singer_tremor"]
+KALMAN = ["constant_velocity", "constant_acceleration", "singer_tremor", "adaptive"]
 
 
 def method(name: str) -> Filter:
     return TRACKING_METHODS[name](SETTINGS.max_speed_m_per_s)
 
 
-def new_tracker(name: str = "singer_tremor") -> Tracker:
+def new_tracker(name: str = "adaptive") -> Tracker:
     return Tracker(method(name), SETTINGS)
 
 
@@ -193,7 +194,7 @@ def test_tremor_is_predicted_by_its_model_and_not_amplified_by_others() -> None:
         return float(np.sqrt(np.mean(np.square(errors))))
 
     left_out_m = 5e-5 / np.sqrt(2)
-    assert error_m("singer_tremor") < 0.75 * left_out_m
+    assert error_m("adaptive") < 0.75 * left_out_m
     assert left_out_m < error_m("constant_velocity") < 2.0 * left_out_m
 
 
@@ -482,6 +483,6 @@ def test_methods_have_the_stated_accuracy_in_their_range() -> None:
             assert point.error < family.tolerance(SCENE)
     for motion, lead_ms in (("rest", 20), ("rest", 50), ("reach", 20), ("reach", 50)):
         best = min(TRACKING_METHODS, key=lambda name: errors[name, motion, lead_ms])
-        assert best == "singer_tremor"
-    assert errors["none", "reach", 50] > 5 * errors["singer_tremor", "reach", 50]
-    assert errors["singer_tremor", "rest", 0] < errors["none", "rest", 0]
+        assert best == "adaptive"
+    assert errors["none", "reach", 50] > 5 * errors["adaptive", "reach", 50]
+    assert errors["adaptive", "rest", 0] < errors["none", "rest", 0]

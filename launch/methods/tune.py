@@ -92,7 +92,12 @@ TUNABLES = (
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
         _make_settings(
-            "none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"
+            "none",
+            "one_euro",
+            "constant_velocity",
+            "constant_acceleration",
+            "singer_tremor",
+            "adaptive",
         ),
     ),
     Tunable(

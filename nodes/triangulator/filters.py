@@ -9,7 +9,6 @@ with covariances (3, 3) m^2.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -338,28 +337,3 @@ def _white_noise(order: int, dt: float) -> Floats:
             [dt**3 / 6, dt**2 / 2, dt],
         ]
     )
-
-
-TREMOR_SIGMA_M = 3.5e-5
-"""Standard deviation per axis of the tremor of a finger that rests in the air or moves slowly."""
-
-TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
-    "none": Unfiltered,
-    "one_euro": OneEuro,
-    "constant_velocity": lambda max_speed: Kalman(
-        2, 0.005, 3.0, max_speed, unmodelled_tremor_m=2.0 * TREMOR_SIGMA_M
-    ),
-    "constant_acceleration": lambda max_speed: Kalman(
-        3,
-        0.1,
-        10.0,
-        max_speed,
-        acceleration_decay_per_s=10.0,
-        unmodelled_tremor_m=2.0 * TREMOR_SIGMA_M,
-    ),
-    "singer_tremor": lambda max_speed: Kalman(
-        3, 0.08, 10.0, max_speed, acceleration_decay_per_s=10.0, tremor=Tremor(TREMOR_SIGMA_M)
-    ),
-}
-"""Constructors of filters by name; the argument is a finger's maximum speed, m/s.  The noise values
-are tuned for predictions over 20-50 ms (`flexsheet chart tracking`)."""

@@ -16,13 +16,13 @@ from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.triangulator.data_association import DataAssociation
-from flexsheet.nodes.triangulator.filters import TRACKING_METHODS
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.skew import compensate_detection_skew
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
@@ -61,7 +61,7 @@ class Triangulator(Node):
         self.reasons: Counter[FingertipReason] = Counter()
         marker = resolve_method(p.marker, scene.methods.marker, "subpixel_fit")
         triangulation = resolve_method(p.triangulation, scene.methods.triangulation, "dlt")
-        tracking = resolve_method(p.tracking, scene.methods.tracking, "singer_tremor")
+        tracking = resolve_method(p.tracking, scene.methods.tracking, "adaptive")
         self.methods = f"{marker}, {triangulation}, {tracking}"
         self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
         self.config = DetectorConfig(

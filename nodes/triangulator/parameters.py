@@ -49,7 +49,7 @@ class TriangulatorParameters(NodeParameters):
     )
     tracking: TrackingMethod | Literal["auto"] = Field(
         default="auto",
-        description="filter of the fingertip; auto takes the scene's method, else singer_tremor",
+        description="filter of the fingertip; auto takes the scene's method, else adaptive",
     )
     max_acceleration_m_per_s2: Positive = Field(
         default=60.0, description="maximum acceleration of a finger; faster points are rejected"
