@@ -47,19 +47,20 @@ _MODULES = {
     "SystemClock": "flexsheet.messages.clock",
     "TOPICS": "flexsheet.messages.topics",
     "VirtualClock": "flexsheet.messages.clock",
+    "find_topic": "flexsheet.messages.topics",
     "load_graph": "flexsheet.launch.plans.plan",
     "load_scene": "flexsheet.launch.plans.plan",
     "periodic": "flexsheet.nodes.node",
     "read_topic": "flexsheet.launch.running.tools",
     "recover": "flexsheet.messages.bag",
     "run_experiment": "flexsheet.launch.experiments.run",
-    "find_topic": "flexsheet.messages.topics",
 }
 
 _FORMER_NAMES = {
     "Plan": "ResolvedGraph",
     "ToolsWriter": "GraphWriter",
     "load_plan": "load_graph",
+    "topic_named": "find_topic",
 }
 
 __all__ = [

@@ -23,7 +23,7 @@ from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_appa
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.nodes import NODES, NodeRole, node_class
-from flexsheet.nodes.node import Input, Node, parameters_of, ports_of, role_of
+from flexsheet.nodes.node import Input, Node, find_parameters_type, find_ports, find_role
 from flexsheet.nodes.twin import tolerance_table
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
@@ -275,7 +275,7 @@ def test_draws_are_parsed() -> None:
 def test_only_simulator_nodes_get_the_apparatus() -> None:
     plain, given = load_graph(DEMO), load_graph(DEMO, apparatus="seed:3")
     for name, node in given.nodes.items():
-        simulated = issubclass(parameters_of(node_class(node.type)), SimulatorParameters)
+        simulated = issubclass(find_parameters_type(node_class(node.type)), SimulatorParameters)
         assert simulated == name.startswith("twin_")
         if simulated:
             assert node.parameters["apparatus"] == given.apparatus
@@ -310,12 +310,12 @@ def models_in(annotation: Any) -> set[Any]:
 def test_no_other_node_can_read_the_apparatus(name: str) -> None:
     class_ = node_class(name)
     if class_.__module__.startswith("flexsheet.nodes.twin."):
-        assert issubclass(parameters_of(class_), SimulatorParameters)
+        assert issubclass(find_parameters_type(class_), SimulatorParameters)
         return
-    assert Apparatus not in models_in(parameters_of(class_))
-    assert all(port.message is not Apparatus for port in ports_of(class_).values())
-    if role_of(class_) is not NodeRole.RECORDER:
-        parameters = parameters_of(class_)
+    assert Apparatus not in models_in(find_parameters_type(class_))
+    assert all(port.message is not Apparatus for port in find_ports(class_).values())
+    if find_role(class_) is not NodeRole.RECORDER:
+        parameters = find_parameters_type(class_)
         required = {one for one, field in parameters.model_fields.items() if field.is_required()}
         if not required:
             further = class_.further_inputs(parameters(), list(TOPICS.values()))

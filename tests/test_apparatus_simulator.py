@@ -381,7 +381,7 @@ def test_reports_take_the_true_edges() -> None:
     for order in ((SCENE, given), (given, SCENE)):
         errors = SheetErrors(Grid(0, 1.0, 1))
         for message in order:
-            errors.take(message, START_NS)
+            errors.add(message, START_NS)
         off = errors._true_edge_poses["left"] - errors._edge_poses["left"]
         assert off[:3, 3] == pytest.approx([0, 0, 1e-3])
         assert np.array_equal(errors._true_edge_poses["right"], errors._edge_poses["right"])

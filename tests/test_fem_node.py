@@ -273,7 +273,7 @@ async def test_a_newer_scene_interrupts_the_precomputation(
         meshed.wait()
         try:
             while True:
-                progress(0, 1, precompute.WorkBudget(1, 1, 1, 1))
+                progress(0, 1, precompute.ResponseBudget(1, 1, 1, 1))
                 time.sleep(0.001)
         finally:
             ended.set()

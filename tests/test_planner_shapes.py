@@ -150,7 +150,7 @@ def desk_about(name: str) -> tuple[Desk, Shape]:
 
 
 def fresh(name: str) -> tuple[Desk, Shape]:
-    """Return a new planner and the shape; a mesh's is made once per run, since it takes a second."""
+    """Return a new planner and the shape; a mesh's planner, which takes 1 s, is shared."""
     desk, shape = desk_about(name)
     new = copy.copy(desk)
     new.plan, new.seen = copy.copy(desk.plan), []

@@ -110,7 +110,10 @@ def test_bad_times_cost_a_few_frames_and_no_wrong_position(
 def test_no_clutter_is_confused_with_the_finger(
     sequences: tuple[tuple[int, int], ...],
 ) -> None:
-    """This is a short form of `benchmarks.tracking_endurance`.  sequences: seeds and numbers of frames."""
+    """Repeat `benchmarks.tracking_endurance` on few frames.
+
+    sequences: seeds and numbers of frames.
+    """
     count = 0
     for seed, frames in sequences:
         seen, _ = asyncio.run(follow(seed, frames))

@@ -68,8 +68,8 @@ def try_it(
     plan = load_graph(launch_file, settings=given, console=True, apparatus=apparatus)
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
-    given = plan.nodes["console"].parameters
-    url = f"http://{given['address']}:{given['page_port']}/"
+    console = plan.nodes["console"].parameters
+    url = f"http://{console['address']}:{console['page_port']}/"
 
     def ready(run: Run) -> None:
         if as_json:

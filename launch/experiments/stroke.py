@@ -83,7 +83,7 @@ class DrawnFrames:
         return DrawnFrames(
             [(at_ns + late_ns, row) for at_ns, row in self.fingertip],
             [(at_ns + late_ns, row) for at_ns, row in self.sheet],
-            [(at_ns + late_ns, row + late_s) for at_ns, row in self.dented],
+            [(at_ns + late_ns, row + late_s) for at_ns, row in self.deformation_ages],
         )
 
 
@@ -312,7 +312,7 @@ def read_recording(bag: Path) -> StrokeRecording:
     delays_s = group_by_event(delays)
     if apparatus is not None:
         late_s = apparatus.projector.latency_offset_s
-        pictures = pictures.shifted(round(1e9 * late_s))
+        frames = frames.shifted(round(1e9 * late_s))
         if "light" in delays_s:
             delays_s["light"] += late_s
     return StrokeRecording(

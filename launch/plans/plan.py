@@ -21,7 +21,13 @@ from flexsheet.launch.plans.apparatus import (
     load_apparatus,
     refuse_apparatus_readers,
 )
-from flexsheet.launch.plans.documents import BadInputError, Document, read_document, validate
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Problem,
+    read_document,
+    validate,
+)
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -85,7 +91,7 @@ def load_graph(
     entries = collect_entries(spec, document)
     for entry in entries:
         resolve_entry(entry, document)
-    truth = _load_apparatus(apparatus, scene, document.problems)
+    truth = _load_apparatus(apparatus, scene, document)
     give_apparatus(entries, truth, document)
     writers = list_writers(
         spec, entries, document, has_scene=scene is not None, has_apparatus=truth is not None
@@ -150,19 +156,17 @@ def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, 
         return None, None
 
 
-def _load_apparatus(
-    text: str | None, scene: Scene | None, problems: list[Problem]
-) -> Apparatus | None:
+def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -> Apparatus | None:
     if text is None:
         return None
     if scene is None:
         what = "an apparatus differs from a scene, and the launch file has none"
-        problems.append(Problem("--apparatus", (), what, 'name a scene file in "scene"'))
+        document.problems.append(Problem("--apparatus", (), what, 'name a scene file in "scene"'))
         return None
     try:
         return load_apparatus(text, scene)
     except BadInputError as error:
-        problems.extend(error.problems)
+        document.problems.extend(error.problems)
         return None
 
 

@@ -56,7 +56,7 @@ class TriangulatorParameters(NodeParameters):
     )
     track_timeout_s: Positive = Field(
         default=0.1,
-        description="maximum time without a point before the track is lost; at least 2.5 image pairs",
+        description="maximum time without a point before the track is lost; at least 2.5 frames",
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
         default=3, description="number of consecutive consistent points that start a track"

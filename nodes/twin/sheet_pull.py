@@ -25,7 +25,12 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> Rubber:
     """Return the simulator's sheet; sheet: the true one."""
     gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
     return Rubber(
-        sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa, gradient
+        sheet.width_m,
+        sheet.height_m,
+        sheet.thickness_m,
+        sheet.young_modulus_pa,
+        sheet.density_kg_per_m3,
+        gradient,
     )
 
 
