@@ -93,7 +93,7 @@ async def test_the_node_undoes_the_skew_that_a_pair_states() -> None:
                 device=scene.camera.device, exposure_s=0.004, dropped_frames=0,
                 skew_s=0.008 if told else 0.0, left=left, right=right,
             )  # fmt: skip
-            fingertip = await observer.process(pair, round(1e9 * time_s))
+            fingertip = await observer.process_pair(pair, round(1e9 * time_s))
             if fingertip is not None and fingertip.valid and frame > 20:
                 errors.append(np.linalg.norm(fingertip.position_world_m - place(time_s)))
         assert len(errors) > 30
