@@ -123,6 +123,36 @@ def test_the_deformed_mesh_is_the_simulated_sheet(place: tuple[float, float], rm
     assert np.linalg.norm(mesh.vertices - tip, axis=1).min() < rms_m
 
 
+@pytest.mark.parametrize("depth_m", [None, 0.005])
+def test_the_weight_of_the_sheet_deflects_the_mesh(depth_m: float | None) -> None:
+    """The simulated sheet has weight: 1 mm of sag at 50 degrees."""
+    density = SCENE.sheet.density_kg_per_m3
+    pose = transform(rotation_from_vector([np.radians(50.0), 0.0, 0.0]), np.zeros(3))
+    tip = None if depth_m is None else apply(pose, np.array([0.0, 0.0, -depth_m]))
+    sheet = sheet_at(pose, tip)
+    left, right = edge_poses(pose, sheet.edge_distance_m)
+    spec = SCENE.sheet
+    truth = solve(
+        Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa, density),
+        left,
+        right,
+        finger_tip=tip,
+        finger_radius_m=SCENE.finger.radius_m,
+        cells=24,
+    )
+    local = (truth.positions @ pose[:3, :3]).reshape(-1, 3)
+
+    def rms_m(density_kg_per_m3: float) -> float:
+        mesh = deflected_mesh(sheet, few_dents(), density_kg_per_m3=density_kg_per_m3)
+        points = mesh.vertices @ pose[:3, :3]
+        heights = LinearNDInterpolator(points[:, :2], points[:, 2])(local[:, :2])
+        off = (heights - local[:, 2])[np.isfinite(heights)]
+        return float(np.sqrt(np.mean(off**2)))
+
+    assert density > 0.0
+    assert rms_m(density) < 0.25 * rms_m(0.0)
+
+
 def test_meshes_reach_to_the_corners_and_the_fingertip() -> None:
     pose = transform(rotation_from_vector([0.4, 0.1, 0.0]), np.array([0.01, 0.02, -0.01]))
     tip = apply(pose, np.array([0.02, 0.01, -0.015]))
