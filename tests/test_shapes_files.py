@@ -209,8 +209,10 @@ def test_the_real_mesh_is_used_unchanged() -> None:
         read_mesh(LIVER, 1.0, None)
 
 
-def test_methods_for_cylinders_only_reject_others(tmp_path: Path) -> None:
-    with pytest.raises(UnfitGeometryError, match=r'object.geometry.shape: "mesh" .* "cylinder"'):
+def test_an_object_that_is_not_a_cylinder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        UnfitGeometryError, match=r'object.geometry.shape: expected "cylinder", found "mesh"'
+    ):
         require_cylinder(mesh_scene(tmp_path))
 
 
