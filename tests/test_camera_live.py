@@ -372,6 +372,7 @@ async def test_the_regions_come_out_with_their_origins(bag: CameraBag, scene: Sc
         bag.empty()
 
 
+@pytest.mark.alone
 async def test_a_camera_is_unplugged_and_comes_back(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
@@ -387,8 +388,8 @@ async def test_a_camera_is_unplugged_and_comes_back(
         assert all(capture.released.is_set() for capture in right.captures)
         tried = len(left.captures)
         await bench.until(lambda: len(left.captures) > tried)
-        opened = len(right.captures)
         right.plugged = True
+        opened = len(right.captures)
         await bench.until(lambda: len(right.captures) > opened)
         left.shoot(10 * PERIOD_NS, number=3)
         right.shoot(10 * PERIOD_NS, number=3, side=1)
