@@ -433,3 +433,13 @@ async def test_a_track_outlasts_a_missed_image_at_any_rate() -> None:
     for number in range(1, 20):
         harness.node._adapt_timeout(round(1e9 + number * 1e9 / 15.0))
     assert harness.node.tracker.settings.track_timeout_s == pytest.approx(2.5 / 15.0, rel=1e-6)
+
+
+async def test_a_frame_may_be_exposed_while_the_last_is_read_out() -> None:
+    fast = build_node(TwinFingerNode, TwinFingerParameters(clutter="none"))
+    given = apparatus(camera={"rate_hz": 48.0, "read_out_s": 0.01875})
+    slow = build_node(TwinFingerNode, TwinFingerParameters(clutter="none", apparatus=given))
+    for harness in (fast, slow):
+        await harness.step("scene", SCENE)
+    assert fast.node._max_late_ns == 4_000_000
+    assert slow.node._max_late_ns == pytest.approx(4e6 + 22.75e6 - 1e9 / 48.0, abs=2)
