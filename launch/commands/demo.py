@@ -9,7 +9,6 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.experiment import (
     DEMO_FILE,
-    ApparatusOption,
     LaunchOption,
     OutputOption,
     SettingsOption,
@@ -17,7 +16,7 @@ from flexsheet.launch.commands.experiment import (
     print_strokes,
     result_folder,
 )
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
 
 app = typer.Typer(add_completion=False)
