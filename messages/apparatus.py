@@ -217,7 +217,7 @@ class Apparatus(Message):
     scene_id: str | None = Field(
         default=None, description="identity of its object and devices; null: only the name counts"
     )
-    origin: str = Field(default="nominal", description="where it comes from, for people")
+    origin: str = Field(default="file", description="where it comes from, for people")
     nominal: Devices | None = Field(
         default=None,
         description="devices from which the differences are counted; null: those of the scene",
@@ -260,4 +260,9 @@ def devices_of(scene: Scene) -> Devices:
 
 def nominal_apparatus(scene: Scene) -> Apparatus:
     """Return the apparatus that equals its scene."""
-    return Apparatus(scene=scene.name, scene_id=identify_scene(scene), nominal=devices_of(scene))
+    return Apparatus(
+        scene=scene.name,
+        scene_id=identify_scene(scene),
+        origin="nominal",
+        nominal=devices_of(scene),
+    )

@@ -17,7 +17,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, FingerTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
+from flexsheet.messages.types import FingerPath, Fingertip, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes.models.measured_period import MIN_INTERVALS, MeasuredPeriod
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.triangulator.node import Triangulator
@@ -33,6 +33,7 @@ from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.sheet_pull import SheetPull, true_rubber
+from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
 from flexsheet.nodes.twin.truth import apply_apparatus
 from tests.node_harness import build_node
 from tests.test_compliance_experiment import held
@@ -42,6 +43,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SCENE = load_scene(ROOT / "launch" / "scenes" / "cylinder.yaml")
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 START_NS = 1_000_000_000
+CALIBRATION = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 
 
 def apparatus(**sections: Any) -> Apparatus:
@@ -433,3 +435,40 @@ async def test_a_track_outlasts_a_missed_image_at_any_rate() -> None:
     for number in range(1, 20):
         harness.node._adapt_timeout(round(1e9 + number * 1e9 / 15.0))
     assert harness.node.tracker.settings.track_timeout_s == pytest.approx(2.5 / 15.0, rel=1e-6)
+
+
+async def test_a_frame_may_be_exposed_while_the_last_is_read_out() -> None:
+    fast = build_node(TwinFingerNode, TwinFingerParameters(clutter="none"))
+    given = apparatus(camera={"rate_hz": 48.0, "read_out_s": 0.01875})
+    slow = build_node(TwinFingerNode, TwinFingerParameters(clutter="none", apparatus=given))
+    for harness in (fast, slow):
+        await harness.step("scene", SCENE)
+    assert fast.node._max_late_ns == 4_000_000
+    assert slow.node._max_late_ns == pytest.approx(4e6 + 22.75e6 - 1e9 / 48.0, abs=2)
+
+
+async def test_the_slowest_camera_is_tracked() -> None:
+    """A calibrated rig at 15 Hz measures this draw's marker; others are refused as merged."""
+    rate_hz = 15.0
+    given = sample_apparatus(SCENE, 2, profile=Profile.PAPER, calibrated=True)
+    assert given.camera.rate_hz == rate_hz
+    finger = build_node(TwinFingerNode, TwinFingerParameters(apparatus=given, clutter="lab"))
+    tracker = build_node(Triangulator, TriangulatorParameters(calibration=CALIBRATION))
+    await finger.node.setup()
+    await tracker.node.setup()
+    try:
+        await finger.step("scene", SCENE)
+        await tracker.step("scene", SCENE)
+        for number in range(1, 12):
+            stamp_ns = 1_000 + round(number * 1e9 / rate_hz)
+            pair = finger.node.expose(stamp_ns)
+            header = Header(number, stamp_ns, stamp_ns, "clock", "test", 1)
+            await tracker.node.step("stereo", pair, header)
+            assert tracker.node.errors == 0, tracker.node.last_error
+    finally:
+        await finger.node.close()
+        await tracker.node.close()
+    truth = finger.messages(TwinFinger)[-1][0].position_world_m
+    tip = tracker.messages(Fingertip)[-1][0]
+    assert (tip.valid, tip.state) == (True, "tracking"), tip.reason
+    assert np.linalg.norm(tip.position_world_m - truth) < 1.5e-3

@@ -64,8 +64,9 @@ def try_it(
     from flexsheet.launch.running.precompute import precompute_graph
 
     page = [f"console.page_port={port}"]
-    given = [*page, *(settings or ())]
-    plan = load_graph(launch_file, settings=given, console=True, apparatus=apparatus)
+    plan = load_graph(
+        launch_file, settings=[*page, *(settings or ())], console=True, apparatus=apparatus
+    )
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
     console = plan.nodes["console"].parameters

@@ -192,6 +192,12 @@ class TwinFingerNode(Node):
         true_s = None if given.apparatus is None else given.apparatus.camera.read_out_s
         return given.transfer_s if true_s is None else true_s
 
+    @property
+    def _max_late_ns(self) -> int:
+        """Return how late a frame may be begun; its exposure may overlap the last read-out."""
+        overlap_ns = self.exposure_ns + round(1e9 * self._read_out_s) - self.period_ns
+        return self.exposure_ns + max(0, overlap_ns)
+
     async def _film(self) -> None:
         """Simulate the exposures on a fixed time grid.
 
@@ -202,7 +208,7 @@ class TwinFingerNode(Node):
         while True:
             start_ns += self.period_ns
             late_ns = self.clock.now_ns() - start_ns
-            if late_ns > self.exposure_ns:
+            if late_ns > self._max_late_ns:
                 missed = -(-late_ns // self.period_ns)
                 self.missed_frames += missed
                 start_ns += missed * self.period_ns
