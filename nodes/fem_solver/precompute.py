@@ -102,6 +102,14 @@ class ResponseBudget:
             f"{(self.working_bytes + self.table_bytes) / 1e6:.0f} MB"
         )
 
+    def require_memory(self, skin_spacing_m: float) -> None:
+        """Raise MemoryError if the machine has too little free memory."""
+        require_memory(
+            self.working_bytes + self.table_bytes,
+            f"precomputing {self.loads} loads on {self.skin_nodes} skin nodes",
+            f"increase skin_spacing_m above {skin_spacing_m:g}",
+        )
+
 
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
@@ -152,12 +160,12 @@ def compute(
     lame_constants(1.0, spec.poisson_ratio)
     need = estimate_budget(spec)
     progress(0, need.loads + MESH_STEPS + FACTOR_STEPS, need)
-    require_memory(need, spec)
+    need.require_memory(spec.mesh.skin_spacing_m)
     mesh = build_mesh(spec.mesh)
     require_support(mesh.nodes, mesh.fixed)
     order = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed)
     need = compute_budget(mesh, order, spec.loads_per_node)
-    require_memory(need, spec)
+    need.require_memory(spec.mesh.skin_spacing_m)
     done, total = MESH_STEPS, need.loads + MESH_STEPS + FACTOR_STEPS
     progress(done, total, need)
     matrices = element_stiffness(
@@ -253,17 +261,15 @@ def make_tangents(normals: Floats) -> Floats:
     return np.stack([first, np.cross(normals, first)], axis=1)
 
 
-def require_memory(need: ResponseBudget, spec: SoftBodySpec) -> None:
-    """Raise MemoryError if the machine has less free memory than the computation needs."""
+def require_memory(required_bytes: int, what: str, remedy: str) -> None:
+    """Raise MemoryError, with a remedy, if the machine has less free memory than required."""
     import psutil
 
     free = psutil.virtual_memory().available
-    required_bytes = need.working_bytes + need.table_bytes
     if required_bytes > free:
         raise MemoryError(
-            f"precomputing {need.loads} loads on {need.skin_nodes} skin nodes needs "
-            f"{required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; increase "
-            f"skin_spacing_m above {spec.mesh.skin_spacing_m:g}"
+            f"{what} needs {required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; "
+            f"{remedy}"
         )
 
 

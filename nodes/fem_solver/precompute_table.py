@@ -184,7 +184,11 @@ def _compute_table(
     )
     total = SNAPSHOT_STEPS * len(samples) + NODE_STEPS * len(response.contact_nodes)
     progress(0, total, need)
-    _require_memory(need, spec)
+    precompute.require_memory(
+        need.bytes,
+        f"the soft body's table ({need.text()})",
+        f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
+    )
     jobs = [
         snapshots.make_snapshot_job(
             mesh_spec,
@@ -258,16 +262,3 @@ def solve_all(
         for future in waiting:
             future.cancel()
     return [solved[number] for number in range(len(jobs))]
-
-
-def _require_memory(need: TableBudget, spec: TableSpec) -> None:
-    """Raise MemoryError if the machine has less free memory than the table needs."""
-    import psutil
-
-    free = psutil.virtual_memory().available
-    if need.bytes > free:
-        raise MemoryError(
-            f"the soft body's table needs {need.bytes / 2**30:.1f} GiB ({need.text()}), "
-            f"{free / 2**30:.1f} GiB are free; increase skin_spacing_m above "
-            f'{spec.body.mesh.skin_spacing_m:g}, or set method to "linear"'
-        )

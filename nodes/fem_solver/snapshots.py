@@ -230,7 +230,11 @@ def make_snapshot_job(
             focus=focus,
         )
     return make_job_on_mesh(
-        mesh, sample, poisson_ratio=poisson_ratio, finger_radius_m=finger_radius_m
+        mesh,
+        sample,
+        poisson_ratio=poisson_ratio,
+        finger_radius_m=finger_radius_m,
+        depths_m=DEPTHS_M,
     )
 
 
@@ -240,7 +244,7 @@ def make_job_on_mesh(
     *,
     poisson_ratio: float,
     finger_radius_m: float,
-    depths_m: tuple[float, ...] = DEPTHS_M,
+    depths_m: tuple[float, ...],
 ) -> SnapshotJob:
     """Return the job of pushes at a sample point on the given mesh."""
     return SnapshotJob(

@@ -117,7 +117,7 @@ class FrameRenderer:
             scene_renderer.draw_style(shown, finger_tip, ports.sheet_target.message),
             read=with_pixels,
             eyes=select_drawn_eyes(pair, shown.stereo, which, swap_eyes=shown.swap_eyes),
-            drawn=lambda number: self._output.take(number, scene_renderer.canvas.resolved),
+            drawn=lambda number: self._output.store(number, scene_renderer.canvas.resolved),
         )
         drawn_ns = self._clock.now_ns()
         light_ns = 0

@@ -39,7 +39,7 @@ class OutputWindow(Protocol):
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
-    def take(self, number: int, image: moderngl.Framebuffer) -> None: ...
+    def store(self, number: int, image: moderngl.Framebuffer) -> None: ...
     def show(self, tag: Any, display: Display) -> None: ...
     def poll(self) -> bool: ...
     def close(self) -> None: ...
@@ -58,7 +58,7 @@ class OffscreenOutput:
     def open(self, size: tuple[int, int]) -> None:
         """Do nothing: there is no window."""
 
-    def take(self, number: int, image: moderngl.Framebuffer) -> None:
+    def store(self, number: int, image: moderngl.Framebuffer) -> None:
         """Do nothing: images are not stored."""
 
     def show(self, tag: Any, display: Display) -> None:
@@ -145,7 +145,7 @@ class ProjectorWindow:
         self.is_seen, self.note = True, ""
         self._note_size(size, self._presenter.framebuffer_px)
 
-    def take(self, number: int, image: moderngl.Framebuffer) -> None:
+    def store(self, number: int, image: moderngl.Framebuffer) -> None:
         """Store the image of eye `number` for the next `show`."""
         if self._presenter is None:
             return

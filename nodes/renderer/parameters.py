@@ -19,7 +19,10 @@ class RendererParameters(NodeParameters):
     idle_rate_hz: Positive = Field(
         default=1.0, description="Frame rate while nothing moves and no finger is tracked."
     )
-    output: Literal["headless", "window"] = "headless"
+    output: Literal["headless", "window"] = Field(
+        default="headless",
+        description="headless: no window. window: a window on the projector's monitor.",
+    )
     monitor: str | int | None = Field(
         default=None,
         description="Monitor of the projector, by name or number. null: an ordinary window.",
