@@ -352,7 +352,7 @@ def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
             paths.append(tmp_path / f"{len(paths)}{matrix[0, 0]:.0f}.png")
             picture = render(rigid.transform(np.eye(3), place), rays_of(matrix), camera_from_left)
             cv2.imwrite(str(paths[-1]), picture)
-    with pytest.raises(CalibrationError, match=r"do not determine the rig.*tilt the board"):
+    with pytest.raises(CalibrationError, match=r"do not determine the rig.*tilt of the board"):
         calibrate(pictures.left, pictures.right)
 
 

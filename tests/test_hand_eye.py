@@ -229,9 +229,7 @@ def test_when_nothing_fits_together_it_says_so() -> None:
             zip(detections, [*detections[5:], *detections[:5]], strict=True)
         )
     ]
-    with pytest.raises(
-        HandEyeError, match=r"(contradict|do not agree) .*check that the joints are those"
-    ):
+    with pytest.raises(HandEyeError, match=r"contradict .*check that the joints are measured"):
         calibrate_base(shuffled, RIG)
 
 
@@ -261,7 +259,7 @@ def test_joints_that_are_none_are_named(joints: Floats) -> None:
     detections = Workplace(9).detections(6)
     one = detections[2]
     detections[2] = BoardDetection(one.name, joints, one.left, one.right)
-    with pytest.raises(HandEyeError, match="place 2: needs six finite joints"):
+    with pytest.raises(HandEyeError, match="place 2: expected six finite joint angles"):
         calibrate_base(detections, RIG)
 
 

@@ -26,7 +26,7 @@ RunOption = Annotated[
         autocompletion=complete.runs,
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 class NoGraphError(CommandError):

@@ -63,7 +63,7 @@ def launch(
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="BAG", help="Bag file for the topics of the launch file's `log`."),
+        typer.Option(metavar="BAG", help="Bag file to record the logged topics to."),
     ] = None,
     console: Annotated[
         bool,
