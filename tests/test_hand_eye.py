@@ -446,7 +446,7 @@ def test_one_arm_alone_from_a_folder(
         "calibrate", "arms", *COMMON, "--right-arm", tmp_path, "-o", tmp_path / "arms.yaml",
     )  # fmt: skip
     assert code == 0, err
-    assert "right arm        8 of 8 poses used" in out
+    assert "8 of 8 poses used" in out
     assert "  right:\n    world_from_base: {position_m: [" in out
     assert load_arms_calibration(tmp_path / "arms.yaml").left is None
 
