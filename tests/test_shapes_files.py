@@ -190,7 +190,7 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
         read_mesh(tmp_path / "a.ply", 0.001, None)
     with (tmp_path / "huge.stl").open("wb") as file:
         file.truncate(MAX_BYTES + 1)
-    with pytest.raises(MeshError, match="at most 64 are allowed"):
+    with pytest.raises(MeshError, match="at most 64 MiB"):
         read_mesh(tmp_path / "huge.stl", 0.001, None)
 
 
