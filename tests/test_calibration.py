@@ -175,7 +175,7 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
     blank = tmp_path / "blank.png"
     cv2.imwrite(str(blank), np.full((SIZE[1], SIZE[0]), 90, np.uint8))
     calibration = calibrate([*rendered.left[:6], blank], rendered.right[:7])
-    assert calibration.pairs[6].reason == "no chessboard of 7x5 inner corners in blank.png"
+    assert calibration.pairs[6].reason == "no chessboard of 7x5 inner corners found in blank.png"
     assert calibration.pairs[6].left_rms_px is None
     with pytest.raises(
         CalibrationError, match=r"4 of 5 pairs are usable.*\n  blank\.png: no chess"
