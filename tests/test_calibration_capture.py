@@ -113,7 +113,9 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
     stored = (tmp_path / "board.png").read_bytes()
     dots_per_m = int.from_bytes(stored[stored.index(b"pHYs") + 4 :][:4], "big")
     assert dots_per_m == pytest.approx(300 / 0.0254, rel=1e-3)
-    with pytest.raises(CalibrationError, match=r"board\.pdf: write the board as \.svg or \.png"):
+    with pytest.raises(
+        CalibrationError, match=r"board\.pdf: unknown image format; use \.svg or \.png"
+    ):
         write_board(CHESSBOARD, tmp_path / "board.pdf")
 
 

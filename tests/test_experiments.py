@@ -127,7 +127,9 @@ def test_a_missing_stroke_is_named_with_what_there_is() -> None:
         delays_s={},
         drops=0,
     )
-    with pytest.raises(ExperimentError, match=r"no finger path .*it has: wandering"):
+    with pytest.raises(
+        ExperimentError, match=r"not contain the finger path .*it contains: wandering"
+    ):
         stroke.stroke_errors(recording, 10.0)
 
 
@@ -166,7 +168,7 @@ def test_rows_have_the_papers_sizes_and_a_missing_image_is_named() -> None:
     assert rows[0]["delta_w_mm"] == pytest.approx(10.0, abs=0.1)
     assert rows[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
     pictures.popitem()
-    with pytest.raises(ExperimentError, match="no image"):
+    with pytest.raises(ExperimentError, match="not contain the image"):
         image.make_rows(pictures, series)
 
 

@@ -231,9 +231,7 @@ def test_inconsistent_poses_are_an_error() -> None:
             zip(detections, [*detections[5:], *detections[:5]], strict=True)
         )
     ]
-    with pytest.raises(
-        HandEyeError, match=r"(contradict|do not agree) .*check that the joints are those"
-    ):
+    with pytest.raises(HandEyeError, match=r"contradict .*check that the joints are measured"):
         calibrate_base(shuffled, RIG)
 
 
@@ -263,7 +261,7 @@ def test_joints_that_are_none_are_named(joints: Floats) -> None:
     detections = Workplace(9).detections(6)
     one = detections[2]
     detections[2] = BoardDetection(one.name, joints, one.left, one.right)
-    with pytest.raises(HandEyeError, match="place 2: needs six finite joints"):
+    with pytest.raises(HandEyeError, match="place 2: expected six finite joint angles"):
         calibrate_base(detections, RIG)
 
 
@@ -450,7 +448,7 @@ def test_one_arm_alone_from_a_folder(
         "calibrate", "arms", *COMMON, "--right-arm", tmp_path, "-o", tmp_path / "arms.yaml",
     )  # fmt: skip
     assert code == 0, err
-    assert "right arm        8 of 8 poses used" in out
+    assert "8 of 8 poses used" in out
     assert "  right:\n    world_from_base: {position_m: [" in out
     assert load_arms_calibration(tmp_path / "arms.yaml").left is None
 

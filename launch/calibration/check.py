@@ -186,7 +186,7 @@ def check_stereo(
     if size != (calibration.width_px, calibration.height_px):
         raise CalibrationError(
             f"images of {size[0]}x{size[1]} px, but the calibration of {calibration.device} is for "
-            f"{calibration.width_px}x{calibration.height_px} px"
+            f"{calibration.width_px}x{calibration.height_px} px; use images of that size"
         )
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     if not pairs:

@@ -34,7 +34,7 @@ LaunchOption = Annotated[
     typer.Option(
         "--launch",
         metavar="FILE",
-        help="Launch file of the graph; default: the demo graph.",
+        help="Launch file of the graph.",
         autocompletion=complete.yaml_files,
     ),
 ]

@@ -35,7 +35,7 @@ ApparatusOption = Annotated[
         "default: the scene.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 class NoGraphError(CommandError):

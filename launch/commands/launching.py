@@ -64,7 +64,7 @@ def launch(
     apparatus: ApparatusOption = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="BAG", help="Bag file for the topics of the launch file's `log`."),
+        typer.Option(metavar="BAG", help="Bag file to record the logged topics to."),
     ] = None,
     console: Annotated[
         bool,

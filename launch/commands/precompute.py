@@ -43,7 +43,7 @@ def precompute(
         typer.Option(
             "--skin-spacing",
             metavar="METRES",
-            help="Node spacing of the soft body's nonlinear table, m; computes it too (minutes).",
+            help="Node spacing of the soft body's nonlinear table, m; also computes it (minutes).",
         ),
     ] = None,
     scheduler: Annotated[

@@ -32,7 +32,7 @@ def try_it(
         typer.Option(
             "--launch",
             metavar="FILE",
-            help="Launch file; default: the demo graph.",
+            help="Launch file of the graph.",
             autocompletion=complete.yaml_files,
         ),
     ] = DEMO_FILE,

@@ -172,7 +172,7 @@ def _repair(
     """Return vertices (v, 3), m, triangles (t, 3) and the repairs. Raises MeshError if empty."""
     repairs = []
     if not len(getattr(mesh, "faces", ())):
-        raise MeshError("does not contain triangles")
+        raise MeshError("does not contain triangles; export a triangle mesh")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
         raise MeshError(f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES}; decimate the mesh")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
