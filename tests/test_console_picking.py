@@ -131,7 +131,7 @@ def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
 
 commands = st.one_of(
     st.tuples(st.just("push"), st.floats(0.0, 0.03)),
-    st.tuples(st.just("place"), st.floats(-0.05, 0.05), st.floats(-0.03, 0.03)),
+    st.tuples(st.just("move_to"), st.floats(-0.05, 0.05), st.floats(-0.03, 0.03)),
     st.tuples(st.just("lift")),
     st.tuples(st.just("lift_or_lower")),
     st.tuples(st.just("scene"), st.booleans()),
@@ -156,7 +156,7 @@ def test_the_finger_depends_only_on_the_present_request(
         commanded = True
         if name == "push":
             depth, lifted = values[0], False
-        elif name == "place":
+        elif name == "move_to":
             position = (values[0], values[1])
         else:
             lifted = name == "lift" or not lifted

@@ -157,7 +157,7 @@ async def test_crashes_are_answered_with_growing_delays_and_then_an_end(tmp_path
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
         with pytest.raises(NodeFailedError, match="beacon ended with exit code 3, after 3 restart"):
             await asyncio.wait_for(graph.wait(), DEADLINE_S)
-    delays = [line.split("restarts in ")[1] for line in said if "restarts in" in line]
+    delays = [line.split("next start in ")[1] for line in said if "next start in" in line]
     assert delays == ["0.02 s", "0.04 s", "0.05 s"]
     assert graph.exit_codes == {"beacon": 3}
 
@@ -225,7 +225,7 @@ async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
         assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
         assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
-    told = "hung: no heartbeat for 2 s; its log contains the stacks; restarts in 0.01 s"
+    told = "hung: no heartbeat for 2 s; its log contains the stacks; next start in 0.01 s"
     assert f"stuck {told}" in said
     assert not any("launch_nodes.py" in line for line in said)
 
@@ -390,7 +390,7 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
 async def test_addresses_beyond_loopback_are_rejected_without_keys(tmp_path: Path) -> None:
     hosts = {"main": {"address": "192.0.2.1"}}
     plan = load_graph(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
-    with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is bey"):
+    with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is n"):
         await RunningGraph(plan).__aenter__()
 
 

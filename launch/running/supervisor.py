@@ -510,7 +510,7 @@ class RunningGraph:
                 )
             delay_s = min(policy.delay_s * 2 ** len(recent), policy.max_delay_s)
             recent.append(loop.time())
-            self._report(LAUNCHER, f"{node.name} {problem or 'ended'}; restarts in {delay_s:g} s")
+            self._report(LAUNCHER, f"{node.name} {problem or 'ended'}; next start in {delay_s:g} s")
             await asyncio.sleep(delay_s)
             self.restarts[node.name] += 1
 

@@ -96,7 +96,7 @@ class Console(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "the bag does not contain the requests of its viewers"
+        return "it serves a page, and the bag does not contain its viewers' requests"
 
     @classmethod
     def further_inputs(
