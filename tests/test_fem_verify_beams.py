@@ -1,4 +1,4 @@
-"""Cantilevers and Cook's membrane, against elasticity theory and published values."""
+"""Verify cantilevers and Cook's membrane against elasticity theory and published values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def faces_where(nodes: Floats, elements: Ints, there: NDArray[np.bool_]) -> Ints
 
 
 def plane_cantilever(points: Floats) -> Floats:
-    """Displacement (k, 3) in plane strain under the end shear `FORCE` per width; x along it."""
+    """Return the displacement (k, 3) in plane strain under the end shear `FORCE` per width, along
+    x."""
     x, y = points[:, 0], points[:, 1]
     e, nu = E / (1 - NU**2), NU / (1 - NU)
     inertia = 2 * HALF**3 / 3
@@ -44,7 +45,7 @@ def plane_cantilever(points: Floats) -> Floats:
 
 
 def plane_cantilever_slope(points: Floats) -> Floats:
-    """Its gradient (k, 3, 3)."""
+    """Return the gradient (k, 3, 3) of `plane_cantilever`."""
     x, y = points[:, 0], points[:, 1]
     e, nu = E / (1 - NU**2), NU / (1 - NU)
     f = FORCE / (6 * e * 2 * HALF**3 / 3)
@@ -57,8 +58,8 @@ def plane_cantilever_slope(points: Floats) -> Floats:
 
 
 def test_plane_cantilever_with_end_shear(record_property: Record) -> None:
-    """A beam in plane strain, its root moved as the theory says, parabolic shear on its end: the
-    whole displacement, which is cubic, by elements that hold quadratic ones.
+    """A beam in plane strain has the theoretical displacement at its root and parabolic shear at
+    its end. The cubic displacement is approximated by quadratic elements.
 
     Source: Timoshenko & Goodier, Theory of Elasticity, 3rd ed., art. 21; in this form Augarde &
     Deeks, Finite Elem. Anal. Des. 44, 2008, eqs. 1-5
@@ -90,8 +91,8 @@ def test_plane_cantilever_with_end_shear(record_property: Record) -> None:
 
 
 def test_slender_cantilever_with_end_shear(record_property: Record) -> None:
-    """A square bar in space, its root clamped, shear on its end.  The clamp keeps the root from
-    thinning out, which no beam theory knows: a little stiffer.
+    """A square bar in space is clamped at its root, with shear on its end. The clamp prevents
+    lateral contraction, which beam theory neglects, so that the bar is slightly stiffer.
 
     Source: Timoshenko beam, P L^3 / (3 E I) + P L / (k G A), with k = 10 (1 + nu) / (12 + 11 nu):
     Cowper, J. Appl. Mech. 33, 1966
@@ -133,7 +134,8 @@ def elastica(load: float) -> tuple[float, float]:
 def test_cantilever_bent_far(
     record_property: Record, load: float, across: float, along: float
 ) -> None:
-    """A slender neo-Hookean bar bent by half its length.  It stretches a little, the elastica not.
+    """A slender neo-Hookean bar is bent by half its length. It stretches slightly, unlike the
+    elastica.
 
     Source: elastica, Bisshopp & Drucker, Quart. Appl. Math. 3, 1945; the tip's places as tabulated
     by Mattiasson, Int. J. Numer. Meth. Eng. 17, 1981
@@ -153,7 +155,8 @@ def test_cantilever_bent_far(
 
 
 def cook(divisions: int) -> tuple[Floats, Ints]:
-    """Cook's tapered panel as a slab of one layer: 48 wide, 44 high at the root, 16 at the end."""
+    """Return Cook's tapered panel as a slab of one layer: 48 wide, 44 high at the root, 16 at the
+    end."""
     nodes, elements = box((divisions, divisions, 1), (1.0, 1.0, 1.0))
     s, t, z = nodes.T
     thick = 48.0 / divisions
@@ -161,25 +164,25 @@ def cook(divisions: int) -> tuple[Floats, Ints]:
 
 
 def cook_supports(nodes: Floats) -> Ints:
-    """Clamped root, no movement across the panel: plane strain."""
+    """Return the supports: clamped root, no displacement across the panel (plane strain)."""
     root = dofs_of(np.flatnonzero(nodes[:, 0] == 0.0))
     return np.union1d(root, 3 * np.arange(len(nodes)) + 2)
 
 
 def cook_loads(nodes: Floats, elements: Ints, force: float) -> Floats:
-    """Uniform shear on the end, `force` per unit of thickness."""
+    """Return the loads of a uniform shear on the end, `force` per unit of thickness."""
     end = faces_where(nodes, elements, np.isclose(nodes[:, 0], 48.0))
     return surface_loads(nodes, end, lambda p, _: np.broadcast_to([0, force / 16, 0], p.shape))
 
 
 def height(nodes: Floats, displacement: Floats, y: float) -> float:
-    """How far the end has risen at the height y."""
+    """Return the rise of the end at the height y."""
     there = np.isclose(nodes[:, 0], 48.0) & np.isclose(nodes[:, 1], y)
     return float(displacement[there, 1].mean())
 
 
 def cook_tip(divisions: int, e: float, nu: float) -> float:
-    """At the middle of the end, under unit force; linear."""
+    """Return the linear rise at the middle of the end under unit force."""
     nodes, elements = cook(divisions)
     matrix = stiffness_matrix(nodes, elements, young_modulus_pa=e, poisson_ratio=nu)
     held = cook_supports(nodes)
@@ -190,8 +193,8 @@ def cook_tip(divisions: int, e: float, nu: float) -> float:
 
 @cache
 def cook_mixed_tip(nu: float) -> float:
-    """The same by scikit-fem in the plane, with pressure of its own (Taylor & Hood's elements),
-    which do not lock: shear modulus 3/8."""
+    """Return the rise by scikit-fem in the plane, with Taylor-Hood elements, which do not lock;
+    shear modulus 3/8."""
     import skfem
     from scipy.sparse import bmat
     from skfem.helpers import ddot, div, sym_grad
@@ -232,8 +235,8 @@ def cook_mixed_tip(nu: float) -> float:
 
 
 def test_cooks_membrane(record_property: Record) -> None:
-    """The tapered panel, its rise at the middle of the end.  The published value is for plane
-    stress; plane strain with E (1 + 2 nu) / (1 + nu)^2 and nu / (1 + nu) is the same problem.
+    """The published value for plane stress is that of plane strain with E (1 + 2 nu) / (1 + nu)^2
+    and nu / (1 + nu).
 
     Source: Cook, J. Struct. Div. ASCE 100, 1974; converged value 23.96 (E = 1, nu = 1/3, plane
     stress): Cook, Malkus & Plesha, Concepts and Applications of FEA, 3rd ed., 1989, sec. 6.13
@@ -244,9 +247,8 @@ def test_cooks_membrane(record_property: Record) -> None:
 
 
 def test_cooks_membrane_nearly_incompressible(record_property: Record) -> None:
-    """nu = 0.4999: displacement elements hold back volume at too many points and are too stiff.
-    They come near from below as elements grow smaller; scikit-fem with a pressure field does not
-    lock, and bears the published value out.
+    """At nu = 0.4999, displacement elements lock: they are too stiff, and converge from below.
+    scikit-fem with a pressure field does not lock, and confirms the published value.
 
     Source: 16.4326 (lambda = 7500, mu = 0.375, Richardson-extrapolated), Krysl, FinEALE's example
     Cook_3D_strain_T10
@@ -267,8 +269,8 @@ def test_cooks_membrane_nearly_incompressible(record_property: Record) -> None:
 def test_locking_grows_towards_incompressibility(
     record_property: Record, nu: float, low: float
 ) -> None:
-    """How much too stiff bending is as nu goes to 0.5: the same mesh over scikit-fem's mixed
-    elements, which do not lock.
+    """The bending stiffness for nu towards 0.5 is compared with scikit-fem's mixed elements on the
+    same mesh, which do not lock.
 
     Source: Taylor & Hood, Comput. Fluids 1, 1973, by scikit-fem
     """
@@ -278,8 +280,8 @@ def test_locking_grows_towards_incompressibility(
 
 
 def test_cooks_membrane_at_large_strain(record_property: Record) -> None:
-    """A neo-Hookean panel with nu = 0.4999 whose corner rises by 40 % of the end's height: locks as
-    the linear one does.
+    """A neo-Hookean panel with nu = 0.4999, whose corner rises by 40 % of the end's height, locks
+    like the linear one.
 
     Source: rise of the upper corner 6.9083 (E = 240.565, nu = 0.4999, load 100; 128 x 128 mesh):
     Elguedj, Bazilevs, Calo & Hughes, Comput. Methods Appl. Mech. Eng. 197, 2008

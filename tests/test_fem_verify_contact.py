@@ -1,4 +1,4 @@
-"""Point loads and light pushes on a half-space: Boussinesq and Hertz."""
+"""Verify point loads and light contacts on a half-space against Boussinesq and Hertz."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ E = 4000.0
 
 
 def boussinesq(points: Floats, force: float, nu: float) -> Floats:
-    """Displacement (k, 3) of the half-space z <= 0 under a force down in the origin."""
+    """Return the displacement (k, 3) of the half-space z <= 0 under a downward force at the
+    origin."""
     r2 = points[:, 0] ** 2 + points[:, 1] ** 2
     depth = -points[:, 2]
     rho = np.sqrt(r2 + depth**2)
@@ -35,11 +36,11 @@ def boussinesq(points: Floats, force: float, nu: float) -> Floats:
 
 @pytest.mark.parametrize("nu", [0.3, 0.45, 0.499])
 def test_point_load_on_a_half_space(record_property: Record, nu: float) -> None:
-    """A quarter of a block, its outer faces moved as the half-space's are there: how deep the skin
-    sinks around the load, and how that falls with the distance.
+    """A quarter of a block has the half-space's displacement on its outer faces. The test measures
+    the indentation around the load, and its decrease with the distance.
 
-    Source: Boussinesq 1885; w = (1 - nu^2) F / (pi E r): Johnson, Contact Mechanics, 1985,
-    eqs. 3.18-3.22
+    Source: Boussinesq 1885; w = (1 - nu^2) F / (pi E r): Johnson, Contact Mechanics, 1985, eqs.
+    3.18-3.22
     """
     width, force = 30.0, 1000.0
     nodes, elements = half_space(
@@ -79,8 +80,8 @@ HARD = (10 * newton.PENALTY_RATIO, newton.ROUNDING_RATIO / 10)
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """What a light push measures: the force, the patch's radius by the pressure's second moment,
-    how deep the skin sinks below the finger, and by how much more than at the distance `away`."""
+    """Results of a light contact: force, radius of the contact by the pressure's second moment, and
+    indentation below the finger, absolute and relative to that at the distance `away`."""
 
     depth: float
     force: float
@@ -92,8 +93,8 @@ class Touch:
 
 @cache
 def touches(penalty: tuple[float, float]) -> list[Touch]:
-    """A sphere pressed lightly into a block by the full Newton, its contact's bed as hard as this:
-    the solver's ratios `BED_RATIO` and `ROUNDING_RATIO`."""
+    """Press a sphere lightly into a block by Newton's method, with a contact penalty of this
+    stiffness."""
     nodes, elements = half_space(
         half_width=HALF_WIDTH, smallest=0.75, fine_radius=1.5, growth=0.9, whole=True
     )
@@ -136,7 +137,7 @@ def touches(penalty: tuple[float, float]) -> list[Touch]:
 
 
 def sunk_at(r: float, patch: float, force: float) -> float:
-    """Hertz's surface outside the patch."""
+    """Return Hertz's surface outside the contact."""
     pressure = 3 * force / (2 * np.pi * patch**2)
     share = patch / r
     bend = (2 * patch**2 - r**2) * np.arcsin(share) + r * patch * np.sqrt(1 - share**2)
@@ -147,10 +148,10 @@ def sunk_at(r: float, patch: float, force: float) -> float:
 def test_light_pushes_follow_hertz(
     record_property: Record, penalty: tuple[float, float], name: str, off: float
 ) -> None:
-    """From the force: the patch's radius, and how far the skin sinks; and the power 3/2.  Sinking
-    is taken against the skin some patches away, which the block's far ends do not shift.  With a
-    bed ten times as hard as the solver's own, Hertz is nearly what is left; with its own, the patch
-    is wider by what the bed gives way.
+    """The test compares the radius of the contact and the indentation for a given force, and the
+    exponent 3/2. The indentation is relative to the skin some radii away, which is independent of
+    the block's boundaries. With a penalty ten times as stiff as the solver's, the result is nearly
+    Hertz's; with the solver's, the contact is wider by the penetration.
 
     Source: Hertz 1882; Johnson, Contact Mechanics, 1985, eqs. 3.42, 4.22-4.24
     """
@@ -184,8 +185,8 @@ def test_light_pushes_follow_hertz(
 
 
 def test_what_the_bed_costs_is_known(record_property: Record) -> None:
-    """The solver's bed lets the skin enter the finger by less than a hundredth of its radius.  Of a
-    light push that is a part that matters; the force at the same depth is lower by it.
+    """With the solver's penalty, the skin penetrates the finger by less than a hundredth of its
+    radius. For a light contact this is significant, and reduces the force at the same depth.
 
     Source: the bed's own law, nodes/fem_solver/newton.py, against the bed ten times as hard
     """

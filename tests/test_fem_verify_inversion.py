@@ -1,4 +1,4 @@
-"""Where the full Newton comes to its end: what it says then, and that it never shows worse."""
+"""Verify the limits of Newton's method: its results are flagged, and never inverted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ FINGER, SIDE, HEIGHT = 0.007, 0.03, 0.012
 def pad(
     *, nu: float = 0.45, finger: float = FINGER, friction: Friction = "none", sides: bool = False
 ) -> NeoHookeanBody:
-    """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0; coarse, to fail early."""
+    """Return a block of 30 x 30 x 12 mm, fixed at its bottom, with its top at z = 0; coarse, to
+    fail early."""
     nodes, elements = box((4, 4, 2), (SIDE, SIDE, HEIGHT))
     nodes = nodes - [0.5 * SIDE, 0.5 * SIDE, HEIGHT]
     faces = boundary_faces(elements)
@@ -52,8 +53,8 @@ def pressed(body: NeoHookeanBody, *places: tuple[float, float, float]) -> list[E
 
 
 def require_sound(body: NeoHookeanBody, states: list[EquilibriumState]) -> None:
-    """No answer is turned over or endless, all Newton's claims hold, and after the first that was
-    not reached none is."""
+    """Assert finite results without inversion, valid convergence flags, and no result after the
+    first failure."""
     for state in states:
         assert np.isfinite(state.displacement).all()
         assert np.isfinite(state.force_n).all()
@@ -67,8 +68,8 @@ def require_sound(body: NeoHookeanBody, states: list[EquilibriumState]) -> None:
 
 @pytest.mark.parametrize("nu", [0.3, 0.45, 0.499])
 def test_a_push_too_deep_is_flagged_and_sound(record_property: Record, nu: float) -> None:
-    """Deeper and deeper until the mesh can no more: the last answer stays, flagged; no element is
-    turned over anywhere, not only at its quadrature points.
+    """The depth increases until the mesh fails: the last result remains, flagged, and no element is
+    inverted anywhere, not only at quadrature points.
 
     Source: Jacobians bounded by Bernstein coefficients, Johnen, Remacle & Geuzaine, J. Comput.
     Phys. 233, 2013
@@ -87,8 +88,8 @@ def test_a_push_too_deep_is_flagged_and_sound(record_property: Record, nu: float
 
 
 def test_a_finger_faster_than_a_frame_does_not_slip_through() -> None:
-    """From above to beyond the bottom in one step: as if it had gone slowly, not a body at rest
-    with a finger inside."""
+    """A finger that moves from above to below the block in one step gives the result of a slow
+    motion."""
     body = pad()
     states = pressed(body, (0.001, 0.0007, FINGER), (0.001, 0.0007, FINGER - 0.03))
     require_sound(body, states)
@@ -98,15 +99,15 @@ def test_a_finger_faster_than_a_frame_does_not_slip_through() -> None:
 
 
 def test_a_finger_that_begins_inside_is_flagged() -> None:
-    """With no way in there is no answer."""
+    """Without a path into the body there is no result."""
     state = pressed(pad(), (0.001, 0.0007, -0.006))[0]
     assert not state.reached
     assert not state.displacement.any()
 
 
 def test_a_finger_smaller_than_the_elements_is_felt(record_property: Record) -> None:
-    """A tip of 1 mm on elements of 7.5 mm touches between their nodes; what no mesh as coarse can
-    follow is flagged."""
+    """A tip of 1 mm on elements of 7.5 mm touches between their nodes; unresolvable results are
+    flagged."""
     body = pad(finger=0.001)
     states = pressed(body, (0.001, 0.0007, 0.001), (0.001, 0.0007, 0.0), (0.001, 0.0007, -0.003))
     require_sound(body, states)
@@ -124,7 +125,7 @@ def test_a_finger_smaller_than_the_elements_is_felt(record_property: Record) -> 
 
 
 def test_a_finger_on_the_edge_slides_off_soundly() -> None:
-    """Half on the top, half beside it."""
+    """Half of the contact is on the top, half beside it."""
     body = pad(sides=True)
     states = pressed(body, (0.015, 0.0007, 0.0071), (0.015, 0.0007, 0.003))
     require_sound(body, states)
@@ -133,7 +134,7 @@ def test_a_finger_on_the_edge_slides_off_soundly() -> None:
 
 
 def test_a_sticking_finger_that_goes_too_far_is_flagged() -> None:
-    """Held skin is dragged until elements would turn over."""
+    """Sticking skin is dragged until elements would invert."""
     body = pad(friction="stick")
     states = pressed(
         body, (-0.006, 0.0007, FINGER), (-0.006, 0.0007, 0.003), (0.014, 0.0007, 0.003)
@@ -153,8 +154,8 @@ def test_a_finger_without_a_position_is_an_error(value: float) -> None:
 
 
 def test_a_turned_corner_is_seen_though_quadrature_sees_nothing() -> None:
-    """The middle of an edge moved nearly to its end: the corner there is turned over, while all
-    quadrature points keep a positive volume, and the energy stays finite."""
+    """The middle node of an edge is moved nearly to its end. The corner there is inverted, although
+    all quadrature points have a positive volume and the energy is finite."""
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     solid = NeoHookeanSolid(nodes, elements, young_modulus_pa=1.0, poisson_ratio=0.3)
     moved = np.zeros_like(nodes)
@@ -168,7 +169,7 @@ def test_a_turned_corner_is_seen_though_quadrature_sees_nothing() -> None:
 
 @pytest.mark.parametrize(("place", "times"), [((0.4, 0.5, 0.6), 1.0), ((1.2, 0.5, 0.5), 0.0)])
 def test_winding_number_detects_inside(place: tuple[float, float, float], times: float) -> None:
-    """Once around from inside, not at all from outside."""
+    """The winding number is one inside and zero outside."""
     nodes, elements = box((2, 2, 2), (1.0, 1.0, 1.0))
     hull = boundary_faces(elements)[:, :3]
     assert winding_number(nodes[hull] - place) == pytest.approx(times, abs=1e-12)

@@ -1,4 +1,4 @@
-"""The neo-Hookean body at large stretch, against closed forms."""
+"""Verify the neo-Hookean body at large stretch against closed forms."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def cube(nu: float) -> NeoHookeanSolid:
 
 
 def stretched(solid: NeoHookeanSolid, stretches: dict[int, float]) -> tuple[Floats, Floats]:
-    """Displacement and forces (n, 3) of the cube, gliding on its three lower faces, with the upper
-    faces across some axes moved."""
+    """Return displacement and forces (n, 3) of the cube with sliding supports on its three lower
+    faces and prescribed upper faces."""
     nodes = solid.nodes
     values = {3 * int(n) + a: 0.0 for a in range(3) for n in np.flatnonzero(nodes[:, a] == 0.0)}
     for axis, stretch in stretches.items():
@@ -39,20 +39,20 @@ def stretched(solid: NeoHookeanSolid, stretches: dict[int, float]) -> tuple[Floa
 
 
 def traction(nu: float, mine: float, volume_ratio: float) -> float:
-    """Force per undeformed area along an axis stretched by `mine`."""
+    """Return the force per undeformed area along an axis stretched by `mine`."""
     lam, mu = lame(MODULUS, nu)
     return mu * (mine - 1 / mine) + lam * np.log(volume_ratio) / mine
 
 
 def pulled(solid: NeoHookeanSolid, forces: Floats, axis: int) -> float:
-    """Force on the upper face across an axis."""
+    """Return the force on the upper face of an axis."""
     return float(forces[np.isclose(solid.nodes[:, axis], 1.0), axis].sum())
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.499])
 @pytest.mark.parametrize("stretch", [0.4, 3.0])
 def test_uniaxial(record_property: Record, stretch: float, nu: float) -> None:
-    """Pulled along one axis, free across: how thin it grows, and the force.
+    """The cube is stretched along one axis with free sides; contraction and force are compared.
 
     Source: Bonet & Wood, Nonlinear Continuum Mechanics, 2nd ed., sec. 6.4.3 and exercise 6.2
     """
@@ -68,7 +68,7 @@ def test_uniaxial(record_property: Record, stretch: float, nu: float) -> None:
 
 @pytest.mark.parametrize("stretch", [0.6, 2.0])
 def test_equibiaxial(record_property: Record, stretch: float) -> None:
-    """Pulled along two axes alike.
+    """The cube is stretched equally along two axes.
 
     Source: Bonet & Wood, Nonlinear Continuum Mechanics, 2nd ed., sec. 6.4.3
     """
@@ -85,7 +85,7 @@ def test_equibiaxial(record_property: Record, stretch: float) -> None:
 
 @pytest.mark.parametrize("stretch", [0.5, 2.0])
 def test_uniaxial_of_rubber(record_property: Record, stretch: float) -> None:
-    """nu = 0.4999 comes to the incompressible law.
+    """At nu = 0.4999 the result approaches the incompressible law.
 
     Source: P = mu (l - 1 / l^2), Treloar, The Physics of Rubber Elasticity, 3rd ed., 1975, sec. 4.3
     """
@@ -97,8 +97,8 @@ def test_uniaxial_of_rubber(record_property: Record, stretch: float) -> None:
 
 
 def test_simple_shear(record_property: Record) -> None:
-    """Sheared by twice its height: shear stress in proportion, and the normal stress difference
-    that linear elasticity does not know.
+    """The cube is sheared by twice its height. The shear stress is proportional, with a normal
+    stress difference that linear elasticity does not have.
 
     Source: s12 = mu g and Rivlin's universal relation s11 - s22 = g s12, Phil. Trans. R. Soc. A
     241, 1948 (the volume does not change, so that compressibility does not matter)

@@ -1,4 +1,4 @@
-"""The elements carry what they must carry exactly, on the meshes of all shapes."""
+"""Verify that the elements reproduce exact solutions on the meshes of all shapes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRADIENT = np.array([[0.3, 0.1, -0.2], [0.05, -0.4, 0.15], [0.2, -0.1, 0.25]])
 
 
 def bent_inside(nodes: Floats, elements: Ints) -> tuple[Floats, Ints]:
-    """A box's mesh with inner corners moved about, and inner edges curved as well."""
+    """Return a box's mesh with displaced inner corners and curved inner edges."""
     nodes, elements = distorted(nodes, elements)
     inner = np.setdiff1d(elements[:, 4:], boundary_faces(elements))
     size = np.linalg.norm(nodes[elements[:, 0]] - nodes[elements[:, 1]], axis=1).min()
@@ -48,11 +48,10 @@ def patch_error(nodes: Floats, elements: Ints, nu: float) -> float:
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.499])
 def test_patch_of_distorted_tetrahedra(record_property: Record, nu: float) -> None:
-    """A hull moved by a linear field: inner nodes follow it, whatever the elements' form; here
-    with inner corners moved about and inner edges curved.
+    """The hull has a linear displacement, which inner nodes must follow for any element shape.
 
-    Source: patch test, Irons & Razzaque 1972; Zienkiewicz & Taylor, The Finite Element Method,
-    vol. 1, ch. 10
+    Source: patch test, Irons & Razzaque 1972; Zienkiewicz & Taylor, The Finite Element Method, vol.
+    1, ch. 10
     """
     nodes, elements = bent_inside(*box((3, 3, 3), (1.0, 1.0, 1.0)))
     error = patch_error(nodes, elements, nu)
@@ -61,7 +60,7 @@ def test_patch_of_distorted_tetrahedra(record_property: Record, nu: float) -> No
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_patch_of_every_shape(record_property: Record, shape: str) -> None:
-    """The same on the meshes that the solver makes, their skins curved.
+    """The patch test uses the solver's meshes with curved skins.
 
     Source: patch test, Irons & Razzaque 1972
     """
@@ -72,11 +71,11 @@ def test_patch_of_every_shape(record_property: Record, shape: str) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_large_uniform_deformation_of_every_shape(record_property: Record, shape: str) -> None:
-    """Inner nodes are in balance under a linear field of any size, and the work of the forces gives
-    the closed-form stress.
+    """Inner nodes are in equilibrium under a linear field of any size, and the work of the forces
+    gives the closed-form stress.
 
-    Source: P = mu F + (lambda ln J - mu) F^-T, Bonet & Wood, Nonlinear Continuum Mechanics,
-    2nd ed., sec. 6.4.3
+    Source: P = mu F + (lambda ln J - mu) F^-T, Bonet & Wood, Nonlinear Continuum Mechanics, 2nd
+    ed., sec. 6.4.3
     """
     mesh = scene_solid(shape)
     solid = NeoHookeanSolid(mesh.nodes, mesh.elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
@@ -93,8 +92,8 @@ def test_a_large_uniform_deformation_of_every_shape(record_property: Record, sha
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_tractions_of_a_uniform_stress(record_property: Record, shape: str) -> None:
-    """Not the displacement but the tractions of a uniform stress are given, on the curved hull;
-    three nodes hold the body in place.  The whole displacement is the linear field.
+    """The tractions of a uniform stress are given on the curved hull, with three nodes as supports.
+    The displacement is the linear field.
 
     Source: patch test form C (tractions), Taylor, Simo, Zienkiewicz & Chan, Int. J. Numer. Meth.
     Eng. 22, 1986
@@ -114,8 +113,8 @@ def test_tractions_of_a_uniform_stress(record_property: Record, shape: str) -> N
 
 
 def test_pure_bending_is_exact(record_property: Record) -> None:
-    """A bar bent by end couples has a quadratic displacement, which quadratic elements hold exactly
-    where their edges are straight.
+    """A bar bent by end couples has a quadratic displacement, which quadratic elements with
+    straight edges reproduce exactly.
 
     Source: Timoshenko & Goodier, Theory of Elasticity, 3rd ed., art. 102
     """
@@ -138,7 +137,7 @@ def test_pure_bending_is_exact(record_property: Record) -> None:
 
 
 def test_a_body_under_its_own_weight_is_exact(record_property: Record) -> None:
-    """A bar hanging by its weight: quadratic displacement again, with a body force.
+    """A bar that hangs by its weight has a quadratic displacement with a body force.
 
     Source: Timoshenko & Goodier, Theory of Elasticity, 3rd ed., art. 96
     """
@@ -159,8 +158,8 @@ def test_a_body_under_its_own_weight_is_exact(record_property: Record) -> None:
 
 
 def with_sliver(flatness: float) -> tuple[Floats, Ints]:
-    """A box whose middle corner is moved towards a face of an element about it, so that the element
-    is this flat, for its size; a neighbour gives way, none is inverted."""
+    """Return a box whose middle corner is moved towards a face of one of its elements, so that this
+    element has the given flatness."""
     nodes, elements = box((2, 2, 2), (1.0, 1.0, 1.0))
     middle = int(np.flatnonzero((nodes == 0.5).all(axis=1))[0])
     mine = elements[(elements[:, :4] == middle).any(axis=1)][0, :4]
@@ -173,8 +172,8 @@ def with_sliver(flatness: float) -> tuple[Floats, Ints]:
 
 @pytest.mark.parametrize("flatness", [1e-1, 1e-3, 1e-5])
 def test_slivers_carry_the_patch(record_property: Record, flatness: float) -> None:
-    """A nearly flat element among good ones costs digits, not correctness: the patch test holds to
-    rounding over flatness.
+    """A nearly flat element among good ones reduces the precision only: the error of the patch test
+    is rounding over flatness.
 
     Source: conditioning of a flat tetrahedron's stiffness goes with its inverse height, Shewchuk,
     What is a good linear finite element?, 2002, sec. 3
@@ -187,7 +186,7 @@ def test_slivers_carry_the_patch(record_property: Record, flatness: float) -> No
 
 
 def test_large_deformation_with_a_sliver(record_property: Record) -> None:
-    """Newton settles on the linear field of a stretched hull with a sliver inside.
+    """Newton's method converges to the linear field of a stretched hull with a nearly flat element.
 
     Source: patch test, Irons & Razzaque 1972
     """
@@ -202,7 +201,7 @@ def test_large_deformation_with_a_sliver(record_property: Record) -> None:
 
 @pytest.mark.parametrize("flatness", [0.0, -1e-3, 1e-9])
 def test_flat_and_inverted_elements_are_rejected(flatness: float) -> None:
-    """Both laws refuse what has no volume to rounding, by the same measure."""
+    """Both material laws reject elements without volume by the same measure."""
     nodes, elements = with_sliver(flatness)
     with pytest.raises(SolidMeshError, match="inverted or flat"):
         stiffness_matrix(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
@@ -212,7 +211,7 @@ def test_flat_and_inverted_elements_are_rejected(flatness: float) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_nodes_that_are_not_finite_are_rejected(value: float) -> None:
-    """Not a number is not a place."""
+    """NaN and infinity are rejected."""
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     nodes[3, 1] = value
     with pytest.raises(SolidMeshError, match="not finite"):

@@ -1,4 +1,4 @@
-"""How fast errors fall with the elements' size: manufactured solutions."""
+"""Verify the convergence rates with manufactured solutions."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ PHASES = np.array([0.3, 0.7, 0.1])
 
 
 def field(size: float, points: Floats) -> Floats:
-    """Three plane waves, one for each component."""
+    """Return three plane waves, one for each component."""
     return size * np.sin(points @ WAYS.T + PHASES)
 
 
 def slope(size: float, points: Floats | Complexes) -> Complexes:
-    """Its gradient, also beside the real axes."""
+    """Return the gradient of `field`, also for complex points."""
     waves = np.cos(points @ WAYS.T + PHASES)
     return np.asarray(size * waves[:, :, None] * WAYS, dtype=np.complex128)
 
@@ -49,8 +49,8 @@ def neo_hooke(gradient: Complexes) -> Complexes:
 
 
 def body_force(size: float, law: object, points: Floats) -> Floats:
-    """What holds the field in balance: minus the divergence of its stress, by complex steps, which
-    take derivatives to rounding (Squire & Trapp, SIAM Review 40, 1998)."""
+    """Return the force in equilibrium with the field: minus the divergence of its stress, by
+    complex-step derivatives (Squire & Trapp, SIAM Review 40, 1998)."""
     assert callable(law)
     tiny = 1e-30
     force = np.zeros_like(points)
@@ -62,7 +62,7 @@ def body_force(size: float, law: object, points: Floats) -> Floats:
 
 
 def test_linear_rates(record_property: Record) -> None:
-    """Plane waves in a box of distorted elements, moved on its hull and by a body force.
+    """Plane waves are prescribed on the hull of a box of distorted elements, with a body force.
 
     Source: manufactured solution, Roache, J. Fluids Eng. 124, 2002; rates 3 and 2 of quadratic
     elements: Strang & Fix, An Analysis of the Finite Element Method, 1973, ch. 3
@@ -100,7 +100,7 @@ def test_linear_rates(record_property: Record) -> None:
 
 
 def test_neo_hookean_rates(record_property: Record) -> None:
-    """The same waves, strains to a third, in the neo-Hookean body.
+    """The same waves are used with strains up to a third in the neo-Hookean body.
 
     Source: manufactured solution, Roache, J. Fluids Eng. 124, 2002
     """

@@ -1,4 +1,4 @@
-"""The meshes of all shapes through scikit-fem as well: the same stiffness, the same solution."""
+"""Verify stiffness and solution on the meshes of all shapes against scikit-fem."""
 
 from __future__ import annotations
 
@@ -28,10 +28,8 @@ E, NU, PRESSURE = 4000.0, 0.45, 50.0
 
 @cache
 def their_basis(shape: str) -> tuple[Any, Ints]:
-    """scikit-fem's basis on the curved mesh, and our degree of freedom for each of its.
-
-    Same quadrature as ours, so that nothing but the assembly differs.
-    """
+    """Return scikit-fem's basis on the curved mesh, and our degree of freedom for each of its, with
+    the same quadrature so that only the assembly differs."""
     mesh = scene_solid(shape)
     corners = np.unique(mesh.elements[:, :4])
     straight = mesh.nodes.copy()
@@ -62,7 +60,7 @@ def their_matrix(shape: str) -> Any:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_stiffness_equals_that_of_scikit_fem(record_property: Record, shape: str) -> None:
-    """Largest difference of any entry over the largest entry.
+    """The error is the largest difference of any entry over the largest entry.
 
     Source: scikit-fem (Gustafsson & McBain, J. Open Source Softw. 5, 2020), linear_elasticity on
     curved ElementTetP2
@@ -77,8 +75,8 @@ def test_stiffness_equals_that_of_scikit_fem(record_property: Record, shape: str
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_solution_equals_that_of_scikit_fem(record_property: Record, shape: str) -> None:
-    """The body on its support, a pressure on the skin that fingers reach: both of the solver's
-    factors against scikit-fem's `solve`.
+    """The body on its support has a pressure on the skin that fingers reach; both of the solver's
+    factorizations are compared with scikit-fem's `solve`.
 
     Source: scikit-fem, `condense` and `solve`
     """

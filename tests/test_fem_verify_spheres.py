@@ -1,4 +1,4 @@
-"""Thick spheres under pressure: Lame's solution, and the inflation of a rubber one."""
+"""Verify thick spheres under pressure: Lame's solution, and the inflation of a rubber sphere."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ class Lame:
 
 @cache
 def unit_answers(layers: int, nu: float) -> tuple[Floats, Ints, Floats, Floats]:
-    """Nodes, elements, and their displacements under a unit of inner and of outer pressure."""
+    """Return nodes, elements, and their displacements under a unit of inner and of outer
+    pressure."""
     nodes, elements = eighth(layers)
     loads = [pressure_loads(nodes, faces_at(nodes, elements, at), 1.0) for at in (INNER, OUTER)]
     matrix = stiffness_matrix(nodes, elements, young_modulus_pa=E, poisson_ratio=nu)
@@ -59,7 +60,7 @@ def unit_answers(layers: int, nu: float) -> tuple[Floats, Ints, Floats, Floats]:
 
 
 def solved(layers: int, exact: tuple[float, float], nu: float) -> tuple[Floats, Ints, Floats]:
-    """Nodes, elements and displacement under an inner and an outer pressure."""
+    """Return nodes, elements and displacement under an inner and an outer pressure."""
     nodes, elements, inner, outer = unit_answers(layers, nu)
     return nodes, elements, exact[0] * inner + exact[1] * outer
 
@@ -68,7 +69,8 @@ def solved(layers: int, exact: tuple[float, float], nu: float) -> tuple[Floats, 
 def test_thick_sphere_under_pressure(
     record_property: Record, inside: float, outside: float
 ) -> None:
-    """Outer radius twice the inner one, four layers of cells: where both skins go.
+    """The outer radius is twice the inner one, with four layers of cells; the displacements of both
+    surfaces are compared.
 
     Source: Lame 1852; Timoshenko & Goodier, Theory of Elasticity, 3rd ed., art. 136
     """
@@ -85,9 +87,9 @@ def test_thick_sphere_under_pressure(
 
 
 def test_thick_sphere_converges_as_it_should(record_property: Record) -> None:
-    """Curved elements and pressure on curved faces keep the rates of quadratic elements, 3 and 2;
-    on meshes this coarse they come near them from below (from two to five layers 1.65, 1.75, 1.81
-    from mesh to mesh, in energy).
+    """Curved elements and pressure on curved faces have the rates of quadratic elements, 3 and 2.
+    On such coarse meshes the rates approach them from below (from two to five layers 1.65, 1.75,
+    1.81 in energy).
 
     Source: Lame 1852; rates by Ciarlet & Raviart, isoparametric elements, 1972
     """
@@ -105,8 +107,8 @@ def test_thick_sphere_converges_as_it_should(record_property: Record) -> None:
 
 @pytest.mark.parametrize("nu", [0.45, 0.499, 0.4999])
 def test_thick_sphere_nearly_incompressible(record_property: Record, nu: float) -> None:
-    """A body that must keep its volume and still can move: displacements stay right as nu goes to
-    0.5, while the error in the energy norm, that of stresses, grows.
+    """The displacements remain accurate as nu approaches 0.5, while the error in the energy norm,
+    that of stresses, grows.
 
     Source: Lame 1852
     """
@@ -118,8 +120,8 @@ def test_thick_sphere_nearly_incompressible(record_property: Record, nu: float) 
 
 
 def test_inflated_rubber_sphere(record_property: Record) -> None:
-    """A thick neo-Hookean sphere whose inner radius grows by half, nu = 0.499 for 0.5: its outer
-    radius, and the pressure that it takes.
+    """The inner radius of a thick neo-Hookean sphere grows by half, with nu = 0.499 for 0.5; outer
+    radius and pressure are compared.
 
     Source: p = mu/2 [(4 / l + 1 / l^4)]_outer - [...]_inner with l the hoop stretches, Ogden,
     Non-linear Elastic Deformations, 1984, sec. 5.3
