@@ -187,7 +187,7 @@ FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     ),
     "device": (
         lambda v: changed(v["main"], missing_devices=("/dev/video0",)),
-        ("main", "devices", "failed"), "plugged",
+        ("main", "devices", "failed"), "cable",
     ),
     "disk": (lambda v: changed(v["main"], disk_free_bytes=1), ("main", "disk", "warning"), "bags"),
     "memory": (

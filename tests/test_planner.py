@@ -22,6 +22,7 @@ from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
 from flexsheet.nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from flexsheet.nodes.models.shapes import CylinderShape
 from flexsheet.nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.compliance import (
     USABLE_FRACTION,
     choose_stretch,
@@ -30,12 +31,15 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.contact_state import ContactCommand, ContactLimits, ContactStateMachine
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import make_rubber
 from tests.fingertips import fingertip
+from tests.scenes import make_weightless
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+HEAVY_SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+SCENE = make_weightless(HEAVY_SCENE)
 RADIUS = SCENE.object.geometry.radius_m
 SHAPE = CylinderShape(RADIUS, SCENE.object.geometry.length_m)
 FRAME_NS = 16_666_667
@@ -148,6 +152,31 @@ async def test_the_sheet_approaches_the_tangent_plane_under_the_finger(angle_deg
     )
     assert target.contact_sheet_m == pytest.approx([0.02, 0.0], abs=1e-9)
     assert target.push_depth_m == 0.0
+
+
+@pytest.mark.parametrize("angle_deg", [-50.0, 0.0, 50.0])
+async def test_the_sheet_is_placed_behind_the_tangent_plane_by_its_sag(angle_deg: float) -> None:
+    finger = in_world(on_cylinder(angle_deg, 0.03, 0.02))
+    targets = []
+    for scene in (HEAVY_SCENE, SCENE):
+        desk = Table(scene)
+        await desk.start()
+        targets.append(await desk.rest_at(finger))
+    heavy, weightless = targets
+    normal = weightless.world_from_sheet[:3, 2]
+    spec = HEAVY_SCENE.sheet
+    distance_m = spec.width_m * weightless.stretch_ratio
+    sag_m = compute_sag_m(
+        make_rubber(spec),
+        normal,
+        density_kg_per_m3=spec.density_kg_per_m3,
+        edge_distance_m=distance_m,
+        across=0.5 + 0.02 / distance_m,
+    )
+    moved = heavy.world_from_sheet[:3, 3] - weightless.world_from_sheet[:3, 3]
+    assert moved == pytest.approx(-sag_m * normal, abs=1e-9)
+    assert np.sign(sag_m) == -np.sign(normal[1])
+    assert heavy.normal_offset_m == pytest.approx(float(sag_m), abs=1e-12)
 
 
 async def stroke(

@@ -28,10 +28,12 @@ from flexsheet.nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected,
 from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
 from flexsheet.nodes.twin.true_object import TrueBody
 from tests.indentation_bases import few_dents
+from tests.scenes import make_weightless
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+HEAVY_SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE = make_weightless(HEAVY_SCENE)
 STRETCH = 1.05
 FLAT = DrawStyle(flat=True, pattern="object")
 
@@ -126,7 +128,7 @@ def test_the_deformed_mesh_is_the_simulated_sheet(place: tuple[float, float], rm
 @pytest.mark.parametrize("depth_m", [None, 0.005])
 def test_the_weight_of_the_sheet_deflects_the_mesh(depth_m: float | None) -> None:
     """The simulated sheet has weight: 1 mm of sag at 50 degrees."""
-    density = SCENE.sheet.density_kg_per_m3
+    density = HEAVY_SCENE.sheet.density_kg_per_m3
     pose = transform(rotation_from_vector([np.radians(50.0), 0.0, 0.0]), np.zeros(3))
     tip = None if depth_m is None else apply(pose, np.array([0.0, 0.0, -depth_m]))
     sheet = sheet_at(pose, tip)

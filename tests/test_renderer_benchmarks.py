@@ -13,8 +13,11 @@ from flexsheet.nodes.renderer import benchmarks, deflection_cache
 from flexsheet.nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
 from flexsheet.nodes.renderer.scene_renderer import projector_homography
 from tests.indentation_bases import few_dents
+from tests.scenes import make_weightless
 
-SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
+SCENE = make_weightless(
+    load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
+)
 
 
 @pytest.fixture(scope="module")

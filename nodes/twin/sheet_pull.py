@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -38,7 +38,8 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> Rubber:
 class SheetPull:
     """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
 
-    A finger's push on the sheet is not part of the pull: it is small beside the tension.
+    The finger's push and the sheet's weight (0.3 N per arm) are not part of the pull: they are
+    small beside the tension.
     """
 
     distances_m: Floats
@@ -54,7 +55,7 @@ class SheetPull:
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
         if not any(compliances):
             return None
-        rubber = true_rubber(sheet, apparatus)
+        rubber = replace(true_rubber(sheet, apparatus), density_kg_per_m3=0.0)
         distances_m = rubber.width_m * np.array(STRETCHES)
         forces_n = [0.0]
         for distance_m in distances_m[1:]:
