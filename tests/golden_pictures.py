@@ -27,6 +27,7 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose
 from tests.drawing import dent, follow, sheet_at
 from tests.indentation_bases import few_dents
+from tests.scenes import make_weightless
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -43,7 +44,7 @@ TIP = (TILTED @ [0.015, -0.01, -0.025, 1.0])[:3]
 
 def small_scene(name: str, **appearance: object) -> Scene:
     """Make a scene with fewer pixels and optionally another appearance."""
-    scene = load_scene(SCENES / f"{name}.yaml")
+    scene = make_weightless(load_scene(SCENES / f"{name}.yaml"))
     projector, lens = scene.projector, scene.projector.lens
     sizes = {key: SHARE * getattr(lens, key) for key in ("fx_px", "fy_px")}
     # Pixels are counted from the first one's centre.

@@ -28,9 +28,12 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
+from tests.scenes import make_weightless
 
 Floats = NDArray[np.float64]
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE = make_weightless(
+    load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+)
 TIMES = np.array([0, 1_000_000_000], dtype=np.int64)
 STRETCH = 1.06
 CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])

@@ -75,7 +75,7 @@ def test_bags_that_cannot_be_shown_give_a_reason(tmp_path: Path, bag: Path) -> N
     with pytest.raises(BagError, match="cannot be read"):
         Timeline(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("no bag")
-    with pytest.raises(BagError, match="no MCAP"):
+    with pytest.raises(BagError, match="not an MCAP file"):
         Timeline(tmp_path / "text.mcap")
     with BagWriter(tmp_path / "stop.mcap") as writer:
         message = EStop(engaged=True, reason="")

@@ -27,9 +27,12 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import seen
 from tests.indentation_bases import DEEPEST_M, few_dents
+from tests.scenes import make_weightless
 
 Floats = NDArray[np.float64]
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE = make_weightless(
+    load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+)
 STRETCH = 1.05
 WHOLE = 14600
 """Number of points of the whole object at 0.7 mm per pixel."""

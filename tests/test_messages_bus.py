@@ -406,7 +406,7 @@ async def test_stale_ipc_file_of_a_killed_writer_is_replaced(room: Room) -> None
     [
         ("ipc:///" + "x" * 200, "has 201 bytes, the system allows 107"),
         ("ipc:///no/such/folder/a", "cannot be bound"),
-        ("tcp://127.0.0.1:99999", "a number from 1 to 65535"),
+        ("tcp://127.0.0.1:99999", "the port must be in 1..65535"),
         ("tcp://192.0.2.1:7777", "beyond loopback"),
         ("nonsense", "neither ipc"),
     ],

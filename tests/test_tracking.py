@@ -252,7 +252,7 @@ def test_a_swing_is_met_between_the_points() -> None:
 
 
 def test_a_path_of_one_point_is_rejected() -> None:
-    with pytest.raises(ValueError, match="two or more are needed"):
+    with pytest.raises(ValueError, match="at least two are required"):
         interpolate_path(np.zeros((1, 3)), 0.01, 0.0)
 
 
