@@ -51,7 +51,7 @@ MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 STAMP_JITTER_NS = 2_000_000
 """Time by which a scored age may fall short of its horizon."""
 
-MEMORY_S = 3.0
+MEMORY_S = 1.5
 """Time constant of the covariance of the filters' errors."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
@@ -90,15 +90,15 @@ NO_OSCILLATOR = (10.0, 0.0)
 MODELS: tuple[Model, ...] = (
     (1e-5, 0.0, *NO_OSCILLATOR),
     (1e-3, 0.0, *NO_OSCILLATOR),
-    (1e-1, 0.0, *NO_OSCILLATOR),
     (0.0, 1e-2, *NO_OSCILLATOR),
     (0.0, 1e0, *NO_OSCILLATOR),
     (0.0, 1e2, *NO_OSCILLATOR),
     *((1e-7, 0.0, frequency_hz, 5e-4) for frequency_hz in (1.0, 2.5)),
     *((0.0, 1e-2, frequency_hz, 1e-4) for frequency_hz in (5.0, 6.5, 8.0, 9.5, 11.5)),
+    *((0.0, 1e1, frequency_hz, 1e-4) for frequency_hz in (6.0, 9.0)),
 )
-"""Steady and lively motion, voluntary motion around one point, and tremor.  Few models are enough,
-since their combinations stand for the spectra between them."""
+"""Steady and lively motion, voluntary motion around one point, tremor, and tremor of a lively hand.
+Few models are enough, since their combinations stand for the spectra between them."""
 
 ACCELERATION_NOISE, JERK_NOISE, FREQUENCY_HZ, DEVIATION_M = np.array(MODELS).T
 FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
@@ -243,8 +243,8 @@ def _find_path(horizons: bytes) -> tuple[Floats, Floats]:
 def combine(covariance: Floats) -> Floats:
     """Return weights (..., models) of sum 1 that minimise the mean square of the combined error.
 
-    covariance: (..., models, models) m^2 of the models' errors.  The measurement noise in them is
-        equal for all models, so that it changes nothing.
+    covariance: (..., models, models) of the models' errors, in any unit.  The measurement noise in
+        them is equal for all models, so that it changes nothing.
     """
     count = covariance.shape[-1]
     own = covariance.trace(axis1=-2, axis2=-1) / count
@@ -265,8 +265,8 @@ class BankEstimate(Estimate):
         states are along them.
     points: number of points since the track began.
     past_ns, past: earlier times and states, oldest first, over the longest scored horizon.
-    error_covariance: (scored horizons, 3, models, models) m^2 of the models' prediction errors by
-        axis, measurement noise included.
+    error_covariance: (scored horizons, 3, models, models) m of the models' prediction errors by
+        axis, each divided by the root of its size at the time.
     weights: (scored horizons, 3, models), with sum 1 over the models.
     scored_ages_s: ages of the states whose predictions of the newest point were scored.
     innovation: mean square (3,) m^2 of the combined innovation.
@@ -298,7 +298,7 @@ class AdaptiveBank:
         state = np.zeros((len(MODELS), STATES, 3))
         state[:, 0] = measured @ axes
         shape = (len(SCORED_HORIZONS_S), 3, len(MODELS))
-        prior = variances[:, None, None] + PRIOR_ERROR_M**2 * np.eye(len(MODELS))
+        prior = PRIOR_ERROR_M * np.eye(len(MODELS))
         return BankEstimate(
             at_ns,
             state,
@@ -338,6 +338,8 @@ class AdaptiveBank:
         past_ns, past = (*before.past_ns, before.at_ns), (*before.past, before.state)
         errors, ages_s = _prediction_errors(past_ns, past, at_ns, point)
         first = at_ns - past_ns[0] > MAX_AGE_NS
+        # A calm hand after a lively one must not wait until the larger errors are forgotten.
+        errors /= np.sqrt(np.sqrt(np.square(errors).mean(axis=2, keepdims=True)) + 1e-9)
         error_covariance = before.error_covariance + forgotten * (
             errors[..., None] * errors[:, :, None] - before.error_covariance
         )
