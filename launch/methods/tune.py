@@ -89,14 +89,7 @@ TUNABLES = (
         "tracking",
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _by_name(
-            "none",
-            "one_euro",
-            "constant_velocity",
-            "constant_acceleration",
-            "singer_tremor",
-            "adaptive",
-        ),
+        _by_name("none", "one_euro", "adaptive"),
     ),
     Tunable(
         "sheet-force",

@@ -51,8 +51,8 @@ MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 STAMP_JITTER_NS = 2_000_000
 """Time by which a scored age may fall short of its horizon."""
 
-MEMORY_S = 1.5
-"""Time constant of the covariance of the filters' errors."""
+MEMORY_S, MEMORY_POINTS = 1.0, 60
+"""Time constant of the covariance of the filters' errors, and the points that it has at least."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
 """Error of every filter at first, and its weight in points."""
@@ -322,7 +322,8 @@ class AdaptiveBank:
         assert isinstance(before, BankEstimate)
         before, variances = _align(before, covariance)
         dt, points = (at_ns - before.at_ns) * 1e-9, before.points + 1
-        forgotten = max(-math.expm1(-dt / MEMORY_S), 1.0 / (PRIOR_POINTS + points))
+        forgotten = min(-math.expm1(-dt / MEMORY_S), 1.0 / MEMORY_POINTS)
+        forgotten = max(forgotten, 1.0 / (PRIOR_POINTS + points))
         point = measured @ before.axes
         gains = find_gains(dt, variances.tolist(), points)
         prior = _find_transition(round(dt / TIME_STEP_S)) @ before.state
