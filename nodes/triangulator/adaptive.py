@@ -54,6 +54,12 @@ STAMP_JITTER_NS = 2_000_000
 MEMORY_S, MEMORY_POINTS = 1.0, 60
 """Time constant of the covariance of the filters' errors, and the points that it has at least."""
 
+RECENT_S, RECENT_POINTS = 0.2, 10
+OUTDATED_RATIO = 1.5
+OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
+"""Time constant of recent mean-square errors; ratio of the combination's to the best model's above
+which the covariance is outdated; and the shorter memory that it then has."""
+
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
 """Error of every filter at first, and its weight in points."""
 
@@ -287,6 +293,8 @@ class BankEstimate(Estimate):
     error_covariance: (scored horizons, 3, models, models) m of the models' prediction errors by
         axis, each divided by the root of its size at the time.
     weights: (scored horizons, 3, models), with sum 1 over the models.
+    recent: mean squares (scored horizons, 3, models + 1) m^2 of the errors of each model and of the
+        combination in the last instants.
     scored_ages_ms: ages of the states whose predictions of the newest point were scored.
     innovation: mean square (3,) m^2 of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
@@ -299,6 +307,7 @@ class BankEstimate(Estimate):
     past: tuple[Floats, ...]
     error_covariance: Floats
     weights: Floats
+    recent: Floats
     scored_ages_ms: tuple[int, ...]
     innovation: Floats
     position: Floats
@@ -328,6 +337,7 @@ class AdaptiveBank:
             past=(),
             error_covariance=np.broadcast_to(prior, (*shape, len(MODELS))),
             weights=np.full(shape, 1.0 / len(MODELS)),
+            recent=np.zeros((*shape[:2], len(MODELS) + 1)),
             scored_ages_ms=(1,) * len(SCORED_HORIZONS_S),
             innovation=variances,
             position=state[0, 0],
@@ -341,8 +351,7 @@ class AdaptiveBank:
         assert isinstance(before, BankEstimate)
         before, variances = _align(before, covariance)
         dt, points = (at_ns - before.at_ns) * 1e-9, before.points + 1
-        forgotten = min(-math.expm1(-dt / MEMORY_S), 1.0 / MEMORY_POINTS)
-        forgotten = max(forgotten, 1.0 / (PRIOR_POINTS + points))
+        forgotten = max(_forget(dt, MEMORY_S, MEMORY_POINTS), 1.0 / (PRIOR_POINTS + points))
         point = measured @ before.axes
         gains = find_gains(dt, variances.tolist(), points)
         prior = _find_transition(round(dt / TIME_STEP_S)) @ before.state
@@ -358,11 +367,19 @@ class AdaptiveBank:
         past_ns, past = (*before.past_ns, before.at_ns), (*before.past, before.state)
         errors, ages_ms = _prediction_errors(past_ns, past, at_ns, point, innovations)
         first = at_ns - past_ns[0] > MAX_AGE_NS
+        both = np.concatenate(
+            [errors, (before.weights * errors).sum(axis=2, keepdims=True)], axis=2
+        )
+        recent = before.recent + _forget(dt, RECENT_S, RECENT_POINTS) * (both**2 - before.recent)
+        # A combination that is worse than its best model has been learnt from another motion.
+        is_outdated = recent[:, :, -1] > OUTDATED_RATIO * recent[:, :, :-1].min(axis=2)
+        sooner = max(forgotten, _forget(dt, OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS))
+        forgotten = np.where(is_outdated, sooner, forgotten)[:, :, None, None]
         # A calm hand after a lively one must not wait until the larger errors are forgotten.
         sizes = np.sqrt(np.einsum("sam,sam->sa", errors, errors) / len(MODELS))
         errors /= np.sqrt(sizes + MIN_ERROR_M)[:, :, None]
         error_covariance = (1.0 - forgotten) * before.error_covariance
-        error_covariance += errors[..., None] * (forgotten * errors)[:, :, None]
+        error_covariance += errors[..., None] * forgotten * errors[:, :, None]
         # The weights change slowly, and solving for them takes as long as all the rest.
         weights = before.weights
         if points % COMBINE_EVERY_POINTS == 0:
@@ -377,6 +394,7 @@ class AdaptiveBank:
             past=past[first:],
             error_covariance=error_covariance,
             weights=weights,
+            recent=recent,
             scored_ages_ms=ages_ms,
             innovation=innovation,
             position=point - (1.0 - gain) * combined,
@@ -402,6 +420,11 @@ class AdaptiveBank:
         paths[-1] = estimate.position - (weighted[0, :, 0] + weighted[0, :, 3]).sum(axis=0)
         shares = _find_shares(horizons, estimate.scored_ages_ms)
         return np.asarray((shares * paths).sum(axis=0) @ estimate.axes.T)
+
+
+def _forget(dt: float, memory_s: float, memory_points: int) -> float:
+    """Return the weight of a new value in a mean over a time, and at least over some points."""
+    return min(-math.expm1(-dt / memory_s), 1.0 / memory_points)
 
 
 def predict_by_model(estimate: BankEstimate, horizons_s: Floats) -> Floats:
@@ -458,6 +481,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         past=tuple(state @ rotation for state in estimate.past),
         error_covariance=np.einsum("ij,sjmn->simn", mix, estimate.error_covariance),
         weights=mix @ estimate.weights,
+        recent=mix @ estimate.recent,
         innovation=mix @ estimate.innovation,
         position=estimate.position @ rotation,
         variance=mix @ estimate.variance,
