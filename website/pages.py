@@ -15,6 +15,7 @@ from website import (
     messages_page,
     parameters_page,
     registers_page,
+    tracking_page,
 )
 from website.graph import PICTURES, svg
 
@@ -24,7 +25,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 def generate(docs: Path) -> dict[Path, str]:
     """Return the contents of all generated files by their path relative to the folder of pages.
 
-    docs: folder with arms.md and modbus.md, of which only a part is generated.
+    docs: folder with arms.md, modbus.md and tracking.md, of which only a part is generated.
     """
     return {
         Path("messages.md"): messages_page.reference(),
@@ -33,6 +34,9 @@ def generate(docs: Path) -> dict[Path, str]:
         Path("errors.md"): errors_page.reference(),
         Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
+        Path("tracking.md"): tracking_page.page(
+            (docs / "tracking.md").read_text(encoding="utf-8"), docs / "charts/tracking-regret.json"
+        ),
         **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
     }
 

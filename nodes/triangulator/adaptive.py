@@ -374,12 +374,12 @@ class AdaptiveBank:
         # A combination that is worse than its best model has been learnt from another motion.
         is_outdated = recent[:, :, -1] > OUTDATED_RATIO * recent[:, :, :-1].min(axis=2)
         sooner = max(forgotten, _forget(dt, OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS))
-        forgotten = np.where(is_outdated, sooner, forgotten)[:, :, None, None]
+        fresh = np.where(is_outdated, sooner, forgotten)[:, :, None, None]
         # A calm hand after a lively one must not wait until the larger errors are forgotten.
         sizes = np.sqrt(np.einsum("sam,sam->sa", errors, errors) / len(MODELS))
         errors /= np.sqrt(sizes + MIN_ERROR_M)[:, :, None]
-        error_covariance = (1.0 - forgotten) * before.error_covariance
-        error_covariance += errors[..., None] * forgotten * errors[:, :, None]
+        error_covariance = (1.0 - fresh) * before.error_covariance
+        error_covariance += errors[..., None] * fresh * errors[:, :, None]
         # The weights change slowly, and solving for them takes as long as all the rest.
         weights = before.weights
         if points % COMBINE_EVERY_POINTS == 0:
@@ -440,7 +440,7 @@ def _prediction_errors(
     at_ns: int,
     point: Floats,
     innovations: Floats,
-) -> tuple[Floats, tuple[float, ...]]:
+) -> tuple[Floats, tuple[int, ...]]:
     """Return the errors (scored horizons, 3, models) m with which earlier states predicted a point.
 
     The first are the innovations (models, 3) after the newest state.  Each other horizon takes the
