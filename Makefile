@@ -102,6 +102,7 @@ bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.frame_cpu
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
 
 # docs/messaging-peers.md: other messaging libraries in turns with ours (a network of its own: root).
 bench-peers: setup

@@ -41,14 +41,14 @@ def low_pass_noise(random: np.random.Generator, count: int, cutoff_hz: float) ->
     The values are samples at GRID_HZ of a periodic signal.
     """
     frequencies = np.fft.fftfreq(count, 1.0 / GRID_HZ)
-    return _shaped(random, (1.0 + (frequencies / cutoff_hz) ** 4) ** -0.5)
+    return _shaped(random, np.asarray((1.0 + (frequencies / cutoff_hz) ** 4) ** -0.5, float))
 
 
 def _shaped(random: np.random.Generator, amplitudes: Floats) -> Complexes:
     """Return noise with spectral amplitudes (count,), scaled to unit variance per part."""
     count = len(amplitudes)
     white = random.standard_normal(count) + 1j * random.standard_normal(count)
-    return np.fft.ifft(white * amplitudes) * count / np.sqrt(np.sum(amplitudes**2))
+    return np.asarray(np.fft.ifft(white * amplitudes) * count / np.sqrt(np.sum(amplitudes**2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ def sample_wander(bandwidth_hz: float, duration_s: float, random: np.random.Gene
     count = round(duration_s * GRID_HZ)
     corner_hz = bandwidth_hz / 0.72
     frequencies = np.fft.fftfreq(count, 1.0 / GRID_HZ)
-    amplitudes = (1.0 + (frequencies / corner_hz) ** 2) ** -2.0
+    amplitudes = np.asarray((1.0 + (frequencies / corner_hz) ** 2) ** -2.0, float)
     return WANDER_MM * np.stack([_shaped(random, amplitudes).real for _ in range(3)], axis=1)
 
 

@@ -261,6 +261,7 @@ def compare_methods(
 
 def measure_all(seeds: Sequence[int], recording: Path | None) -> dict[str, Any]:
     """Return the result of `--json`: machine, commit, time of a step by method, and all cases."""
+    commit = git_commit()
     cases: list[Regret] = []
     step_s: dict[str, list[float]] = {}
     for seed in seeds:
@@ -274,7 +275,7 @@ def measure_all(seeds: Sequence[int], recording: Path | None) -> dict[str, Any]:
     return {
         "machine": machine_name(),
         "load": describe_load(),
-        "commit": git_commit(),
+        "commit": commit,
         "seeds": list(seeds),
         "median_step_s": {name: statistics.median(each) for name, each in step_s.items()},
         "cases": [_rounded(asdict(case)) for case in cases],

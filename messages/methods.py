@@ -15,14 +15,7 @@ T = TypeVar("T", bound=str | float)
 
 MarkerMethod = Literal["moments", "weighted_centroid", "subpixel_fit"]
 TriangulationMethod = Literal["dlt"]
-TrackingMethod = Literal[
-    "none",
-    "one_euro",
-    "constant_velocity",
-    "constant_acceleration",
-    "singer_tremor",
-    "adaptive",
-]
+TrackingMethod = Literal["none", "one_euro", "adaptive"]
 SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]

@@ -55,7 +55,13 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("NodeProcess", "state"): {"away": "exited"},
     ("Methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
     ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
-    ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
+    ("Methods", "tracking"): {
+        "hand": "adaptive",
+        "singer_tremor": "adaptive",
+        "constant_velocity": "adaptive",
+        "constant_acceleration": "adaptive",
+        "exponential": "one_euro",
+    },
     ("Methods", "sheet_force"): {"cubic": "scaled"},
 }
 """Former and current literal values, by model and current field name."""

@@ -132,7 +132,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {tracking: hand}}\n",
-            "'hand' is invalid; it is now \"singer_tremor\"",
+            "'hand' is invalid; it is now \"adaptive\"",
         ),
         (GRAPH + "    host: left\n", 'unknown host "left"; choose one of: main'),
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),

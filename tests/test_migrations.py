@@ -59,7 +59,7 @@ def test_a_recorded_scene_is_read_with_todays_methods_and_without_removed_ones(
     assert migration is not None
     methods = Scene.model_validate(migration(fields)).methods
     assert not hasattr(methods, "kinematics")
-    assert (methods.marker, methods.tracking) == ("moments", "singer_tremor")
+    assert (methods.marker, methods.tracking) == ("moments", "adaptive")
 
 
 def test_renamed_fields_of_a_recorded_fingertip_are_read() -> None:

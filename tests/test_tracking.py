@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
-from flexsheet.nodes.triangulator.filters import Estimate, Filter, Kalman, Tremor
+from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
 from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
@@ -28,7 +28,6 @@ SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(max_speed_m_per_s=1.5)
-KALMAN = ["constant_velocity", "constant_acceleration", "singer_tremor", "adaptive"]
 
 
 def method(name: str) -> Filter:
@@ -117,9 +116,8 @@ def lag_s(name: str, lead_s: float) -> float:
     return float(-np.mean(errors @ velocity) / (velocity @ velocity))
 
 
-@pytest.mark.parametrize("name", KALMAN)
-def test_a_steady_finger_is_predicted_without_lag(name: str) -> None:
-    assert abs(lag_s(name, 0.05)) < 1e-3
+def test_a_steady_finger_is_predicted_without_lag() -> None:
+    assert abs(lag_s("adaptive", 0.05)) < 1e-3
 
 
 def test_a_low_pass_lags_by_its_own_time_but_not_by_the_lead() -> None:
@@ -133,15 +131,15 @@ def test_a_method_without_velocity_lags_by_the_horizon() -> None:
     assert np.linalg.norm(off) > 0.9 * 0.05 * np.linalg.norm([0.1, -0.05, 0.02])
 
 
-@pytest.mark.parametrize("name", KALMAN)
-def test_a_resting_finger_is_known_better_than_it_is_measured(name: str) -> None:
-    filter_ = method(name)
+def test_a_resting_finger_is_known_better_than_it_is_measured() -> None:
+    filter_ = method("adaptive")
     errors = [
         filter_.moments(estimate)[0] - still(0.0) for estimate in followed(filter_, still, 600)[60:]
     ]
     assert np.sqrt(np.mean(np.square(errors))) < 0.95 * np.sqrt(np.trace(NOISE) / 3)
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("name", ["constant_acceleration", "singer_tremor"])
 def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
     """The normalised squared error is about one per axis for a finger that moves as in the
@@ -182,6 +180,49 @@ def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
 
 
 def test_tremor_is_predicted_by_its_model_and_not_amplified_by_others() -> None:
+||||||| 8b924ba
+@pytest.mark.parametrize("name", ["constant_acceleration", "singer_tremor"])
+def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
+    """The normalised error squared of a hand that moves as the model says is about one per axis."""
+    filter_ = method(name)
+    assert isinstance(filter_, Kalman)
+    generator = np.random.default_rng(5)
+    tremor = filter_.tremor or Tremor(filter_.unmodelled_tremor_m)
+    dt, squares = 1.0 / 60.0, []
+    # Truth: acceleration as a decaying random walk, and tremor as damped swings.
+    velocity, acceleration, place = np.zeros(3), np.zeros(3), np.zeros(3)
+    swing = (
+        generator.standard_normal((tremor.size, 3)) * np.sqrt(np.diag(tremor.stationary))[:, None]
+    )
+    carry = tremor.transition(dt)
+    kick = np.linalg.cholesky(tremor.stationary - carry @ tremor.stationary @ carry.T)
+    estimate: Estimate | None = None
+    for frame in range(3000):
+        at_ns = round(frame * dt * 1e9)
+        truth = place + swing[::2].sum(axis=0)
+        seen = truth + np.sqrt(np.diag(NOISE)) * generator.standard_normal(3)
+        estimate = (
+            filter_.initialize(at_ns, seen, NOISE)
+            if estimate is None
+            else filter_.update(estimate, at_ns, seen, NOISE)
+        )
+        if frame > 100:
+            position, _, covariance = filter_.moments(estimate)
+            error = position - truth
+            squares.append(error @ np.linalg.solve(covariance[:3, :3], error) / 3)
+        place = place + dt * velocity + 0.5 * dt * dt * acceleration
+        velocity = velocity + dt * acceleration
+        acceleration = acceleration * np.exp(-filter_.acceleration_decay_per_s * dt)
+        acceleration += filter_.noise * np.sqrt(dt) * generator.standard_normal(3)
+        swing = carry @ swing + kick @ generator.standard_normal((tremor.size, 3))
+    # Tremor that counts as white noise makes a filter more careful than it need be.
+    assert (0.6 if filter_.tremor else 0.3) < np.mean(squares) < 1.4
+
+
+def test_tremor_is_predicted_by_the_hand_and_not_the_wrong_way_by_the_others() -> None:
+=======
+def test_tremor_is_predicted() -> None:
+>>>>>>> trk
     def trembling(time_s: float) -> Floats:
         return np.array([5e-5 * np.sin(2 * np.pi * 9.3 * time_s), 0.0, 0.0])
 
@@ -195,37 +236,21 @@ def test_tremor_is_predicted_by_its_model_and_not_amplified_by_others() -> None:
 
     left_out_m = 5e-5 / np.sqrt(2)
     assert error_m("adaptive") < 0.75 * left_out_m
-    assert left_out_m < error_m("constant_velocity") < 2.0 * left_out_m
+    assert left_out_m < error_m("one_euro") < 2.0 * left_out_m
 
 
 def test_a_start_and_a_stop_are_followed_within_a_few_frames() -> None:
     def stop_and_go(time_s: float) -> Floats:
         return np.array([0.2 * min(max(time_s - 1.0, 0.0), 0.5), 0.0, 0.0])
 
-    for name in KALMAN:
-        filter_ = method(name)
-        estimates = followed(filter_, stop_and_go, 180)
-        off = [
-            np.linalg.norm(filter_.moments(one)[0] - stop_and_go(one.at_ns * 1e-9))
-            for one in estimates[30:]
-        ]
-        assert max(off) < 2e-3, name
-        assert np.linalg.norm(filter_.moments(estimates[-1])[1]) < 5e-3, name
-
-
-def test_tremor_dies_out_when_nothing_keeps_it_up() -> None:
-    tremor = Tremor(5e-5)
-    assert tremor.transition(0.0) == pytest.approx(np.eye(tremor.size))
-    twice = tremor.transition(0.02) @ tremor.transition(0.02)
-    assert twice == pytest.approx(tremor.transition(0.04), abs=1e-9)
-    assert np.abs(tremor.transition(3.0)).max() < 0.05 * np.abs(tremor.transition(0.0167)).max()
-    horizons_s = np.array([0.0, 0.013, 0.05])
-    for lead_s, row in zip(horizons_s, tremor.displacements(horizons_s), strict=True):
-        assert row == pytest.approx(tremor.transition(float(lead_s))[::2].sum(axis=0))
-    for dt in (0.001, 0.0167, 0.3):
-        carry = tremor.transition(dt)
-        gained = tremor.stationary - carry @ tremor.stationary @ carry.T
-        assert np.linalg.eigvalsh(gained).min() > 0
+    filter_ = method("adaptive")
+    estimates = followed(filter_, stop_and_go, 180)
+    off = [
+        np.linalg.norm(filter_.moments(one)[0] - stop_and_go(one.at_ns * 1e-9))
+        for one in estimates[30:]
+    ]
+    assert max(off) < 2e-3
+    assert np.linalg.norm(filter_.moments(estimates[-1])[1]) < 5e-3
 
 
 # The path ahead

@@ -446,7 +446,7 @@ async def test_a_node_follows_the_scene_if_set_to_auto() -> None:
     for each in (follows, set_by_hand):
         await each.setup()
         await each.step("scene", SCENE, header_at(0))
-    assert follows.methods == "subpixel_fit, dlt, singer_tremor"
+    assert follows.methods == "subpixel_fit, dlt, adaptive"
     for each in (follows, set_by_hand):  # another scene, at run time
         changed = with_methods(marker="moments", triangulation="dlt", tracking="one_euro")
         await each.step("scene", changed, header_at(1))

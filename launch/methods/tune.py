@@ -91,14 +91,7 @@ TUNABLES = (
         "tracking",
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _make_settings(
-            "none",
-            "one_euro",
-            "constant_velocity",
-            "constant_acceleration",
-            "singer_tremor",
-            "adaptive",
-        ),
+        _make_settings("none", "one_euro", "adaptive"),
     ),
     Tunable(
         "sheet-force",

@@ -59,7 +59,13 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "compliance_mode": {"curve": "force_curve", "stretch": "stiffness"},
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
     "sheet_force": {"cubic": "scaled"},
-    "tracking": {"exponential": "one_euro", "hand": "singer_tremor"},
+    "tracking": {
+        "hand": "adaptive",
+        "singer_tremor": "adaptive",
+        "constant_velocity": "adaptive",
+        "constant_acceleration": "adaptive",
+        "exponential": "one_euro",
+    },
     "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }

@@ -51,11 +51,20 @@ MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 STAMP_JITTER_NS = 2_000_000
 """Time by which a scored age may fall short of its horizon."""
 
-MEMORY_S = 3.0
-"""Time constant of the covariance of the filters' errors."""
+MEMORY_S, MEMORY_POINTS = 1.0, 60
+"""Time constant of the covariance of the filters' errors, and the points that it has at least."""
+
+RECENT_S, RECENT_POINTS = 0.2, 10
+OUTDATED_RATIO = 1.5
+OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
+"""Time constant of recent mean-square errors; ratio of the combination's to the best model's above
+which the covariance is outdated; and the shorter memory that it then has."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
 """Error of every filter at first, and its weight in points."""
+
+MIN_ERROR_M = 1e-9
+"""Size of errors below which they are not scaled up."""
 
 SHRINKAGE = 0.02
 """Weight of equal shares against the covariance of the errors, which is one of a few seconds, as a
@@ -90,15 +99,15 @@ NO_OSCILLATOR = (10.0, 0.0)
 MODELS: tuple[Model, ...] = (
     (1e-5, 0.0, *NO_OSCILLATOR),
     (1e-3, 0.0, *NO_OSCILLATOR),
-    (1e-1, 0.0, *NO_OSCILLATOR),
     (0.0, 1e-2, *NO_OSCILLATOR),
     (0.0, 1e0, *NO_OSCILLATOR),
     (0.0, 1e2, *NO_OSCILLATOR),
     *((1e-7, 0.0, frequency_hz, 5e-4) for frequency_hz in (1.0, 2.5)),
     *((0.0, 1e-2, frequency_hz, 1e-4) for frequency_hz in (5.0, 6.5, 8.0, 9.5, 11.5)),
+    *((0.0, 1e1, frequency_hz, 1e-4) for frequency_hz in (6.0, 9.0)),
 )
-"""Steady and lively motion, voluntary motion around one point, and tremor.  Few models are enough,
-since their combinations stand for the spectra between them."""
+"""Steady and lively motion, voluntary motion around one point, tremor, and tremor of a lively hand.
+Few models are enough, since their combinations stand for the spectra between them."""
 
 ACCELERATION_NOISE, JERK_NOISE, FREQUENCY_HZ, DEVIATION_M = np.array(MODELS).T
 FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
@@ -232,19 +241,35 @@ def _find_observation(steps: int) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _find_path(horizons: bytes) -> tuple[Floats, Floats]:
-    """Return horizons (n, 1) s from an array's bytes, and the rows (n, models * 5) that give the
-    positions then from weighted states."""
-    times = np.frombuffer(horizons)
-    rows = np.array([OBSERVED @ compute_transition(float(time)) for time in times])
-    return times[:, None], rows.reshape(len(times), -1)
+def _find_rows(horizons: bytes) -> Floats:
+    """Return the rows (n, models * 5) that give positions at horizons (n,) s from weighted states.
+
+    horizons: the bytes of the array.
+    """
+    rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
+    return np.array(rows).reshape(len(rows), -1)
+
+
+@lru_cache(maxsize=512)
+def _find_shares(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
+    """Return the shares (scored horizons + 1, n, 1) in the predictions at horizons (n,) s.
+
+    They are those of each scored horizon's weights, by its age, and that of the filtered position's
+    offset, which fades towards the first of them.
+    """
+    times_ms = 1e3 * np.frombuffer(horizons)
+    anchors_ms, counts = np.unique(ages_ms, return_counts=True)
+    together = np.interp(times_ms, anchors_ms, counts)
+    shares = [np.interp(times_ms, anchors_ms, anchors_ms == age) / together for age in ages_ms]
+    offset = np.interp(times_ms, [0.0, ages_ms[0]], [1.0, 0.0])
+    return np.stack([*shares, offset])[:, :, None]
 
 
 def combine(covariance: Floats) -> Floats:
     """Return weights (..., models) of sum 1 that minimise the mean square of the combined error.
 
-    covariance: (..., models, models) m^2 of the models' errors.  The measurement noise in them is
-        equal for all models, so that it changes nothing.
+    covariance: (..., models, models) of the models' errors, in any unit.  The measurement noise in
+        them is equal for all models, so that it changes nothing.
     """
     count = covariance.shape[-1]
     own = covariance.trace(axis1=-2, axis2=-1) / count
@@ -265,10 +290,12 @@ class BankEstimate(Estimate):
         states are along them.
     points: number of points since the track began.
     past_ns, past: earlier times and states, oldest first, over the longest scored horizon.
-    error_covariance: (scored horizons, 3, models, models) m^2 of the models' prediction errors by
-        axis, measurement noise included.
+    error_covariance: (scored horizons, 3, models, models) m of the models' prediction errors by
+        axis, each divided by the root of its size at the time.
     weights: (scored horizons, 3, models), with sum 1 over the models.
-    scored_ages_s: ages of the states whose predictions of the newest point were scored.
+    recent: mean squares (scored horizons, 3, models + 1) m^2 of the errors of each model and of the
+        combination in the last instants.
+    scored_ages_ms: ages of the states whose predictions of the newest point were scored.
     innovation: mean square (3,) m^2 of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
     velocity_variance: (3,) m^2/s^2.
@@ -280,7 +307,8 @@ class BankEstimate(Estimate):
     past: tuple[Floats, ...]
     error_covariance: Floats
     weights: Floats
-    scored_ages_s: tuple[float, ...]
+    recent: Floats
+    scored_ages_ms: tuple[int, ...]
     innovation: Floats
     position: Floats
     variance: Floats
@@ -298,7 +326,7 @@ class AdaptiveBank:
         state = np.zeros((len(MODELS), STATES, 3))
         state[:, 0] = measured @ axes
         shape = (len(SCORED_HORIZONS_S), 3, len(MODELS))
-        prior = variances[:, None, None] + PRIOR_ERROR_M**2 * np.eye(len(MODELS))
+        prior = PRIOR_ERROR_M * np.eye(len(MODELS))
         return BankEstimate(
             at_ns,
             state,
@@ -309,7 +337,8 @@ class AdaptiveBank:
             past=(),
             error_covariance=np.broadcast_to(prior, (*shape, len(MODELS))),
             weights=np.full(shape, 1.0 / len(MODELS)),
-            scored_ages_s=(MIN_INTERVAL_S, *SCORED_HORIZONS_S[1:]),
+            recent=np.zeros((*shape[:2], len(MODELS) + 1)),
+            scored_ages_ms=(1,) * len(SCORED_HORIZONS_S),
             innovation=variances,
             position=state[0, 0],
             variance=variances,
@@ -322,7 +351,7 @@ class AdaptiveBank:
         assert isinstance(before, BankEstimate)
         before, variances = _align(before, covariance)
         dt, points = (at_ns - before.at_ns) * 1e-9, before.points + 1
-        forgotten = max(-math.expm1(-dt / MEMORY_S), 1.0 / (PRIOR_POINTS + points))
+        forgotten = max(_forget(dt, MEMORY_S, MEMORY_POINTS), 1.0 / (PRIOR_POINTS + points))
         point = measured @ before.axes
         gains = find_gains(dt, variances.tolist(), points)
         prior = _find_transition(round(dt / TIME_STEP_S)) @ before.state
@@ -336,11 +365,21 @@ class AdaptiveBank:
         expected = np.maximum(expected, MIN_GAIN * variances)
         gain = expected / (expected + variances)
         past_ns, past = (*before.past_ns, before.at_ns), (*before.past, before.state)
-        errors, ages_s = _prediction_errors(past_ns, past, at_ns, point)
+        errors, ages_ms = _prediction_errors(past_ns, past, at_ns, point, innovations)
         first = at_ns - past_ns[0] > MAX_AGE_NS
-        error_covariance = before.error_covariance + forgotten * (
-            errors[..., None] * errors[:, :, None] - before.error_covariance
+        both = np.concatenate(
+            [errors, (before.weights * errors).sum(axis=2, keepdims=True)], axis=2
         )
+        recent = before.recent + _forget(dt, RECENT_S, RECENT_POINTS) * (both**2 - before.recent)
+        # A combination that is worse than its best model has been learnt from another motion.
+        is_outdated = recent[:, :, -1] > OUTDATED_RATIO * recent[:, :, :-1].min(axis=2)
+        sooner = max(forgotten, _forget(dt, OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS))
+        fresh = np.where(is_outdated, sooner, forgotten)[:, :, None, None]
+        # A calm hand after a lively one must not wait until the larger errors are forgotten.
+        sizes = np.sqrt(np.einsum("sam,sam->sa", errors, errors) / len(MODELS))
+        errors /= np.sqrt(sizes + MIN_ERROR_M)[:, :, None]
+        error_covariance = (1.0 - fresh) * before.error_covariance
+        error_covariance += errors[..., None] * fresh * errors[:, :, None]
         # The weights change slowly, and solving for them takes as long as all the rest.
         weights = before.weights
         if points % COMBINE_EVERY_POINTS == 0:
@@ -355,7 +394,8 @@ class AdaptiveBank:
             past=past[first:],
             error_covariance=error_covariance,
             weights=weights,
-            scored_ages_s=ages_s,
+            recent=recent,
+            scored_ages_ms=ages_ms,
             innovation=innovation,
             position=point - (1.0 - gain) * combined,
             variance=gain * variances,
@@ -373,47 +413,50 @@ class AdaptiveBank:
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
         assert isinstance(estimate, BankEstimate)
-        times, rows = _find_path(horizons_s.tobytes())
+        horizons = horizons_s.tobytes()
         weighted = estimate.weights.transpose(0, 2, 1)[:, :, None] * estimate.state
-        first, second, third = rows @ weighted.reshape(len(weighted), -1, 3)
-        first_s, second_s, third_s = estimate.scored_ages_s
-        path = first + _rise(times, first_s, second_s) * (second - first)
-        path += _rise(times, second_s, third_s) * (third - second)
-        # Towards the present, the filtered position takes over from the combined prediction.
-        offset = estimate.position - (weighted[0, :, 0] + weighted[0, :, 3]).sum(axis=0)
-        path += (1.0 - _rise(times, 0.0, first_s)) * offset
-        return np.asarray(path @ estimate.axes.T)
+        paths = np.empty((len(weighted) + 1, len(horizons_s), 3))
+        np.matmul(_find_rows(horizons), weighted.reshape(len(weighted), -1, 3), out=paths[:-1])
+        paths[-1] = estimate.position - (weighted[0, :, 0] + weighted[0, :, 3]).sum(axis=0)
+        shares = _find_shares(horizons, estimate.scored_ages_ms)
+        return np.asarray((shares * paths).sum(axis=0) @ estimate.axes.T)
 
 
-def _rise(times: Floats, begin: float, end: float) -> Floats:
-    """Return values that rise from 0 to 1 between two times; a step if they are equal."""
-    fraction = (times - begin) / max(end - begin, 1e-9)
-    return np.asarray(np.minimum(np.maximum(fraction, 0.0), 1.0))
+def _forget(dt: float, memory_s: float, memory_points: int) -> float:
+    """Return the weight of a new value in a mean over a time, and at least over some points."""
+    return min(-math.expm1(-dt / memory_s), 1.0 / memory_points)
 
 
 def predict_by_model(estimate: BankEstimate, horizons_s: Floats) -> Floats:
     """Return the positions (n, models, 3) that each model predicts at times (n,) s."""
-    _, rows = _find_path(horizons_s.tobytes())
+    rows = _find_rows(horizons_s.tobytes())
     by_model = np.einsum("nms,msa->nma", rows.reshape(-1, len(MODELS), STATES), estimate.state)
     return np.asarray(by_model @ estimate.axes.T)
 
 
 def _prediction_errors(
-    times_ns: tuple[int, ...], states: tuple[Floats, ...], at_ns: int, point: Floats
-) -> tuple[Floats, tuple[float, ...]]:
+    times_ns: tuple[int, ...],
+    states: tuple[Floats, ...],
+    at_ns: int,
+    point: Floats,
+    innovations: Floats,
+) -> tuple[Floats, tuple[int, ...]]:
     """Return the errors (scored horizons, 3, models) m with which earlier states predicted a point.
 
-    Each horizon takes the newest state that is as old, else the oldest.  The second result holds
-    their ages in s.
+    The first are the innovations (models, 3) after the newest state.  Each other horizon takes the
+    newest state that is as old, else the oldest.  The second result holds their ages in ms.
     """
-    errors, ages_s = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS))), []
-    for error, horizon_s in zip(errors, SCORED_HORIZONS_S, strict=True):
+    errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
+    errors[0] = innovations.T
+    ages_ms = [max(round((at_ns - times_ns[-1]) * 1e-6), 1)]
+    for error, horizon_s in zip(errors[1:], SCORED_HORIZONS_S[1:], strict=True):
         newest_ns = at_ns - round(1e9 * horizon_s) + STAMP_JITTER_NS
         index = max(bisect.bisect(times_ns, newest_ns) - 1, 0)
-        ages_s.append((at_ns - times_ns[index]) * 1e-9)
-        rows = _find_observation(round(ages_s[-1] / TIME_STEP_S))
+        age_ns = at_ns - times_ns[index]
+        ages_ms.append(max(round(age_ns * 1e-6), 1))
+        rows = _find_observation(round(age_ns * 1e-9 / TIME_STEP_S))
         np.subtract(point[:, None], (rows @ states[index])[:, 0].T, out=error)
-    return errors, tuple(ages_s)
+    return errors, tuple(ages_ms)
 
 
 def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Floats]:
@@ -438,6 +481,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         past=tuple(state @ rotation for state in estimate.past),
         error_covariance=np.einsum("ij,sjmn->simn", mix, estimate.error_covariance),
         weights=mix @ estimate.weights,
+        recent=mix @ estimate.recent,
         innovation=mix @ estimate.innovation,
         position=estimate.position @ rotation,
         variance=mix @ estimate.variance,
