@@ -15,12 +15,8 @@ from website import (
     messages_page,
     parameters_page,
     registers_page,
-<<<<<<< HEAD
     tolerances_page,
-||||||| 8b924ba
-=======
     tracking_page,
->>>>>>> trk
 )
 from website.graph import DRAWINGS, svg
 
@@ -39,19 +35,13 @@ def generate(docs: Path) -> dict[Path, str]:
         Path("errors.md"): errors_page.reference(),
         Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
-<<<<<<< HEAD
         Path("apparatus.md"): tolerances_page.page(
             (docs / "apparatus.md").read_text(encoding="utf-8")
         ),
-        **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
-||||||| 8b924ba
-        **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
-=======
         Path("tracking.md"): tracking_page.page(
             (docs / "tracking.md").read_text(encoding="utf-8"), docs / "charts/tracking-regret.json"
         ),
-        **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
->>>>>>> trk
+        **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
     }
 
 
