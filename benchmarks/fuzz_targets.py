@@ -39,6 +39,7 @@ import flexsheet.launch
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.apparatus import nominal_apparatus
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.bag import (
     BagError,
@@ -50,6 +51,7 @@ from flexsheet.messages.bag import (
 )
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.wire import WireError, decode, encode
 from flexsheet.nodes import NODES, node_class
@@ -264,8 +266,6 @@ def _example_of(info: Any) -> Any:
 
 def _array(spec: ArraySpec) -> np.ndarray[Any, Any]:
     shape = tuple(one if isinstance(one, int) else 2 for one in spec.shape)
-    if shape == (4, 4):  # a rigid transform
-        return np.eye(4, dtype=np.dtype(spec.dtype))
     return np.ones(shape, np.dtype(spec.dtype))
 
 
@@ -274,15 +274,21 @@ NAMES = tuple(TOPICS)
 
 
 @cache
-def scene() -> Message:
+def scene() -> Scene:
     return load_scene(LAUNCH / "scenes" / "cylinder.yaml")
+
+
+@cache
+def messages_of_scene() -> dict[str, Message]:
+    """Return valid messages of the topics whose values depend on one another."""
+    return {"scene": scene(), "twin/apparatus": nominal_apparatus(scene())}
 
 
 def wire_seeds() -> list[bytes]:
     """Return a message of each topic: the topic's number, then its frames as in a bag."""
     found = []
     for number, topic in enumerate(TOPICS.values()):
-        message = scene() if topic.name == "scene" else example(topic.message)
+        message = messages_of_scene().get(topic.name) or example(topic.message)
         for inline_bytes in (0, 1024):
             frames = encode(message, HEADER, inline_bytes=inline_bytes)
             found.append(bytes([number]) + join_frames(frames))

@@ -283,5 +283,5 @@ def test_a_point_that_is_not_finite_never_enters() -> None:
         point = np.full(3, np.nan) if bad else points[i]
         assert not (tracker.update(round(1e9 * time_s), point, NOISE) == "ok" and bad)
     track = tracker.predict_at(round(1e9 * times_s[-1]), np.array([0.0, 0.1]))
-    assert np.isfinite(track.ahead).all()
+    assert np.isfinite(track.path).all()
     assert np.isfinite(track.covariance).all()

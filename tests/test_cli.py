@@ -339,7 +339,7 @@ def test_verify_steps_a_node_and_compares(
     flexsheet: Command, recorded: Path, tmp_path: Path
 ) -> None:
     result = flexsheet("bag", "verify", "listener", recorded, "--json").json()
-    assert result["ok"], result
+    assert result["ok"], str(result)
     assert result["same_bytes"]
     assert result["topics"]["estop"] == {
         "recorded": 1, "replayed": 1, "compared": 1, "beyond_tolerance": 0, "worst": {},
