@@ -92,7 +92,7 @@ test-long: $(DEV_STAMP) cached
 		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
-# Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
+# Longer than the tests: what docs/results.md and docs/image-correction.md contain.
 bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
@@ -104,7 +104,7 @@ bench: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
 
-# docs/messaging-peers.md: other messaging libraries in turns with ours (a network of its own: root).
+# Other messaging libraries in turns with ours (a network of its own: root).
 bench-peers: setup
 	$(INSTALL) --no-build-isolation -e '.[peers]'
 	$(BIN)/python -m benchmarks.messaging_peers
@@ -126,7 +126,7 @@ fuzz: setup
 	$(INSTALL) --no-build-isolation -e '.[fuzz]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
-# What docs/limits.md and docs/limits-soft-body.md show: tables and pictures.
+# What docs/limits.md summarises: tables and pictures.
 limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits

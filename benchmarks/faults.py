@@ -246,7 +246,7 @@ def rows(
 
 
 def table(cases: list[dict[str, Any]]) -> str:
-    """Return the rows of the table in docs/limits.md."""
+    """Return the rows of the table as Markdown."""
     lines = [
         "| fault | neither follows after | both again | both followed, of the time until then "
         "| sheet off by, p50 / p95 | missing in the bag | faults |",

@@ -547,7 +547,7 @@ def format_ratios(report: dict[str, Any]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Return the page docs/messaging.md."""
+    """Return the report as Markdown."""
     lines = [
         "# How long a message takes",
         "",
@@ -598,7 +598,7 @@ def main() -> None:
             )
     report = {
         "command": f"python -m benchmarks.messaging --transport {options.transport} "
-        f"--rounds {rounds} --seconds {seconds:g} --markdown docs/messaging.md",
+        f"--rounds {rounds} --seconds {seconds:g} --markdown messaging.md",
         "machine": machine_name(),
         "load": [load_before, os.getloadavg()[0]],
         "zmq": zmq.zmq_version(),

@@ -238,7 +238,7 @@ HEADS = ("library", "", "p50 µs", "p99 µs", "p50 ratio", "(min-max)", "p99 rat
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Return the page docs/messaging-peers.md."""
+    """Return the report as Markdown."""
     lines = [
         "# How long a message takes by other libraries",
         "",
@@ -302,7 +302,7 @@ def main() -> None:
             latency += measure_over(one, found, options, lambda: progress.advance(task))
     report = {
         "command": f"python -m benchmarks.messaging_peers --rounds {options.rounds} "
-        f"--seconds {options.seconds:g} --markdown docs/messaging-peers.md",
+        f"--seconds {options.seconds:g} --markdown messaging-peers.md",
         "machine": machine_name(),
         "load": [load_before, os.getloadavg()[0]],
         "zmq": zmq.zmq_version(),

@@ -1,4 +1,4 @@
-"""Measure the limits of the soft body's methods, for docs/limits-soft-body.md.
+"""Measure the limits of the soft body's methods.
 
 OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_limits [CASE ...]
 

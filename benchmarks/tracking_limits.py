@@ -426,7 +426,7 @@ def evaluate(
 
 
 def tables(results: dict[str, list[Row]]) -> str:
-    """Format the tables of docs/limits.md as Markdown."""
+    """Format the tables as Markdown."""
     lines = []
     for name, rows in results.items():
         failure = FAILURES[name]

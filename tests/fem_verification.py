@@ -2,9 +2,10 @@
 
 OPENBLAS_NUM_THREADS=1 python -m tests.fem_verification
 
-This runs tests/test_fem_verify_*.py and prints a Markdown table with one row per result, for
-docs/soft-body-verification.md. A test records its measurements with `at_most`, `between` or `near`,
-which also assert them. The last paragraph of its docstring names the source after "Source:".
+This runs tests/test_fem_verify_*.py and prints a Markdown table with one row per result;
+docs/soft-body-verification.md summarises it. A test records its measurements with `at_most`,
+`between` or `near`, which also assert them. The last paragraph of its docstring names the source
+after "Source:".
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ INTRODUCTION = """\
 Messages between nodes.  Units are SI and radians; positions and directions are in the
 world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless
 a name says otherwise; `a_from_b` is a 4x4 transform.  The form on sockets and in bags is described
-in `messages/wire.py` and `messages/bag.py`; how long a message takes is in
-[messaging.md](messaging.md).
+in `messages/wire.py` and `messages/bag.py`; delivery and clocks in [time and messaging](clocks.md).
 
 ## Topics
 

@@ -26,7 +26,7 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
     """A soft body that cannot be computed; the text gives the reason and a remedy."""
 
     code = "no-soft-body"
-    remedy = "Follow the remedy in the text; see docs/meshing.md and docs/soft-body.md."
+    remedy = "Follow the remedy in the text; see docs/soft-body-reference.md and docs/soft-body.md."
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:

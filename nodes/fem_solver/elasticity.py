@@ -26,7 +26,7 @@ class SolidMeshError(FlexsheetError, ValueError):
     """Raised for a mesh with inverted elements or a body without sufficient support."""
 
     code = "solid-mesh"
-    remedy = "Increase skin_spacing_m, or fix more of the object; see docs/meshing.md."
+    remedy = "Increase skin_spacing_m, or fix more of the object; see docs/soft-body-reference.md."
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:

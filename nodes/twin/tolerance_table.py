@@ -297,7 +297,7 @@ _ROWS = (
     Tolerance("finger.finger_tilt_rad", "°", math.degrees(1.0),
               Uniform(-math.radians(20.0), math.radians(20.0)), J),
     Tolerance("finger.tremor_frequency_hz", "Hz", 1.0, Uniform(5.0, 12.0),
-              "11.3 − 0.042 × age (n = 340), 5 to 9 with a free wrist (docs/finger-motion.md)"),
+              "11.3 − 0.042 × age (n = 340), 5 to 9 with a free wrist"),
     Tolerance("finger.tremor_width_hz", "Hz", 1.0, Uniform(0.8, 3.0), J),
     Tolerance("finger.tremor_rms_m", "µm", UM, LogNormal(60e-6, 0.5),
               "Growdon 2000: 30 µm supported, twice that with the hand free"),

@@ -51,7 +51,7 @@ MIN_THICKNESS_SPACINGS = 4.0
 """Minimum thickness of the object, in skin spacings: two elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""Peak memory while meshing, see docs/meshing.md."""
+"""Peak memory while meshing; `benchmarks.meshing` measures it."""
 SAMPLES = 16
 """Sample points along each side of the bounding box for the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0

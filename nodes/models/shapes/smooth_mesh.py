@@ -89,7 +89,8 @@ if TYPE_CHECKING:
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     """Return the default smoothing length, 1.75 median edges, m.
 
-    Shorter lengths leave facets visible, longer ones flatten curved parts; see docs/shapes.md.
+    Shorter lengths leave facets visible, longer ones flatten curved parts; `benchmarks.shapes`
+    measures both.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)

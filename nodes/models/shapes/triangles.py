@@ -27,7 +27,9 @@ class MeshError(FlexsheetError, ValueError):
     """Raised for a mesh that does not bound a solid."""
 
     code = "mesh"
-    remedy = "Repair the mesh: closed, outward, no inverted elements; see docs/meshing.md."
+    remedy = (
+        "Repair the mesh: closed, outward, no inverted elements; see docs/soft-body-reference.md."
+    )
 
 
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
