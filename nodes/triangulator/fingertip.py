@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.triangulator.flat_marker import DiscView, FlatPose, estimate_flat_pose
 from flexsheet.nodes.triangulator.marker import (
+    FLAT_METHODS,
     SHARP_PX,
     Blob,
     BlobFilter,
@@ -64,6 +66,9 @@ WINDOW_MARGIN_PX = 5
 
 GATE_RADIUS_SIGMAS = 4.0
 """Radius of a gate in standard deviations of the expected position."""
+
+MAX_FLAT_PAIRS = 4
+"""Maximum number of pairs that are refined as flat markers, those with the lowest costs."""
 
 AMBIGUITY_MARGIN = 9.0
 """Minimum cost difference of a unique match to every other, in squared standard deviations."""
@@ -348,10 +353,15 @@ class RefinedPair:
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
     """Select the marker among one or more pairs.
 
-    Of pairs with about the same cost, only those that are discs after refinement remain.
+    Of pairs with about the same cost, only those that are discs after refinement remain: round
+    ones, or flat ones seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
+    rejected = [one for one in rivals if one.rejection_reason is not None]
+    if rejected:
+        flat = _refine_flat(inputs, rejected[:MAX_FLAT_PAIRS])
+        refined, rivals = [*flat, *refined], [*flat, *rivals]
     valid = sorted(
         (one for one in rivals if one.rejection_reason is None), key=lambda one: one.cost
     )
@@ -375,6 +385,76 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
         cost = math.inf if rejection_reason else pair.cost + _size_cost(inputs, pair, markers)
         found.append(RefinedPair(pair, markers, rejection_reason, cost))
     return found
+
+
+def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> list[RefinedPair]:
+    """Refine rejected pairs as flat markers; return those that are such markers."""
+    refine = FLAT_METHODS.get(inputs.config.refine)
+    if refine is None:
+        return []
+    pairs = [one.pair for one in rejected]
+    found = []
+    for pair, markers in zip(pairs, _refine_markers(inputs, pairs, refine), strict=True):
+        if any(marker.rejection_reason is not None for marker in markers):
+            continue
+        flat = _check_flat_pair(inputs, markers)
+        if flat is not None:
+            cost = pair.cost + _size_cost(inputs, pair, flat)
+            found.append(RefinedPair(pair, flat, None, cost))
+    return found
+
+
+def _check_flat_pair(
+    inputs: DetectionInput, markers: tuple[Marker, Marker]
+) -> tuple[Marker, Marker] | None:
+    """Return two ellipses with the centre of the flat marker; None if they are no such marker.
+
+    The centres are those of the marker, without the effect of perspective.  The radius is the major
+    semi-axis.  The mismatch of both shapes increases the covariance, because an occluder that
+    covers a strip changes the semi-axis by as much as the centre.
+    """
+    measured = _triangulate(inputs, markers)
+    if measured is None:
+        return None
+    pose = _flat_pose(inputs, measured.point_world, markers)
+    majors_px = [marker.radius + math.hypot(*marker.elongation) for marker in markers]
+    deviation = math.hypot(MARKER_SIZE_SIGMA, *(marker.radius_deviation for marker in markers))
+    if not pose.mismatch_px <= SIZE_SIGMAS * deviation * max(majors_px):
+        return None
+    noise_px = max(markers[0].radius_deviation * major_px for major_px in majors_px)
+    variance_px2 = max(pose.mismatch_px**2 - noise_px**2, 0.0)
+    one, other = (
+        replace(
+            marker,
+            centre=marker.centre - offset_px,
+            covariance=marker.covariance + variance_px2 * np.eye(2),
+            radius=major_px,
+        )
+        for marker, offset_px, major_px in zip(
+            markers, pose.centre_offsets_px, majors_px, strict=True
+        )
+    )
+    return one, other
+
+
+def _flat_pose(
+    inputs: DetectionInput, point_world: Floats, markers: tuple[Marker, Marker]
+) -> FlatPose:
+    """Return the pose of a flat marker at a point (3,), m."""
+    geometry = inputs.geometry
+    left_from_world, right_from_left = geometry.left_from_world, geometry.right_from_left
+    in_left = left_from_world[:3, :3] @ point_world + left_from_world[:3, 3]
+    in_right = right_from_left[:3, :3] @ in_left + right_from_left[:3, 3]
+    views = []
+    for view, (turn, point) in enumerate(
+        ((np.eye(3), in_left), (right_from_left[:3, :3], in_right))
+    ):
+        matrix, distortion = geometry.matrices[view], geometry.distortions[view]
+        (e, f), radius = markers[view].elongation, markers[view].radius
+        axes = np.array([[radius + e, f], [f, radius - e]])
+        jacobian = project_with_jacobian(point, matrix, distortion)[1]
+        views.append(DiscView(turn, point, jacobian, axes))
+    return estimate_flat_pose(views, inputs.config.marker_radius_m)
 
 
 def _unique_candidates(
@@ -408,13 +488,14 @@ def _appearance(pair: BlobPair) -> Floats:
 
 
 def _refine_markers(
-    inputs: DetectionInput, pairs: Sequence[BlobPair]
+    inputs: DetectionInput, pairs: Sequence[BlobPair], refine: Refine | None = None
 ) -> list[tuple[Marker, Marker]]:
-    """Refine the markers of all pairs at once."""
+    """Refine the markers of all pairs at once, by the configured method or another."""
     config = inputs.config
     images = [image for _ in pairs for image in inputs.images]
     blobs = [blob for pair in pairs for blob in (pair.left, pair.right)]
-    markers = config.refine(images, blobs, config.blob_filter, config.sensor)
+    refine = config.refine if refine is None else refine
+    markers = refine(images, blobs, config.blob_filter, config.sensor)
     return list(zip(markers[::2], markers[1::2], strict=True))
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs, fit_ellipses
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -108,6 +108,8 @@ class Marker:
     radius_deviation: standard deviation of the radius by the method, as a fraction of it.
     blur: standard deviation of its edge, px.
     motion: (x, y) px during the exposure, of unknown sign.
+    elongation: (e, f) px of a flat marker seen at an angle, see `ellipse`.  Its radius is the mean
+        semi-axis.
     height: levels above its surroundings.
     rejection_reason: None for a valid marker.
     """
@@ -120,6 +122,7 @@ class Marker:
     motion: tuple[float, float]
     height: float
     rejection_reason: MarkerRejection | None
+    elongation: tuple[float, float] = (0.0, 0.0)
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
@@ -376,12 +379,8 @@ def subpixel_fit(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
     """Refine blobs by a maximum-likelihood fit of a motion-blurred disc; see `subpixel`."""
-    starts = [
-        DiscStart(blob.centre, blob.radius, blob.blur, blob.peak, blob.surround, blob.motion)
-        for blob in blobs
-    ]
     markers = []
-    for blob, fit in zip(blobs, fit_discs(images, starts, noise), strict=True):
+    for blob, fit in zip(blobs, fit_discs(images, _fit_starts(blobs), noise), strict=True):
         rejection_reason: MarkerRejection | None = None
         if fit.blur > max(blob_filter.max_blur * fit.radius, SHARP_PX):
             rejection_reason = "blurred"
@@ -406,8 +405,56 @@ def subpixel_fit(
     return markers
 
 
+MAX_ELLIPSE_MISFIT = 0.035
+MAX_ODD_MISFIT = 0.03
+"""Bounds on an ellipse's residuals and on their odd part, as a fraction of the marker's height.
+They are tighter than a disc's: an ellipse fits a partly covered disc well, but for the odd part."""
+
+
+def fit_flat_markers(
+    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
+) -> list[Marker]:
+    """Refine blobs by a maximum-likelihood fit of an ellipse at rest; see `subpixel`."""
+    markers = []
+    for blob, fit in zip(blobs, fit_ellipses(images, _fit_starts(blobs), noise), strict=True):
+        rejection_reason: MarkerRejection | None = None
+        minor = fit.radius - math.hypot(*fit.elongation)
+        if fit.blur > max(blob_filter.max_blur * minor, SHARP_PX):
+            rejection_reason = "blurred"
+        if (
+            not fit.converged
+            or fit.misfit > min(blob_filter.max_misfit, MAX_ELLIPSE_MISFIT)
+            or fit.odd_misfit > MAX_ODD_MISFIT
+        ):
+            rejection_reason = "merged"
+        markers.append(
+            Marker(
+                centre=fit.centre,
+                covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(blob.motion),
+                radius=fit.radius,
+                radius_deviation=0.02,
+                blur=fit.blur,
+                motion=(0.0, 0.0),
+                height=blob.height,
+                rejection_reason=rejection_reason,
+                elongation=fit.elongation,
+            )
+        )
+    return markers
+
+
+def _fit_starts(blobs: Sequence[Blob]) -> list[DiscStart]:
+    return [
+        DiscStart(blob.centre, blob.radius, blob.blur, blob.peak, blob.surround, blob.motion)
+        for blob in blobs
+    ]
+
+
 MARKER_METHODS: dict[str, Refine] = {
     "moments": moments,
     "weighted_centroid": weighted_centroid,
     "subpixel_fit": subpixel_fit,
 }
+
+FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
+"""Method for flat markers that belongs to a method for round ones."""

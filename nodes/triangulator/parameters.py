@@ -31,7 +31,9 @@ class TriangulatorParameters(NodeParameters):
         default=None,
         description="standard deviation of a marker's centre; null takes the method's estimate",
     )
-    marker_radius_m: Positive = Field(default=0.003, description="true radius of the marker")
+    marker_radius_m: Positive = Field(
+        default=0.003, description="true radius of the marker, a ball or a flat disc"
+    )
     max_reprojection_px: Positive = Field(
         default=1.5, description="maximum reprojection error of a marker pair"
     )

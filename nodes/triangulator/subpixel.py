@@ -11,6 +11,9 @@ with each pixel weighted by its noise.  The inverse of the Fisher information is
 the result, which is the Cramer-Rao bound for images that follow the model.  For other images, the
 odd part of the residuals increases the covariance.
 
+A flat marker that is seen at an angle is an ellipse.  `fit_ellipses` fits two more parameters, its
+elongation, with the exact image of `ellipse`; it leaves the motion out.
+
 The image's derivatives by centre and slopes are odd functions about the centre, all others even.  A
 wrong radius, blur, level or motion therefore changes the covariance, but not the centre.
 """
@@ -18,18 +21,24 @@ wrong radius, blur, level or motion therefore changes the covariance, but not th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
+
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
 STILL_PARAMETERS = 8
+ELONGATION = slice(8, 10)
+ELLIPSE = [X, Y, RADIUS, BLUR, 8, 9]
+"""Parameters of an ellipse: its elongation replaces the motion."""
+
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 """Parameters whose image derivative is odd about the disc's centre."""
 
@@ -49,6 +58,14 @@ the level of a saturated marker."""
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
 """Bounds of radius and blur, px."""
+
+MAX_ELONGATION = 0.6
+START_ELONGATION = 0.45
+"""Maximum elongation of an ellipse over its radius, and that of a start.  The axis ratio is at
+least a quarter."""
+
+ELLIPSE_BLUR_PX = 0.8
+"""Blur at the start of an ellipse's fit; the spread of the light depends on the elongation."""
 
 MOTION_STEP_PX = 1.8
 """Maximum step of the sum over the motion."""
@@ -96,9 +113,11 @@ class DiscFit:
     """Fitted disc.
 
     centre: (2,) px with covariance (2, 2) px^2.
-    radius, blur, motion: px; motion is (x, y).
+    radius, blur, motion: px; motion is (x, y).  The radius of an ellipse is the mean semi-axis.
+    elongation: (e, f) px of an ellipse, see `ellipse`.
     height: levels between ground and marker.
     misfit: root mean square of the residuals beyond noise, as a fraction of the height.
+    odd_misfit: the same of the residuals' odd part about the centre.
     converged: whether the fit converged to a disc.
     """
 
@@ -107,9 +126,15 @@ class DiscFit:
     radius: float
     blur: float
     motion: tuple[float, float]
+    elongation: tuple[float, float]
     height: float
     misfit: float
+    odd_misfit: float
     converged: bool
+
+
+RenderDiscs = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
+"""Function that renders discs; see `_render_disc`."""
 
 
 def fit_discs(
@@ -131,7 +156,28 @@ def fit_discs(
     )
     if max(math.hypot(*one.motion) for one in starts) < MIN_MOTION_PX:
         start = start[:, :STILL_PARAMETERS]
-    solved = _solve(cutouts, start)
+    return _fit(cutouts, start, _render_disc)
+
+
+def fit_ellipses(
+    images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
+) -> list[DiscFit]:
+    """Fit one ellipse at rest in each image; otherwise as `fit_discs`.
+
+    The motion of a start is that of a round disc with the same second moments.  Each ellipse is
+    fitted alone, because the time grows with the third power of its size.
+    """
+    found = []
+    for image, one in zip(images, starts, strict=True):
+        cutouts = _cut_out_discs([image], [one], noise)
+        shape = (*cutouts.offsets[0], one.radius, ELLIPSE_BLUR_PX)
+        start = np.array([(*shape, one.marker, one.ground, 0.0, 0.0, *_elongation(one))])
+        found += _fit(cutouts, start, _render_ellipse)
+    return found
+
+
+def _fit(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> list[DiscFit]:
+    solved = _solve(cutouts, start, render)
     covariances = np.linalg.inv(solved.information)[:, :RADIUS, :RADIUS]
     shifts = np.abs(solved.found - start)[:, :RADIUS].max(axis=1).tolist()
     return [
@@ -140,6 +186,7 @@ def fit_discs(
             corner,
             covariance,
             fitness,
+            is_ellipse=render is _render_ellipse,
             converged=solved.converged and shift < MAX_SHIFT_PX,
         )
         for parameters, corner, covariance, fitness, shift in zip(
@@ -173,13 +220,13 @@ class DiscSolution:
     converged: bool
 
 
-def _solve(cutouts: DiscCutouts, start: Floats) -> DiscSolution:
-    """Return the most likely parameters (n, parameters) of the discs."""
+def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolution:
+    """Return the most likely parameters (n, parameters) of the discs or ellipses."""
     prior_weights = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(prior_weights)
     found, converged, used = start.copy(), False, cutouts.weights
     for _ in range(ITERATIONS):
-        model, slopes = _render_disc(found, cutouts.x, cutouts.y)
+        model, slopes = render(found, cutouts.x, cutouts.y)
         residuals = cutouts.levels - model
         if cutouts.white is not None:
             used = np.where(cutouts.white & (residuals < 0), 0.0, cutouts.weights)
@@ -192,6 +239,8 @@ def _solve(cutouts: DiscCutouts, start: Floats) -> DiscSolution:
         found += step
         bounded = found[:, RADIUS : BLUR + 1]
         np.maximum(np.minimum(bounded, MAX_SHAPE), MIN_SHAPE, out=bounded)
+        if render is _render_ellipse:
+            _bound_elongation(found)
         if (np.abs(shape) < CONVERGED_STEP_PX).all():
             converged = True
             break
@@ -344,12 +393,48 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return levels.reshape(count, side * side), slopes.reshape(count, parameters, side * side)
 
 
+def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Render ellipses as `_render_disc` does: levels (n, s s), derivatives (n, parameters, s s)."""
+    x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
+    coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
+    columns = found.T[:, :, None]
+    dx, dy = x - columns[X], y - columns[Y]
+    ground = columns[GROUND] + (columns[SLOPE_X] * dx + columns[SLOPE_Y] * dy)
+    height = columns[MARKER] - ground
+    slopes = np.empty((*found.shape, x.size))
+    slopes[:, ELLIPSE] = by_shape * height[:, None]
+    slopes[:, MARKER] = coverage
+    slopes[:, GROUND] = 1.0 - coverage
+    slopes[:, SLOPE_X] = slopes[:, GROUND] * dx
+    slopes[:, SLOPE_Y] = slopes[:, GROUND] * dy
+    return ground + coverage * height, slopes
+
+
+def _elongation(start: DiscStart) -> tuple[float, float]:
+    """Return the elongation (e, f) of an ellipse with the second moments of a moving disc."""
+    length = math.hypot(*start.motion)
+    if length == 0.0:
+        return 0.0, 0.0
+    # The variance along the motion exceeds the one across by length^2 / 12; a disc's is a^2 / 4.
+    excess_px = min(length**2 / (12.0 * start.radius), START_ELONGATION * start.radius)
+    cosine, sine = start.motion[0] / length, start.motion[1] / length
+    return excess_px * (cosine**2 - sine**2), 2.0 * excess_px * cosine * sine
+
+
+def _bound_elongation(found: Floats) -> None:
+    """Limit the elongations of ellipses (n, parameters) in place."""
+    elongation = found[:, ELONGATION]
+    length = np.maximum(np.hypot(*elongation.T), 1e-12)
+    elongation *= np.minimum(MAX_ELONGATION * found[:, RADIUS] / length, 1.0)[:, None]
+
+
 def _make_fit(
     found: list[float],
     corner: tuple[int, int],
     covariance: Floats,
     fitness: tuple[float, int, float, float],
     *,
+    is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
     """Make the result of a fit; residuals beyond noise increase its covariance.
@@ -357,17 +442,25 @@ def _make_fit(
     fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness
-    x, y, radius, blur, marker, ground, _, _, *motion = found
+    x, y, radius, blur, marker, ground, _, _, *others = found
+    motion, elongation = (0.0, 0.0), (0.0, 0.0)
+    if is_ellipse:
+        elongation = (others[0], others[1])
+    elif others:
+        motion = (others[0], others[1])
     height = marker - ground
     excess = max(squares - pixels, 0.0) / max(weight, 1e-12)
     return DiscFit(
         centre=np.array([corner[0] + x, corner[1] + y]),
         covariance=covariance * max(ratio, MIN_VARIANCE_RATIO),
-        # Blur shifts a round edge inwards by blur^2 / 2 radius.
-        radius=radius + 0.5 * blur * blur / radius,
+        # Blur shifts a round edge inwards by blur^2 / 2 radius; an ellipse's image is exact.
+        radius=radius if is_ellipse else radius + 0.5 * blur * blur / radius,
         blur=blur,
-        motion=(motion[0], motion[1]) if motion else (0.0, 0.0),
+        motion=motion,
+        elongation=elongation,
         height=height,
         misfit=math.sqrt(excess) / max(abs(height), 1e-6),
+        odd_misfit=math.sqrt(max(ratio - 1.0, 0.0) * pixels / max(weight, 1e-12))
+        / max(abs(height), 1e-6),
         converged=converged and height > 0.0,
     )

@@ -1,0 +1,99 @@
+"""Check that two ellipses are one flat round marker, and correct their centres for perspective.
+
+A disc with radius R, centre p and normal n has the image A A^T = R^2 J (I - n n^T) J^T, with J the
+derivative of the pixel by the point.  Each ellipse gives two normals, mirrored about the line of
+sight; the other view decides.  A marker that is partly covered, or merged with a light, in general
+has no normal that agrees with both views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class DiscView:
+    """One camera's view of a disc.
+
+    camera_from_left: (3, 3) rotation from the left camera's axes.
+    point: (3,) the disc's centre in this camera, m.
+    jacobian: (2, 3) px/m, derivative of its pixel by the point.
+    axes: (2, 2) px, the symmetric matrix A of the ellipse's edge, see `ellipse`.
+    """
+
+    camera_from_left: Floats
+    point: Floats
+    jacobian: Floats
+    axes: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class FlatPose:
+    """Best normal (3,) of a disc, in the left camera's axes.
+
+    mismatch_px: largest difference of a semi-axis between an ellipse and the disc's image.
+    centre_offsets_px: (2, 2) centre of the disc's image minus image of its centre, per view.
+    """
+
+    normal: Floats
+    mismatch_px: float
+    centre_offsets_px: Floats
+
+
+def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
+    """Return the normal for which the disc's images in two views fit the ellipses best."""
+    found = [list(_possible_normals(view, radius_m)) for view in views]
+    normals = [normal for normals in found for normal in normals]
+    for one in found[0]:
+        for other in found[1]:
+            mean = one + other
+            normals.append(mean / max(math.hypot(*mean), 1e-9))
+    mismatches = [
+        max(_mismatch_px(view, view.camera_from_left @ normal, radius_m) for view in views)
+        for normal in normals
+    ]
+    best = int(np.argmin(mismatches))
+    offsets = [_centre_offset_px(view, normals[best], radius_m) for view in views]
+    return FlatPose(normals[best], mismatches[best], np.array(offsets))
+
+
+def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
+    """Yield both normals (3,) for which the disc has this image, in the left camera's axes."""
+    sideways, triangle = np.linalg.qr(view.jacobian.T)
+    back = np.linalg.solve(triangle.T, view.axes) / radius_m
+    values, vectors = np.linalg.eigh(back @ back.T)
+    sine = math.sqrt(min(max(1.0 - float(values[0]), 0.0), 1.0))
+    across = sideways @ vectors[:, 0]
+    towards = np.cross(sideways[:, 0], sideways[:, 1])
+    towards = -math.copysign(1.0, float(towards @ view.point)) * towards
+    for sign in (1.0, -1.0):
+        normal = sign * sine * across + math.sqrt(1.0 - sine * sine) * towards
+        yield view.camera_from_left.T @ normal
+
+
+def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
+    """Return the largest difference of a semi-axis; the normal is in the view's axes."""
+    along = view.jacobian @ normal
+    square = radius_m**2 * (view.jacobian @ view.jacobian.T - np.outer(along, along))
+    # Square root of a symmetric 2 x 2 matrix.
+    root = math.sqrt(max(float(np.linalg.det(square)), 0.0))
+    axes = (square + root * np.eye(2)) / math.sqrt(float(np.trace(square)) + 2.0 * root)
+    return float(np.linalg.norm(view.axes - axes, 2))
+
+
+def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats:
+    """Return the centre of a disc's image minus the image of its centre (2,), from the dual conic.
+
+    The lens's distortion is linearised.
+    """
+    in_camera, point = view.camera_from_left @ normal, view.point
+    conic = radius_m**2 * (np.eye(3) - np.outer(in_camera, in_camera)) - np.outer(point, point)
+    slopes = conic[:2, 2] / conic[2, 2] - point[:2] / point[2]
+    return np.asarray(view.jacobian[:, :2] @ slopes * point[2])
