@@ -341,10 +341,6 @@ _ROWS = (
 TOLERANCES: dict[str, Tolerance] = {row.key: row for row in _ROWS}
 
 NOT_SIMULATED: dict[str, str] = {
-    "sheet.density_kg_per_m3": "the membrane has no weight",
-    "sheet.friction_coefficient": "touched nodes of the membrane stick",
-    "sheet.hysteresis_ratio": "the membrane is elastic",
-    "sheet.creep_ratio_per_decade": "the membrane is elastic",
     "finger.hand_mass_kg": "the finger follows its path whatever it feels",
     "finger.hand_damping_ns_per_m": "the finger follows its path whatever it feels",
     "finger.hand_stiffness_n_per_m": "the finger follows its path whatever it feels",
