@@ -12,7 +12,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.force_history import ForceHistory
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, Rubber, solve
 
 Floats = NDArray[np.float64]
 
@@ -45,12 +45,14 @@ class SheetPull:
     """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
 
     A finger's push on the sheet is not part of the pull: it is small beside the tension.
+    weight_n: (3,) of the sheet, of which each flange carries half.
     history: of the pull; None for elastic rubber.
     """
 
     distances_m: Floats
     forces_n: Floats
     compliances_m_per_n: tuple[float, float]
+    weight_n: Floats = field(default_factory=lambda: np.zeros(3))
     history: ForceHistory | None = None
     _rubber_ratio: float = field(default=1.0, init=False)
 
@@ -69,7 +71,14 @@ class SheetPull:
         for distance_m in distances_m[1:]:
             edges = [transform(np.eye(3), [0.5 * side * distance_m, 0.0, 0.0]) for side in (-1, 1)]
             forces_n.append(float(solve(rubber, *edges, cells=CELLS).left_force_n[0]))
-        return cls(distances_m, np.array(forces_n), compliances, ForceHistory.of(apparatus))
+        volume_m3 = rubber.width_m * rubber.height_m * rubber.thickness_m
+        return cls(
+            distances_m,
+            np.array(forces_n),
+            compliances,
+            rubber.density_kg_per_m3 * volume_m3 * GRAVITY_M_PER_S2,
+            ForceHistory.of(apparatus),
+        )
 
     def force_n(self, distance_m: float) -> float:
         """Return the pull between the arms at a distance of the rigid arms' edges.
@@ -97,7 +106,7 @@ class SheetPull:
         *,
         time_s: float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Return both flange poses (4, 4) under the sheet's pull; they move, but do not turn.
+        """Return both flange poses (4, 4) under pull and weight; they move, but do not turn.
 
         time_s: of the poses; it must not decrease.
         """
@@ -109,6 +118,6 @@ class SheetPull:
         self._remember(distance_m, time_s)
         pull = self.force_n(distance_m) * (right_m - left_m) / distance_m
         left, right = world_from_left_flange.copy(), world_from_right_flange.copy()
-        left[:3, 3] += self.compliances_m_per_n[0] * pull
-        right[:3, 3] -= self.compliances_m_per_n[1] * pull
+        left[:3, 3] += self.compliances_m_per_n[0] * (0.5 * self.weight_n + pull)
+        right[:3, 3] += self.compliances_m_per_n[1] * (0.5 * self.weight_n - pull)
         return left, right
