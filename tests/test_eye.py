@@ -299,7 +299,7 @@ async def test_eye_node_renders_each_label_once(scene: Scene) -> None:
     await bench.show(*(frame(label) for label in ("a", "a", "b", "", "a")))
     await bench.show(frame("a", correction="one_plane"))
     await bench.show(frame("c", pixels=()), frame("d", stereo="anaglyph"))
-    assert "mono frames only" in bench.node.note
+    assert "frames of one view only" in bench.node.note
     await bench.finish()
     assert [(eye.label, eye.correction) for eye, _ in bench.sent] == [
         ("a", "none"),
