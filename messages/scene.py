@@ -242,6 +242,11 @@ class SheetSpec(Part):
     density_kg_per_m3: Annotated[float, Field(ge=0, le=20000)] = Field(
         default=0.0, description="density of the rubber; 0 neglects the sheet's weight"
     )
+    hysteresis_ratio: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.0,
+        description="share of the loading's energy that the rubber loses in a cycle; corrects the "
+        "rendered force, a sheet calibration replaces it",
+    )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
     max_edge_force_n: Positive

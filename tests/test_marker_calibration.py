@@ -127,7 +127,7 @@ def test_contradicting_touches_are_refused() -> None:
         (f"{HEADER}\n{ROW}\nnan,20,30,10,20,22,0,0", r':3: marker_x_mm: .* found "nan"'),
         (f"{HEADER}\n{ROW}\n10,20,30,10,20,22,0,300", r":3: tilt_y_deg: expected at most 120"),
         (f"{HEADER}\n10,20", r":2: expected 8 values, found 2"),
-        (f"{HEADER},normal_x,normal_y,normal_z\n{ROW},0,0,2", r"normal_x: .* the length 2"),
+        (f"{HEADER},normal_x,normal_y,normal_z\n{ROW},0,0,0.5", r"normal_x: .* length 0\.5"),
     ],
 )
 def test_a_bad_file_is_refused_with_line_and_column(tmp_path: Path, text: str, words: str) -> None:
