@@ -393,7 +393,7 @@ def test_the_presented_force_is_that_of_the_true_sheet() -> None:
     plain = ForceReference(recorded).evaluate(0, press)
     given = apparatus(sheet={"modulus_ratio": 1.2})
     stiff = type(recorded)(
-        scene=SCENE,
+        scene=recorded.scene,
         finger=recorded.finger,
         windows_ns={},
         edges=recorded.edges,

@@ -30,7 +30,11 @@ from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 
 Floats = NDArray[np.float64]
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+HEAVY = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE = HEAVY.model_copy(
+    update={"sheet": HEAVY.sheet.model_copy(update={"density_kg_per_m3": 0.0})}
+)
+"""Without the sheet's weight, which pushes an inclined sheet away from the finger."""
 TIMES = np.array([0, 1_000_000_000], dtype=np.int64)
 STRETCH = 1.06
 CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
