@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import solve_sheet
+from flexsheet.launch.experiments.image import summarize_eyes
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display
@@ -206,6 +207,33 @@ def print_places(bench: CorrectionBench) -> None:
         row(f"{place[0]}, {place[1]}", *cells)
 
 
+def print_eyes(bench: CorrectionBench) -> None:
+    """Print the error of each eye's image and of the disparity, against the true sheet."""
+    scene, half = bench.scene, np.array([0.5 * bench.scene.eyes.interocular_m, 0.0, 0.0])
+    benches = [
+        CorrectionBench(
+            scene.model_copy(
+                update={
+                    "eyes": scene.eyes.model_copy(
+                        update={"centre_world_m": scene.eyes.centre_world_m + side * half}
+                    )
+                }
+            ),
+            stretch=bench.stretch,
+        )
+        for side in (-1.0, 1.0)
+    ]
+    cases = [(f"tilted {tilt:+d}°", bench.pushed(0.0, tilt_deg=tilt)) for tilt in (-50, 50)]
+    cases += [(f"pushed {depth} mm", bench.pushed(1e-3 * depth)) for depth in (10, 30, 50)]
+    heading("sheet, mm", "method", "left", "right", "disparity", "vertical", "disparity, 95 %")
+    for name, case in cases:
+        situation = bench.situation(*case)
+        for correction in ("none", "two_pass"):
+            maps = [one.errors(correction, *situation) for one in benches]
+            figures = summarize_eyes(maps[0], maps[1]).values()
+            row(name, correction, *("-" if one is None else f"{one:.3f}" for one in figures))
+
+
 def print_stretches(bench: CorrectionBench) -> None:
     heading("stretch", "pushed 30 mm", "note")
     for stretch in (0.98, 1.0, 1.01, 1.03, 1.05, 1.08, 1.09, 1.12):
@@ -262,6 +290,7 @@ TABLES: dict[str, Callable[[CorrectionBench], None]] = {
     "depths": print_depths,
     "places": print_places,
     "stretches": print_stretches,
+    "eyes": print_eyes,
 }
 
 

@@ -129,7 +129,9 @@ class SheetTruth(Part):
     clamp_slip_m: tuple[Share, Share] = Field(
         default=(0.0, 0.0), description="rubber that the left and right clamp let through"
     )
-    density_kg_per_m3: NonNegative = Field(default=0.0, description="0: without weight")
+    density_kg_per_m3: NonNegative | None = Field(
+        default=None, description="null: the scene's; 0: without weight"
+    )
     friction_coefficient: NonNegative | None = Field(
         default=None, description="between finger and sheet; null: touched rubber sticks"
     )

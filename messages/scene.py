@@ -7,6 +7,7 @@ at the centre of the imaginary screen, x to the right, y up, z towards the user.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
@@ -241,6 +242,11 @@ class SheetSpec(Part):
     density_kg_per_m3: Annotated[float, Field(ge=0, le=20000)] = Field(
         default=0.0, description="density of the rubber; 0 neglects the sheet's weight"
     )
+    hysteresis_ratio: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.0,
+        description="share of the loading's energy that the rubber loses in a cycle; corrects the "
+        "rendered force, a sheet calibration replaces it",
+    )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
     max_edge_force_n: Positive
@@ -324,15 +330,40 @@ class Eyes(Part):
     interocular_m: NonNegative
 
 
+FingerLength = Annotated[float, Field(ge=-0.1, le=0.1)]
+FingerLengths = tuple[FingerLength, FingerLength, FingerLength]
+
+
 class Finger(Part):
-    """Limits of the user's finger."""
+    """The user's finger, its marker and its limits.
+
+    The finger's frame has its origin at the pad's contact point, x along `direction_world`, z out
+    of the nail, and y level. Its direction in the world is constant.
+    """
 
     radius_m: Positive
+    direction_world: tuple[Finite, Finite, Finite] = Field(
+        default=(0.0, -0.5, 0.866), description="from the tip along the finger to the hand"
+    )
+    marker_from_pad_m: FingerLengths = Field(
+        default=(0.0, 0.0, 0.0),
+        description="centre of the marker in the finger's frame; a marker calibration replaces it",
+    )
     max_speed_m_per_s: Positive
     volume_min_m: Vector3 = Field(
         description="lower corner of the box of possible fingertips, world"
     )
     volume_max_m: Vector3
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> Self:
+        x, y, z = self.direction_world
+        if math.hypot(y, z) < 0.1 * math.hypot(x, y, z) or not math.hypot(x, y, z):
+            raise ValueError(
+                f"direction_world {self.direction_world} is along the world's x axis, or zero; "
+                "give the direction from the tip to the hand"
+            )
+        return self
 
 
 class WorkingRange(Part):

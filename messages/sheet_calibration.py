@@ -69,6 +69,10 @@ class SheetCalibration(Part):
         description="cubic term of the slack sheet's force, over that of ideal rubber"
     )
     mooney_share: Fitted | None = Field(default=None, description="C2/(C1+C2); null: not fitted")
+    hysteresis_ratio: Fitted | None = Field(
+        default=None,
+        description="share of the loading's energy that a cycle loses; null: not measured",
+    )
     rows: Annotated[int, Field(ge=1)]
     left_out: tuple[LeftOutRow, ...]
     residual_rms_ratio: NonNegative

@@ -524,11 +524,15 @@ class TwinArms(Message):
     world_from_flange_right: Transform
 
 
+Viewpoint = Literal["centre", "left", "right"]
+
+
 class TwinEye(Message):
-    """Image of a measuring camera at V, and the expected image."""
+    """Image of a measuring camera at V or at an eye, and the expected image."""
 
     label: str
     correction: Correction
+    viewpoint: Viewpoint = Field(default="centre", description="midway between the eyes, or one")
     metres_per_px: Positive = Field(description="size of a pixel on the imaginary screen")
     seen: ColorImage
     expected: ColorImage

@@ -20,6 +20,7 @@ class ParameterMark(StrEnum):
     DEVICE_FILE = "device_file"
     CAMERA_CALIBRATION = "camera_calibration"
     SHEET_CALIBRATION = "sheet_calibration"
+    MARKER_CALIBRATION = "marker_calibration"
 
 
 ListenPort = Annotated[int, Field(ge=0, le=65535), ParameterMark.LISTEN_PORT]
@@ -39,6 +40,9 @@ CameraCalibrationFile = Annotated[Path, ParameterMark.CAMERA_CALIBRATION]
 
 SheetCalibrationFile = Annotated[Path, ParameterMark.SHEET_CALIBRATION]
 """Sheet calibration file; the launcher checks it against the scene."""
+
+MarkerCalibrationFile = Annotated[Path, ParameterMark.MARKER_CALIBRATION]
+"""Marker calibration file; the launcher checks it against the scene."""
 
 ParameterKey = tuple[str | int, ...]
 """Path of a value in the parameters: ("source", "left")."""

@@ -87,10 +87,6 @@ def test_each_field_has_one_row_of_the_table(scene: Scene) -> None:
 
 def test_fields_that_are_not_simulated_are_listed(scene: Scene) -> None:
     assert set(NOT_SIMULATED) == {
-        "sheet.density_kg_per_m3",
-        "sheet.friction_coefficient",
-        "sheet.hysteresis_ratio",
-        "sheet.creep_ratio_per_decade",
         "finger.hand_mass_kg",
         "finger.hand_damping_ns_per_m",
         "finger.hand_stiffness_n_per_m",
@@ -376,7 +372,8 @@ def test_the_command_samples_and_shows(tmp_path: Path) -> None:
     shown = run("show", str(file), "--json")
     rows = {row["parameter"]: row for row in json.loads(shown.stdout)["differences"]}
     assert rows["camera.rate_hz"]["unit"] == "Hz"
-    assert rows["sheet.density_kg_per_m3"]["simulated"] is False
+    assert rows["finger.hand_mass_kg"]["simulated"] is False
+    assert rows["sheet.hysteresis_ratio"]["simulated"] is True
     assert rows["arms.left.servo_lag_s"]["simulated"] is True
     assert "sheet.modulus_ratio" in run("show", "seed:4").stdout
     refused = run("sample", "--seed", "4", "--profile", "old", "-o", str(file))

@@ -9,6 +9,7 @@ import pytest
 from flexsheet.messages.arms_calibration import load_arms_calibration
 from flexsheet.messages.calibration import load_calibration
 from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.marker_calibration import load_marker_calibration
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,7 +30,15 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-@pytest.mark.parametrize("load", [load_calibration, load_arms_calibration, load_sheet_calibration])
+@pytest.mark.parametrize(
+    "load",
+    [
+        load_calibration,
+        load_arms_calibration,
+        load_sheet_calibration,
+        load_marker_calibration,
+    ],
+)
 def test_it_is_rejected(tmp_path: Path, load: object, name: str) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_bytes(HOSTILE[name])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,7 @@ class MeasuredPush:
     """One measured push.
 
     position_m: on the stretched sheet, from its centre. edge_force_n: None if not measured.
+    unloading: whether the finger was deeper before; None if it is not known.
     """
 
     edge_distance_m: float
@@ -49,6 +50,7 @@ class MeasuredPush:
     finger_radius_m: float
     position_m: tuple[float, float] = (0.0, 0.0)
     edge_force_n: float | None = None
+    unloading: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,61 @@ class SheetModelFit:
     residual_ratio: Floats
     rms_ratio: float
     worst_ratio: float
+    nominal_width_m: float
+
+
+MIN_HYSTERESIS_ROWS = 3
+"""Minimum number of rows of loading, and of unloading, for the hysteresis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hysteresis:
+    """Share of the loading's energy that a cycle loses, with its standard deviation."""
+
+    ratio: float
+    standard_deviation: float
+
+    @property
+    def amplitude(self) -> float:
+        """Return h: loading needs 1 + h of the elastic force, unloading gives 1 - h."""
+        return self.ratio / (2.0 - self.ratio)
+
+
+def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
+    """Estimate the hysteresis from the residuals of loading and unloading.
+
+    pushes: as measured. Returns None for fewer than three used rows of either. Raises
+    SheetModelFitError if unloading needs more force than loading.
+    """
+    elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
+    ratios = np.array([push.force_n for push in pushes]) / np.maximum(elastic_n, 1e-6)
+    counted = fit.used & (elastic_n > 3.0 * FORCE_NOISE_N)
+    falling = np.array([push.unloading is True for push in pushes])
+    known = np.array([push.unloading is not None for push in pushes])
+    parts = [ratios[counted & known & side] for side in (~falling, falling)]
+    if min(len(part) for part in parts) < MIN_HYSTERESIS_ROWS:
+        return None
+    (loading, falls), errors = (
+        [float(np.mean(part)) for part in parts],
+        [float(np.std(part, ddof=1) / np.sqrt(len(part))) for part in parts],
+    )
+    share = falls / loading
+    deviation = share * float(np.hypot(errors[0] / loading, errors[1] / falls))
+    if share > 1.0 + 3.0 * deviation:
+        raise SheetModelFitError(
+            f"unloading: its force is {share:.2f} of that of loading; check the column's values"
+        )
+    # (1 - h) / (1 + h) is the share, and 2 h / (1 + h) the energy.
+    return Hysteresis(max(1.0 - share, 0.0), deviation)
+
+
+def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
+    """Return the pushes with the elastic forces, for those with a known direction."""
+    signs = {None: 0.0, False: 1.0, True: -1.0}
+    return [
+        replace(push, force_n=push.force_n / (1.0 + signs[push.unloading] * hysteresis.amplitude))
+        for push in pushes
+    ]
 
 
 NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_share")
@@ -161,6 +218,7 @@ def fit_sheet_model(
         residual_ratio=ratio,
         rms_ratio=float(np.sqrt(np.mean(ratio[counted] ** 2))),
         worst_ratio=float(np.abs(ratio[counted]).max()),
+        nominal_width_m=nominal.width_m,
     )
 
 

@@ -16,7 +16,7 @@ from flexsheet.messages.scene import Scene, SheetSpec
 
 REQUIRED = ("depth_mm", "force_n")
 STRETCH = ("edge_distance_mm", "stretch_ratio")
-OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm")
+OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
@@ -33,8 +33,9 @@ def read_rows(
 
     The first line contains the columns: `depth_mm`, `force_n`, `edge_distance_mm` or
     `stretch_ratio` (over the scene's width). Optional: `x_mm`, `y_mm` (from the sheet's centre),
-    `edge_force_n`, `finger_radius_mm`. Empty lines and lines that start with # are skipped. Raises
-    BadInputError with file, line and column.
+    `edge_force_n`, `finger_radius_mm`, `unloading` (1 if the finger was deeper before, else 0).
+    Empty lines and lines that start with # are skipped. Raises BadInputError with file, line and
+    column.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -137,6 +138,14 @@ def _parse_row(
                 Problem(where, (name,), f'expected a number, found "{text}"', "for example 12.5")
             )
             continue
+        if name == "unloading":
+            if value in (0.0, 1.0):
+                values[name] = value
+            else:
+                problems.append(
+                    Problem(where, (name,), f"expected 0 or 1, found {text}", "1: unloading")
+                )
+            continue
         signed = name in ("x_mm", "y_mm", "force_n", "edge_force_n")
         if not math.isfinite(value) or (value <= 0.0 and not signed):
             problems.append(
@@ -174,6 +183,7 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
         finger_radius_m=1e-3 * values.get("finger_radius_mm", 1e3 * finger_radius_m),
         position_m=(1e-3 * values.get("x_mm", 0.0), 1e-3 * values.get("y_mm", 0.0)),
         edge_force_n=values.get("edge_force_n"),
+        unloading=bool(values["unloading"]) if "unloading" in values else None,
     )
 
 

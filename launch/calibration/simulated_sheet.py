@@ -11,7 +11,8 @@ from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import METRES_PER_PX, seen
-from flexsheet.nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, solve
+from flexsheet.nodes.twin.sheet_pull import true_rubber
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -39,7 +40,7 @@ def simulate_push(
     """
     half = 0.5 * sheet.width_m * stretch_ratio
     pushed = solve(
-        Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
+        true_rubber(sheet, None),
         transform(np.eye(3), [-half, 0.0, 0.0]),
         transform(np.eye(3), [half, 0.0, 0.0]),
         finger_tip=np.array([*point_m, -depth_m]),
@@ -77,9 +78,8 @@ def solve_sheet(
     finger_tip: Floats | None,
 ) -> DeformedSheet:
     """Solve the simulated sheet between two edges (4, 4), under a fingertip (3,) or none."""
-    sheet = scene.sheet
     return solve(
-        Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
+        true_rubber(scene.sheet, None),
         world_from_left_edge,
         world_from_right_edge,
         finger_tip=finger_tip,

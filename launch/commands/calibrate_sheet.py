@@ -136,7 +136,12 @@ def make_calibration(
     """
     from importlib.metadata import version
 
-    from flexsheet.launch.calibration.sheet_fit import fit_sheet_model, tabulate_pushes
+    from flexsheet.launch.calibration.sheet_fit import (
+        estimate_hysteresis,
+        fit_sheet_model,
+        remove_hysteresis,
+        tabulate_pushes,
+    )
     from flexsheet.messages.sheet_calibration import (
         Fitted,
         LeftOutRow,
@@ -146,6 +151,10 @@ def make_calibration(
     from flexsheet.nodes.planner.sheet_force import make_rubber
 
     fit = fit_sheet_model(pushes, make_rubber(scene.sheet), with_mooney=with_mooney)
+    hysteresis = estimate_hysteresis(fit, pushes)
+    if hysteresis is not None:
+        pushes = remove_hysteresis(pushes, hysteresis)
+        fit = fit_sheet_model(pushes, make_rubber(scene.sheet), with_mooney=with_mooney)
     numbers = {
         name: Fitted(value=value, standard_deviation=deviation)
         for name, value, deviation in zip(
@@ -175,6 +184,11 @@ def make_calibration(
         slack_width_m=numbers["slack_width_m"],
         cubic_ratio=numbers["cubic_ratio"],
         mooney_share=numbers.get("mooney_share"),
+        hysteresis_ratio=(
+            None
+            if hysteresis is None
+            else Fitted(value=hysteresis.ratio, standard_deviation=hysteresis.standard_deviation)
+        ),
         rows=len(pushes),
         left_out=tuple(
             LeftOutRow(line=line, residual_ratio=float(ratio))
@@ -207,12 +221,13 @@ def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> l
 
 
 def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
-    mooney = calibration.mooney_share
+    mooney, hysteresis = calibration.mooney_share, calibration.hysteresis_ratio
     fitted = {
         "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
         "slack_width_m": calibration.slack_width_m,
         "cubic_ratio": calibration.cubic_ratio,
         **({} if mooney is None else {"mooney_share": mooney}),
+        **({} if hysteresis is None else {"hysteresis_ratio": hysteresis}),
     }
     if as_json:
         print_json(
@@ -232,6 +247,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         "slack_width_m": ("slack width", 1e3, "mm"),
         "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
         "mooney_share": ("Mooney weight", 1.0, ""),
+        "hysteresis_ratio": ("energy lost in a cycle", 100.0, "%"),
     }
     print_fields(
         [

@@ -52,6 +52,14 @@ SettingsOption = Annotated[
         "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
     ),
 ]
+BothEyesOption = Annotated[
+    bool,
+    typer.Option(
+        "--both-eyes",
+        help="Also measure the errors of each eye's image and of the disparity; triples the "
+        "duration.",
+    ),
+]
 MapOption = Annotated[
     Path | None,
     typer.Option(
@@ -126,6 +134,7 @@ def stroke(
 def tilt(
     *,
     map_file: MapOption = None,
+    both_eyes: BothEyesOption = False,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
@@ -137,7 +146,14 @@ def tilt(
 
     bag = make_result_folder(output, "tilt") / "tilt.mcap"
     _measure_images(
-        TILT, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
+        TILT,
+        bag,
+        launch_file,
+        settings,
+        map_file=map_file,
+        both_eyes=both_eyes,
+        apparatus=apparatus,
+        as_json=as_json,
     )
 
 
@@ -165,6 +181,7 @@ def push(
         ),
     ] = 0.0,
     map_file: MapOption = None,
+    both_eyes: BothEyesOption = False,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
@@ -188,7 +205,14 @@ def push(
         make_push_series(at_mm, tilt_deg),
     )
     _measure_images(
-        series, bag, launch_file, settings, map_file=map_file, apparatus=apparatus, as_json=as_json
+        series,
+        bag,
+        launch_file,
+        settings,
+        map_file=map_file,
+        both_eyes=both_eyes,
+        apparatus=apparatus,
+        as_json=as_json,
     )
 
 
@@ -238,6 +262,7 @@ def _measure_images(
     settings: list[str] | None,
     *,
     map_file: Path | None,
+    both_eyes: bool,
     apparatus: str | None,
     as_json: bool,
 ) -> None:
@@ -248,11 +273,16 @@ def _measure_images(
     mapped = map_file is not None
     with progress_words() as progress:
         procedure = make_image_procedure(
-            series, series.values, image.CORRECTIONS, progress, with_maps=mapped
+            series,
+            series.values,
+            image.CORRECTIONS,
+            progress,
+            with_maps=mapped,
+            with_eyes=both_eyes,
         )
         _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         pictures = image.read_images(bag)
-        rows = image.make_rows(pictures, series, with_maps=mapped)
+        rows = image.make_rows(pictures, series, with_maps=mapped, with_eyes=both_eyes)
         if map_file is not None:
             draw_error_maps(pictures, series, map_file)
     _print_rows(rows, bag, map_file, as_json=as_json)

@@ -33,9 +33,10 @@ from flexsheet.nodes.planner.compliance import (
     WEBER_RATIO,
     WEBER_RATIO_BARE,
 )
-from flexsheet.nodes.twin.membrane import solve
+from flexsheet.nodes.twin.force_history import ForceHistory, apply_history
+from flexsheet.nodes.twin.membrane import CELLS, solve
 from flexsheet.nodes.twin.paths import map_to_surface
-from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
@@ -55,6 +56,12 @@ HOLD_S, EVALUATED_S = 1.0, 0.3
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
+
+HISTORY_STEP_S = 0.01
+"""Interval at which the history of a push is followed; it moves by 0.5 mm in it."""
+HISTORY_DEPTHS = 9
+HISTORY_CELLS = 16
+"""Number of depths, and elements per side, of the force curve by which a history is followed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,36 +235,100 @@ class ForceReference:
             _make_transform(scene.arms.right.flange_from_edge),
         )
         self._rubber = true_rubber(scene.sheet, recorded.apparatus)
+        self._friction = true_friction(recorded.apparatus)
+        self._ratios: dict[str, tuple[Times, Floats]] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
         """Return the forces at a time; the depth is measured from the pressed point."""
-        recorded, times = self._recorded, np.array([at_ns])
-        tip = recorded.finger.interpolate(times)[0]
+        tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
+        pressed_n = self._solve_n(left, right, tip, press)
+        middle = 0.5 * (left[:3, 3] + right[:3, 3])
+        return ForceSample(
+            depth_m=depth_m,
+            wanted_n=self._interpolate_curve_n(at_ns, depth_m),
+            presented_n=pressed_n * self._history_ratio(at_ns, press),
+            normal_offset_m=float((press.surface - middle) @ press.normal),
+        )
+
+    def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
+        """Return the fingertip (3,) and both edges (4, 4) at a time."""
+        times = np.array([at_ns])
         left, right = (
             edges.interpolate(times)[0].reshape(4, 4) @ clamp
-            for edges, clamp in zip(recorded.edges, self._clamps, strict=True)
+            for edges, clamp in zip(self._recorded.edges, self._clamps, strict=True)
         )
+        return self._recorded.finger.interpolate(times)[0], left, right
+
+    def _solve_n(
+        self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
+    ) -> float:
+        """Return the force (N) of the elastic sheet along the press's normal."""
         pressed = solve(
             self._rubber,
             left,
             right,
             finger_tip=tip,
             finger_radius_m=self._radius_m,
+            friction_coefficient=self._friction,
+            cells=cells,
         )
+        return float(pressed.finger_force_n @ press.normal)
+
+    def _history_ratio(self, at_ns: int, press: Press) -> float:
+        """Return the force of the rubber over that of the elastic sheet at a time of a press."""
+        if ForceHistory.of(self._recorded.apparatus) is None:
+            return 1.0
+        label = press.path.label
+        if label not in self._ratios:
+            self._ratios[label] = self._follow_history(press)
+        times, ratios = self._ratios[label]
+        return float(np.interp(at_ns, times, ratios))
+
+    def _follow_history(self, press: Press) -> tuple[Times, Floats]:
+        """Return times (ns) of a press, and the ratio of both forces at them.
+
+        The elastic force over the indentation is that at the press's deepest point. So the
+        membrane is solved at a few depths only; the ratio depends on the curve's shape alone.
+        """
+        begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
+        times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
+        poses = [self._read_poses(int(at)) for at in times]
+        indented_m = np.array([_indentation_m(*pose) for pose in poses])
+        tip, left, right = poses[int(np.argmax(indented_m))]
         middle = 0.5 * (left[:3, 3] + right[:3, 3])
-        return ForceSample(
-            depth_m=depth_m,
-            wanted_n=self._interpolate_curve_n(at_ns, depth_m),
-            presented_n=float(pressed.finger_force_n @ press.normal),
-            normal_offset_m=float((press.surface - middle) @ press.normal),
-        )
+        depths_m = float(indented_m.max()) * np.linspace(0.0, 1.0, HISTORY_DEPTHS)
+        if depths_m[-1] <= 0.0:
+            return times, np.ones(len(times))
+        normal = _sheet_normal(left, right)
+        at_surface = tip - ((tip - middle) @ normal) * normal
+        curve_n = [0.0] + [
+            self._solve_n(left, right, at_surface - depth * normal, press, HISTORY_CELLS)
+            for depth in depths_m[1:]
+        ]
+        elastic_n = np.interp(indented_m, depths_m, curve_n)
+        history = ForceHistory.of(self._recorded.apparatus)
+        assert history is not None
+        felt_n = apply_history(history, times * 1e-9, elastic_n)
+        return times, np.where(elastic_n > 0.0, felt_n / np.maximum(elastic_n, 1e-9), 1.0)
 
     def _interpolate_curve_n(self, at_ns: int, depth_m: float) -> float:
         number = max(0, bisect_right(self._recorded.curve_times_ns, at_ns) - 1)
         rows = self._recorded.curves[number]
         curve = PchipInterpolator(rows[:, 0], rows[:, 1])
         return float(curve(np.clip(depth_m, 0.0, rows[-1, 0])))
+
+
+def _sheet_normal(left: Floats, right: Floats) -> Floats:
+    """Return the unit normal (3,) of the unpushed sheet, towards the user."""
+    normal = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
+def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
+    """Return how far the fingertip is behind the unpushed sheet, m; at least zero."""
+    middle = 0.5 * (left[:3, 3] + right[:3, 3])
+    return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
 
 
 def _make_transform(pose: Pose) -> Floats:

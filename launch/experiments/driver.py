@@ -42,6 +42,8 @@ SETTLED_SPEED_M_PER_S = 0.05
 SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
+EYE_PIXELS_EVERY = 9
+"""Odd, so that the frames of both eyes carry pixels in turn."""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_LOAD_PER_CORE = 3.0
@@ -218,6 +220,30 @@ class Driver:
         eye = self._newest["twin/eye"]
         assert isinstance(eye, TwinEye)
         return eye
+
+    async def capture_both_eyes(self, label: str, correction: Correction, pattern: Pattern) -> None:
+        """Show the object to both eyes in turn, and wait for the image of each."""
+        self.show(
+            Display(
+                correction=correction,
+                stereo="frame_sequential",
+                shading="flat",
+                pattern=pattern,
+                marks=False,
+                pixels_every=EYE_PIXELS_EVERY,
+                label=label,
+            )
+        )
+        missing = {"left", "right"}
+
+        def received() -> bool:
+            eye = self._newest.get("twin/eye")
+            if isinstance(eye, TwinEye) and eye.label == label:
+                missing.discard(eye.viewpoint)
+            return not missing
+
+        await self.wait_for(received, f'the images of "{label}" for both eyes', IMAGE_WAIT_S)
+        self.show(Display(correction=correction, stereo="side_by_side"))
 
 
 def _describe_load() -> str:

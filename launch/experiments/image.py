@@ -19,7 +19,7 @@ from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.stroke import object_pose
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, require_cylinder
-from flexsheet.messages.types import Correction, FingerPath, Pattern, TwinEye
+from flexsheet.messages.types import Correction, FingerPath, Pattern, TwinEye, Viewpoint
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.twin.error_map import ErrorMap, error_map
 from flexsheet.nodes.twin.eye import push_sizes, tilt_sizes
@@ -126,6 +126,16 @@ def make_pattern_label(label: str, pattern: Pattern) -> str:
     return f"{label}, {pattern}"
 
 
+def make_eyes_label(label: str, pattern: Pattern) -> str:
+    """Return the label of a case's images of a pattern that are drawn for each eye."""
+    return f"{make_pattern_label(label, pattern)}, both eyes"
+
+
+def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
+    """Return the key of an image among those of `read_images`."""
+    return label if viewpoint == "centre" else f"{label}, {viewpoint}"
+
+
 @dataclass(frozen=True, slots=True)
 class EyeImage:
     """Image of the simulated eye from a bag."""
@@ -138,11 +148,11 @@ class EyeImage:
 
 
 def read_images(bag: Path) -> dict[str, EyeImage]:
-    """Read the newest image of each label from a bag."""
+    """Read the newest image of each label and viewpoint from a bag."""
     images = {}
     for _, message, _, _ in BagReader(bag, topics=["twin/eye"]):
         if isinstance(message, TwinEye):
-            images[message.label] = EyeImage(
+            images[make_eye_key(message.label, message.viewpoint)] = EyeImage(
                 message.label,
                 message.correction,
                 message.metres_per_px,
@@ -172,12 +182,52 @@ def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
+def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, ErrorMap]:
+    """Compute the errors of the left and of the right eye's image of a case."""
+
+    def errors_of(viewpoint: Viewpoint) -> ErrorMap:
+        x, y = (
+            find_image(images, make_eye_key(make_eyes_label(label, pattern), viewpoint))
+            for pattern in RAMPS
+        )
+        return error_map(x.seen, y.seen, x.metres_per_px)
+
+    return errors_of("left"), errors_of("right")
+
+
+def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
+    """Return the mean error of each eye's image, and of the disparity, mm; None without points.
+
+    The disparity error is the right eye's error minus the left eye's, across and up, where both
+    eyes see the object at the same position on the imaginary screen.
+    """
+    disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
+    across_mm, up_mm = (
+        part[np.isfinite(part)] for part in (disparity_mm[..., 0], disparity_mm[..., 1])
+    )
+    means = {
+        "left_mean_mm": 1e3 * left.sizes_m,
+        "right_mean_mm": 1e3 * right.sizes_m,
+        "disparity_mean_mm": across_mm,
+        "vertical_disparity_mean_mm": up_mm,
+    }
+    summary = {name: float(part.mean()) if len(part) else None for name, part in means.items()}
+    return summary | {
+        "disparity_p95_mm": float(np.quantile(across_mm, 0.95)) if len(across_mm) else None
+    }
+
+
 def make_rows(
-    images: dict[str, EyeImage], series: Series, *, with_maps: bool = False
+    images: dict[str, EyeImage],
+    series: Series,
+    *,
+    with_maps: bool = False,
+    with_eyes: bool = False,
 ) -> list[dict[str, Any]]:
     """Return the results of an experiment, one row per value and correction.
 
-    with_maps: add mean, 95 % quantile and maximum of the errors at all visible points.
+    with_maps: add mean, 95 % quantile and maximum of the errors at all visible points. with_eyes:
+    add the errors of both eyes and of the disparity.
     """
     result = []
     for value in series.values:
@@ -192,6 +242,8 @@ def make_rows(
             row["mean_mm"] = float(np.mean(errors))
             if with_maps:
                 row |= summarize_map(make_error_map(images, series.label(value, correction)))
+            if with_eyes:
+                row |= summarize_eyes(*make_eye_maps(images, series.label(value, correction)))
             result.append(row)
     return result
 

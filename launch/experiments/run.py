@@ -148,10 +148,11 @@ def make_image_procedure(
     *,
     shading: Shading = "flat",
     with_maps: bool = False,
+    with_eyes: bool = False,
 ) -> Procedure:
     """Make a procedure that images each case with each correction.
 
-    with_maps: also image the coordinate ramps, for dense error maps.
+    with_maps: also image the coordinate ramps, for dense error maps. with_eyes: also for each eye.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -165,6 +166,9 @@ def make_image_procedure(
                 for pattern in image.RAMPS if with_maps else ():
                     ramp_label = image.make_pattern_label(label, pattern)
                     await driver.capture_image(ramp_label, correction, pattern=pattern)
+                for pattern in image.RAMPS if with_eyes else ():
+                    eyes_label = image.make_eyes_label(label, pattern)
+                    await driver.capture_both_eyes(eyes_label, correction, pattern)
 
     return procedure
 

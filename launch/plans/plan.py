@@ -43,6 +43,7 @@ from flexsheet.launch.plans.plan_model import (
     Writer,
 )
 from flexsheet.launch.plans.resolve_nodes import (
+    CALIBRATION_MARKS,
     NodeEntry,
     check_calibrations,
     check_device_hosts,
@@ -194,7 +195,7 @@ def _make_node(
         device_files=_device_files(entry.parameters),
         calibrations={
             ".".join(map(str, key)): str(_value_at(parameters, key))
-            for mark in (ParameterMark.CAMERA_CALIBRATION, ParameterMark.SHEET_CALIBRATION)
+            for mark in CALIBRATION_MARKS
             for key in find_marked(entry.parameters, mark)
         },
         role=find_role(entry.type),

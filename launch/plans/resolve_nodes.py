@@ -14,6 +14,7 @@ from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, Launch
 from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
 from flexsheet.messages.calibration import load_calibration, refuse_other_camera
 from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+from flexsheet.messages.marker_calibration import load_marker_calibration, refuse_other_marker
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
@@ -211,6 +212,13 @@ def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Doc
                 )
 
 
+CALIBRATION_MARKS = (
+    ParameterMark.CAMERA_CALIBRATION,
+    ParameterMark.SHEET_CALIBRATION,
+    ParameterMark.MARKER_CALIBRATION,
+)
+
+
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
     """Read the calibration files that parameters name, and compare them with the scene."""
 
@@ -224,11 +232,13 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
         if scene is not None:
             refuse_other_sheet(measured, scene.sheet)
 
-    checks = {
-        ParameterMark.CAMERA_CALIBRATION: check_camera,
-        ParameterMark.SHEET_CALIBRATION: check_sheet,
-    }
-    for entry, (mark, check) in product(entries, checks.items()):
+    def check_marker(path: Path) -> None:
+        measured = load_marker_calibration(path)
+        if scene is not None:
+            refuse_other_marker(measured, scene)
+
+    checks = zip(CALIBRATION_MARKS, (check_camera, check_sheet, check_marker), strict=True)
+    for entry, (mark, check) in product(entries, checks):
         if entry.parameters is None:
             continue
         for marked, calibration in find_marked(entry.parameters, mark).items():

@@ -20,6 +20,7 @@ from flexsheet.nodes.planner.compliance import (
     fit_compliance,
     make_stretch_limits,
 )
+from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 Floats = NDArray[np.float64]
 
@@ -35,14 +36,25 @@ COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 class ComplianceController:
     """Controller of the sheet's stretch and normal offset for the object under the finger.
 
+    hysteresis_ratio: share of the loading's energy that the rubber loses in a cycle; None: the
+        scene's.
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
         small pushes by the stretch only, like the paper.
     """
 
-    def __init__(self, scene: Scene, model: SheetForceModel, mode: ComplianceMode) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        model: SheetForceModel,
+        mode: ComplianceMode,
+        *,
+        hysteresis_ratio: float | None = None,
+    ) -> None:
         self.stretch_ratio = scene.sheet.min_stretch_ratio
         self.note = ""
         self._scene, self._model, self._mode = scene, model, mode
+        ratio = scene.sheet.hysteresis_ratio if hysteresis_ratio is None else hysteresis_ratio
+        self._hysteresis = HysteresisCorrection(ratio) if ratio else None
         self._limits = make_stretch_limits(scene.sheet, model)
         self._compared_m = scene.working_range.push_depth_m * COMPARED_FRACTIONS
         self._fitted_n: Floats | None = None
@@ -103,15 +115,35 @@ class ComplianceController:
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
         """Return the sheet's offset behind the tangent plane (m), and its slope over the depth.
 
+        With hysteresis, each call adds a depth to the history of the finger.
+
         depth_m: of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
         """
+        force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:
             return 0.0, 0.0
-        return (
-            float(self._compliance.normal_offset_m(depth_m, position_m)),
-            self._compliance.offset_per_depth(depth_m, position_m),
-        )
+        offset_m = float(self._compliance.normal_offset_m(depth_m, position_m))
+        per_depth = self._compliance.offset_per_depth(depth_m, position_m)
+        if force_ratio == 1.0 or depth_m >= self._compliance.max_depth_m:
+            return offset_m, per_depth
+        indented_m = depth_m - offset_m
+        scale = force_ratio ** (-1.0 / self._force_exponent(indented_m, position_m))
+        return depth_m - scale * indented_m, 1.0 - scale * (1.0 - per_depth)
+
+    def _force_exponent(self, indentation_m: float, position_m: SheetPosition) -> float:
+        """Return the relative change of the sheet's force over that of its indentation."""
+        if indentation_m <= 0.0:
+            return 1.0
+        below, above = self._model.evaluate(
+            self.stretch_ratio,
+            np.array([0.95, 1.05]) * indentation_m,
+            position_m=position_m,
+            finger_radius_m=self._scene.finger.radius_m,
+        ).force_n
+        if below <= 0.0:
+            return 1.0
+        return max(float(np.log(above / below) / np.log(1.05 / 0.95)), 0.5)
 
 
 def _are_equal(forces_n: Floats, others_n: Floats) -> bool:

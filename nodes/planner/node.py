@@ -66,7 +66,13 @@ class Planner(Node):
             model, self._model_note = load_force_model(scene, method, self.parameters.cache_dir)
         else:
             model, self._model_note = make_force_model(scene.sheet, self._calibration), "calibrated"
-        self._compliance = ComplianceController(scene, model, self.parameters.compliance_mode)
+        measured = None if self._calibration is None else self._calibration.hysteresis_ratio
+        self._compliance = ComplianceController(
+            scene,
+            model,
+            self.parameters.compliance_mode,
+            hysteresis_ratio=None if measured is None else float(measured.value),
+        )
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._timestamps = MonotonicTimestampFilter()
 

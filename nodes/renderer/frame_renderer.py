@@ -20,6 +20,7 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
+from flexsheet.nodes.renderer.eye_predictor import EyePredictor
 from flexsheet.nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
 from flexsheet.nodes.renderer.output_window import OutputWindow
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
@@ -65,6 +66,7 @@ class FrameRenderer:
         self._output, self._ports, self._latency, self._clock = screen, ports, latency, clock
         self._max_age_s = max_age_s
         self._sheet_predictor = SheetPosePredictor(max_age_s=max_age_s)
+        self._eye_predictor = EyePredictor(max_age_s=max_age_s)
         self._extrapolator = SkinExtrapolator()
         self._number = 0
         self._drawn_of: tuple[object, ...] = ()
@@ -96,7 +98,7 @@ class FrameRenderer:
         predicted_to_ns = self._latency.predict_light_ns(begun_ns)
         horizon_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
         source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
-        tracked = ports.eye.message if ports.eye.age_s() <= self._max_age_s else None
+        tracked = self._eye_predictor.predict(ports.eye, horizon_s)
         eyes, across, eye_note = select_eyes(scene_renderer.scene.eyes, tracked)
         finger_tip = predict_fingertip(ports.fingertip, horizon_s, max_age_s=self._max_age_s)
         sheet = self._sheet_predictor.update(
@@ -162,6 +164,10 @@ class FrameRenderer:
         return frame.model_copy(
             update={"swapped_ns": swapped_ns, "light_ns": light_ns, "late_frames": self.late}
         )
+
+    def on_eye(self, eye: Eye, header: Header) -> None:
+        """Add a position of the eyes."""
+        self._eye_predictor.add(eye, header)
 
     def on_soft_body(self, body: SoftBody, header: Header) -> None:
         """Add a response of the soft-body solver."""

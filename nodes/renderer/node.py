@@ -104,6 +104,10 @@ class Renderer(Node):
             self._frame_renderer.on_soft_body(soft_body, header)
         self._draw_if_due()
 
+    def on_eye(self, eye: Eye, header: Header) -> None:
+        if self._frame_renderer is not None:
+            self._frame_renderer.on_eye(eye, header)
+
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if self.soft_body.age_s() > self.parameters.max_age_s:
             self._draw_if_due()

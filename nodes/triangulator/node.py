@@ -10,9 +10,15 @@ import numpy as np
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.marker_calibration import (
+    MarkerCalibration,
+    load_marker_calibration,
+    refuse_other_marker,
+)
 from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
+from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.triangulator.data_association import DataAssociation
@@ -38,7 +44,11 @@ TIMEOUT_PERIODS = 2.5
 
 
 class Triangulator(Node):
-    """Node that detects the fingertip in each stereo pair and tracks it."""
+    """Node that detects the fingertip in each stereo pair and tracks it.
+
+    The marker is tracked. The fingertip is the pad's contact point, a constant distance from it,
+    since the cameras do not see how the finger turns.
+    """
 
     parameters: TriangulatorParameters
     scene: Input[Scene]
@@ -46,18 +56,30 @@ class Triangulator(Node):
     fingertip: Output[Fingertip]
 
     calibration: StereoCalibration | None = None
+    marker_calibration: MarkerCalibration | None = None
     geometry: StereoGeometry | None = None
     epoch, late = 0, 0
 
     async def setup(self) -> None:
         if path := self.parameters.calibration:
             self.calibration = load_calibration(path)
+        if path := self.parameters.marker_calibration:
+            self.marker_calibration = load_marker_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         p = self.parameters
         self.geometry = None
+        marker_from_pad_m = scene.finger.marker_from_pad_m
+        if self.marker_calibration is not None:
+            refuse_other_marker(self.marker_calibration, scene)
+            marker_from_pad_m = self.marker_calibration.marker_from_pad_m
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
-        self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
+        turned = world_from_finger(scene.finger.direction_world)
+        self.pad_to_marker_m = turned @ np.array(marker_from_pad_m)
+        self.volume = (
+            scene.finger.volume_min_m + self.pad_to_marker_m,
+            scene.finger.volume_max_m + self.pad_to_marker_m,
+        )
         self.reasons: Counter[FingertipReason] = Counter()
         marker = resolve_method(p.marker, scene.methods.marker, "subpixel_fit")
         triangulation = resolve_method(p.triangulation, scene.methods.triangulation, "dlt")
@@ -147,15 +169,18 @@ class Triangulator(Node):
     ) -> Fingertip:
         tracker = self.tracker
         track = tracker.predict_at(at_ns, self.horizons_s)
+        pad = track.position - self.pad_to_marker_m
         return Fingertip(
             valid=reason == "ok",
             state=tracker.state(at_ns),
             reason=reason,
-            position_world_m=track.position,
+            position_world_m=pad,
             velocity_world_m_per_s=track.velocity,
             covariance=track.covariance,
-            predicted_path_world_m=track.path,
+            predicted_path_world_m=track.path - self.pad_to_marker_m,
             prediction_step_s=PREDICTION_STEP_S,
-            measured_world_m=track.position if measured is None else measured.point_world,
+            measured_world_m=pad
+            if measured is None
+            else measured.point_world - self.pad_to_marker_m,
             reprojection_px=0.0 if measured is None else measured.reprojection_px,
         )

@@ -9,7 +9,7 @@ from pydantic import Field
 from flexsheet.messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
 from flexsheet.messages.scene import Positive
 from flexsheet.nodes.node import NodeParameters
-from flexsheet.nodes.parameter_marks import CameraCalibrationFile
+from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibrationFile
 
 
 class TriangulatorParameters(NodeParameters):
@@ -18,6 +18,11 @@ class TriangulatorParameters(NodeParameters):
     calibration: CameraCalibrationFile | None = Field(
         default=None,
         description="file of `flexsheet calibrate stereo`; null takes the scene's optics",
+    )
+    marker_calibration: MarkerCalibrationFile | None = Field(
+        default=None,
+        description="file of `flexsheet calibrate marker`; null takes the scene's "
+        "finger.marker_from_pad_m",
     )
     marker: MarkerMethod | Literal["auto"] = Field(
         default="auto",

@@ -215,7 +215,13 @@ class TwinArmsNode(Node):
         left, right = (self._world_from_base[side] @ forward(joints[side]) for side in joints)
         if self._pull is not None:
             clamps = self._flange_from_edge
-            left, right = self._pull.displace(left, right, clamps["left"], clamps["right"])
+            left, right = self._pull.displace(
+                left,
+                right,
+                clamps["left"],
+                clamps["right"],
+                time_s=self.clock.now_ns() * 1e-9,
+            )
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],

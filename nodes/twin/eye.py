@@ -26,7 +26,7 @@ from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
-from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 
 Floats = NDArray[np.float64]
@@ -482,6 +482,7 @@ class EyeSituation:
     displacement: NDArray[np.float32] | None
     flat: bool
     metres_per_px: float
+    friction_coefficient: float | None = None
 
     @classmethod
     def from_messages(
@@ -513,6 +514,7 @@ class EyeSituation:
             displacement=None if moved is None else moved.displacement_world_m,
             flat=display is not None and display.shading == "flat",
             metres_per_px=metres_per_px,
+            friction_coefficient=true_friction(apparatus),
         )
 
 
@@ -523,6 +525,7 @@ def true_sheet(
     finger_tip: Floats | None,
     *,
     rubber: Rubber,
+    friction_coefficient: float | None = None,
 ) -> DeformedSheet:
     """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or
     None.
@@ -544,6 +547,7 @@ def true_sheet(
         edges[1],
         finger_tip=finger_tip,
         finger_radius_m=scene.finger.radius_m,
+        friction_coefficient=friction_coefficient,
     )
 
 
@@ -569,6 +573,7 @@ class EyeCamera:
             situation.world_from_flange_right,
             situation.finger_tip,
             rubber=situation.rubber,
+            friction_coefficient=situation.friction_coefficient,
         )
         scale = situation.metres_per_px
         return (

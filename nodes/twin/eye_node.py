@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +20,7 @@ from flexsheet.messages.types import (
     TwinArms,
     TwinEye,
     TwinFinger,
+    Viewpoint,
 )
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
@@ -48,14 +48,17 @@ class TwinEyeParameters(SimulatorParameters):
     min_interval_s: Positive = Field(
         default=5.0, description="minimum time before the same label is rendered again"
     )
-    viewpoint: Literal["centre", "left", "right"] = Field(
-        default="centre", description="where the measuring camera stands: an eye, or midway"
+    viewpoint: Viewpoint = Field(
+        default="centre",
+        description="where the measuring camera stands for mono frames: an eye, or midway",
     )
     seed: int = Field(default=2026, description="of the head's motion")
 
 
 class TwinEyeNode(Node):
-    """Render each labelled mono frame that carries pixels, once per label and correction.
+    """Render each labelled frame of one view that carries pixels, once per label and correction.
+
+    A mono frame is seen from the viewpoint of the parameters, a frame of one eye from that eye.
 
     An image takes about a second.  Further frames of a label that waits, or was just rendered, are
     therefore skipped; they do not count as lost.  The sheet is the true one at the time that the
@@ -96,13 +99,13 @@ class TwinEyeNode(Node):
             await self._task
 
     def on_frame(self, frame: Frame, header: Header) -> None:
-        key = (frame.label, frame.correction)
+        key = (frame.label, frame.correction, frame.eye)
         if not frame.pixels or not frame.label or self._queue.is_known(key, self.clock.now_ns()):
             return
         if self.scene.message is None or self.twin__arms.message is None:
             self.note = "waits for the scene and the simulated arms"
-        elif frame.stereo != "mono":
-            self.note = f'renders mono frames only; "{frame.label}" is {frame.stereo}'
+        elif frame.stereo != "mono" and frame.eye == "both":
+            self.note = f'renders frames of one view only; "{frame.label}" is {frame.stereo}'
         elif self._queue.is_full:
             if self._queue.reject(key):
                 self.report_error("on_frame", OverflowError(f'no room for "{frame.label}"'))
@@ -120,8 +123,9 @@ class TwinEyeNode(Node):
         self._before_light = None
         true_scene = self._true_scene(scene)
         situation = self._situation(true_scene, arms)
-        eye = self._true_eye(true_scene, light_ns * 1e-9)
-        self._queue.add((frame.label, frame.correction), (situation, eye, frame, frame_header))
+        eye = self._true_eye(true_scene, light_ns * 1e-9, self._viewpoint(frame))
+        key = (frame.label, frame.correction, frame.eye)
+        self._queue.add(key, (situation, eye, frame, frame_header))
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
@@ -152,7 +156,10 @@ class TwinEyeNode(Node):
             apparatus=self.parameters.apparatus,
         )
 
-    def _true_eye(self, true_scene: Scene, at_s: float) -> Floats:
+    def _viewpoint(self, frame: Frame) -> Viewpoint:
+        return self.parameters.viewpoint if frame.eye == "both" else frame.eye
+
+    def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
         """Return the true position (3,) of the measuring camera.
 
         The apparatus's offset counts from the tracked eyes, or else from the scene's.
@@ -167,10 +174,10 @@ class TwinEyeNode(Node):
                 centre = centre + np.array(given.apparatus.eyes.centre_offset_m)
         if self._sway is not None:
             centre = centre + self._sway.at(at_s)
-        if given.viewpoint == "centre":
+        if viewpoint == "centre":
             return centre
         aside_m = 0.5 * true_scene.eyes.interocular_m
-        return np.asarray(centre + (aside_m if given.viewpoint == "right" else -aside_m) * right)
+        return np.asarray(centre + (aside_m if viewpoint == "right" else -aside_m) * right)
 
     async def _picture_all(self) -> None:
         while self._queue:
@@ -186,6 +193,7 @@ class TwinEyeNode(Node):
         picture = TwinEye(
             label=frame.label,
             correction=frame.correction,
+            viewpoint=self._viewpoint(frame),
             metres_per_px=self.parameters.metres_per_px,
             seen=seen,
             expected=expected,

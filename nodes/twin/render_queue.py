@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-Key = tuple[str, str]
-"""Label and correction of a frame."""
+Key = tuple[str, ...]
+"""Label, correction and viewpoint of a frame."""
 
 J = TypeVar("J")
 
@@ -20,7 +20,7 @@ class RenderQueue(Generic[J]):
     def __init__(self, max_length: int, min_interval_s: float) -> None:
         self._max_length, self._min_interval_s = max_length, min_interval_s
         self._jobs: dict[Key, J] = {}
-        self._last: tuple[Key, int] | None = None
+        self._recent_ns: dict[Key, int] = {}
         self._rejected: set[Key] = set()
 
     def __len__(self) -> int:
@@ -32,12 +32,13 @@ class RenderQueue(Generic[J]):
         return len(self._jobs) >= self._max_length
 
     def is_known(self, key: Key, now_ns: int) -> bool:
-        """Return whether a job of the key waits, or was the last one and is still recent."""
+        """Return whether a job of the key waits, or was rendered a short time ago."""
         if key in self._jobs:
             return True
-        if self._last is None or self._last[0] != key:
-            return False
-        return now_ns - self._last[1] < self._min_interval_s * 1e9
+        return key in self._recent_ns and self._is_recent(self._recent_ns[key], now_ns)
+
+    def _is_recent(self, at_ns: int, now_ns: int) -> bool:
+        return now_ns - at_ns < self._min_interval_s * 1e9
 
     def reject(self, key: Key) -> bool:
         """Reject a key while the queue is full; True the first time, which is to be reported."""
@@ -57,7 +58,10 @@ class RenderQueue(Generic[J]):
         """Remove a rendered job."""
         self._jobs.pop(key, None)
         self._rejected.discard(key)
-        self._last = (key, now_ns)
+        self._recent_ns[key] = now_ns
+        self._recent_ns = {
+            one: at_ns for one, at_ns in self._recent_ns.items() if self._is_recent(at_ns, now_ns)
+        }
 
     def clear(self) -> None:
         """Drop all jobs that wait."""

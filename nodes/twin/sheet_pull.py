@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.rigid import transform
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.force_history import ForceHistory
+from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, Rubber, solve
 
 Floats = NDArray[np.float64]
 
@@ -34,17 +35,26 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> Rubber:
     )
 
 
-@dataclass(frozen=True, slots=True)
+def true_friction(apparatus: Apparatus | None) -> float | None:
+    """Return the friction coefficient between finger and sheet; None if touched rubber sticks."""
+    return None if apparatus is None else apparatus.sheet.friction_coefficient
+
+
+@dataclass(slots=True)
 class SheetPull:
     """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
 
-    The finger's push and the sheet's weight (0.3 N per arm) are not part of the pull: they are
-    small beside the tension.
+    A finger's push on the sheet is not part of the pull: it is small beside the tension.
+    weight_n: (3,) of the sheet, of which each flange carries half.
+    history: of the pull; None for elastic rubber.
     """
 
     distances_m: Floats
     forces_n: Floats
     compliances_m_per_n: tuple[float, float]
+    weight_n: Floats = field(default_factory=lambda: np.zeros(3))
+    history: ForceHistory | None = None
+    _rubber_ratio: float = field(default=1.0, init=False)
 
     @classmethod
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
@@ -55,21 +65,37 @@ class SheetPull:
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
         if not any(compliances):
             return None
-        rubber = replace(true_rubber(sheet, apparatus), density_kg_per_m3=0.0)
+        rubber = true_rubber(sheet, apparatus)
         distances_m = rubber.width_m * np.array(STRETCHES)
         forces_n = [0.0]
         for distance_m in distances_m[1:]:
             edges = [transform(np.eye(3), [0.5 * side * distance_m, 0.0, 0.0]) for side in (-1, 1)]
             forces_n.append(float(solve(rubber, *edges, cells=CELLS).left_force_n[0]))
-        return cls(distances_m, np.array(forces_n), compliances)
+        volume_m3 = rubber.width_m * rubber.height_m * rubber.thickness_m
+        return cls(
+            distances_m,
+            np.array(forces_n),
+            compliances,
+            rubber.density_kg_per_m3 * volume_m3 * GRAVITY_M_PER_S2,
+            ForceHistory.of(apparatus),
+        )
 
     def force_n(self, distance_m: float) -> float:
         """Return the pull between the arms at a distance of the rigid arms' edges.
 
         The flanges give way until compliance and sheet are in equilibrium.
         """
-        rigid_m = self.distances_m + sum(self.compliances_m_per_n) * self.forces_n
-        return float(np.interp(distance_m, rigid_m, self.forces_n))
+        forces_n = self._rubber_ratio * self.forces_n
+        rigid_m = self.distances_m + sum(self.compliances_m_per_n) * forces_n
+        return float(np.interp(distance_m, rigid_m, forces_n))
+
+    def _remember(self, distance_m: float, time_s: float) -> None:
+        """Add the pull at a distance to its history; elastic rubber has none."""
+        if self.history is None:
+            return
+        elastic_n = self.force_n(distance_m) / self._rubber_ratio
+        if elastic_n > 0.0:
+            self._rubber_ratio = self.history.update(time_s, elastic_n) / elastic_n
 
     def displace(
         self,
@@ -77,15 +103,21 @@ class SheetPull:
         world_from_right_flange: Floats,
         left_flange_from_edge: Floats,
         right_flange_from_edge: Floats,
+        *,
+        time_s: float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Return both flange poses (4, 4) under the sheet's pull; they move, but do not turn."""
+        """Return both flange poses (4, 4) under pull and weight; they move, but do not turn.
+
+        time_s: of the poses; it must not decrease.
+        """
         left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
         right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]
         distance_m = float(np.linalg.norm(right_m - left_m))
         if distance_m <= 0.0:
             return world_from_left_flange, world_from_right_flange
+        self._remember(distance_m, time_s)
         pull = self.force_n(distance_m) * (right_m - left_m) / distance_m
         left, right = world_from_left_flange.copy(), world_from_right_flange.copy()
-        left[:3, 3] += self.compliances_m_per_n[0] * pull
-        right[:3, 3] -= self.compliances_m_per_n[1] * pull
+        left[:3, 3] += self.compliances_m_per_n[0] * (0.5 * self.weight_n + pull)
+        right[:3, 3] += self.compliances_m_per_n[1] * (0.5 * self.weight_n - pull)
         return left, right

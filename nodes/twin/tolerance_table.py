@@ -290,7 +290,7 @@ _ROWS = (
               (Uniform(-2e-3, 2e-3), Uniform(-2e-3, 2e-3), Normal(10e-3, 1.5e-3)),
               "nail to pad 12 mm less 1 to 2 mm of pad yield, from memory",
               calibrated=Normal(0.0, 0.3e-3),
-              calibrated_source="target of a marker calibration (0.5 mm); none is measured yet"),
+              calibrated_source="[set-up-marker.md](set-up-marker.md): target 0.5 mm"),
     Tolerance("finger.marker_shape", "", 1.0, Always("disc"), "a sticker on the nail"),
     Tolerance("finger.marker_tilt_rad", "°", math.degrees(1.0), Normal(0.0, math.radians(10.0)),
               J),
@@ -341,10 +341,6 @@ _ROWS = (
 TOLERANCES: dict[str, Tolerance] = {row.key: row for row in _ROWS}
 
 NOT_SIMULATED: dict[str, str] = {
-    "sheet.density_kg_per_m3": "the membrane has no weight",
-    "sheet.friction_coefficient": "touched nodes of the membrane stick",
-    "sheet.hysteresis_ratio": "the membrane is elastic",
-    "sheet.creep_ratio_per_decade": "the membrane is elastic",
     "finger.hand_mass_kg": "the finger follows its path whatever it feels",
     "finger.hand_damping_ns_per_m": "the finger follows its path whatever it feels",
     "finger.hand_stiffness_n_per_m": "the finger follows its path whatever it feels",

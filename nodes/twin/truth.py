@@ -58,6 +58,11 @@ def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
                     "young_modulus_pa": base.sheet.young_modulus_pa * sheet.modulus_ratio,
                     "thickness_m": base.sheet.thickness_m * sheet.thickness_ratio,
                     "width_m": base.sheet.width_m + sheet.slack_width_offset_m + slip_m,
+                    "density_kg_per_m3": (
+                        base.sheet.density_kg_per_m3
+                        if sheet.density_kg_per_m3 is None
+                        else sheet.density_kg_per_m3
+                    ),
                 }
             ),
             "finger": base.finger.model_copy(

@@ -1,0 +1,225 @@
+"""Read touches for `flexsheet calibrate marker` from a CSV file, or simulate them."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.calibration.marker_fit import Touch
+from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.calibration import StereoCalibration
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.finger_frame import world_from_finger
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.twin.nail import Nail
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+
+REQUIRED = ("marker_x_mm", "marker_y_mm", "marker_z_mm",
+            "point_x_mm", "point_y_mm", "point_z_mm", "tilt_x_deg", "tilt_y_deg")  # fmt: skip
+NORMAL = ("normal_x", "normal_y", "normal_z")
+COLUMNS = (*REQUIRED, *NORMAL)
+
+MAX_PROBLEMS = 20
+MAX_TILT_DEG = 120.0
+MAX_LENGTH_MM = 5000.0
+"""Maximum plausible coordinate; a larger one is probably in another unit."""
+
+
+def read_touches(path: Path, scene: Scene) -> list[Touch]:
+    """Read touches; docs/set-up-marker.md lists the columns.
+
+    Raises BadInputError with file, line, column, value and remedy.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInputError(
+            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        ) from error
+    numbered = [
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not numbered:
+        remedy = f"start with a line of columns: {', '.join(COLUMNS)}"
+        raise BadInputError([Problem(str(path), (), "is empty", remedy)])
+    first, header = numbered[0]
+    names = [name.strip() for name in next(csv.reader([header]))]
+    _check_header(f"{path}:{first}", names)
+    problems: list[Problem] = []
+    touches = []
+    for number, line in numbered[1:]:
+        found: list[Problem] = []
+        values = _parse_row(f"{path}:{number}", names, next(csv.reader([line])), found)
+        if not found:
+            touches.append(_make_touch(values, scene))
+        problems += found
+    if problems:
+        raise BadInputError(problems[:MAX_PROBLEMS])
+    return touches
+
+
+def _check_header(where: str, names: list[str]) -> None:
+    wanted = COLUMNS if any(name in names for name in NORMAL) else REQUIRED
+    problems = [
+        Problem(where, (name,), "unknown column", did_you_mean(name, COLUMNS))
+        for name in names
+        if name not in COLUMNS
+    ]
+    problems += [
+        Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
+    ]
+    problems += [
+        Problem(where, (name,), "duplicate column", "remove one")
+        for name in dict.fromkeys(names)
+        if names.count(name) > 1
+    ]
+    if problems:
+        raise BadInputError(problems)
+
+
+def _parse_row(
+    where: str, names: list[str], cells: list[str], problems: list[Problem]
+) -> dict[str, float]:
+    """Return the values of a row by column; append its errors to `problems`."""
+    if len(cells) != len(names):
+        what = f"expected {len(names)} values, found {len(cells)}"
+        problems.append(Problem(where, (), what, "give one value per column"))
+        return {}
+    values: dict[str, float] = {}
+    for name, cell in zip(names, cells, strict=True):
+        text = cell.strip()
+        if not text and name in NORMAL:
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        limit = {"deg": MAX_TILT_DEG, "mm": MAX_LENGTH_MM}.get(name.rpartition("_")[2], 1.0)
+        if not math.isfinite(value):
+            what = f'expected a finite number, found "{text}"'
+            problems.append(Problem(where, (name,), what, "measure this touch again, or remove it"))
+        elif abs(value) > limit:
+            what = f"expected at most {limit:g} in size, found {text}"
+            problems.append(Problem(where, (name,), what, "check the unit"))
+        values[name] = value
+    given = [name for name in NORMAL if name in values]
+    if not problems and given:
+        length = math.hypot(*(values.get(name, 0.0) for name in NORMAL))
+        if len(given) < len(NORMAL) or abs(length - 1.0) > 0.01:
+            what = f"the normal has {len(given)} components and the length {length:.3g}"
+            problems.append(Problem(where, NORMAL[:1], what, "give a unit vector, or no value"))
+    return values
+
+
+def _make_touch(values: dict[str, float], scene: Scene) -> Touch:
+    def lengths(name: str) -> Floats:
+        return 1e-3 * np.array([values[f"{name}_{axis}_mm"] for axis in "xyz"])
+
+    tilt_rad = np.radians([values["tilt_x_deg"], values["tilt_y_deg"]])
+    return Touch(
+        marker_m=lengths("marker"),
+        point_m=lengths("point"),
+        world_from_finger=world_from_finger(scene.finger.direction_world, tilt_rad),
+        normal=np.array([values[name] for name in NORMAL]) if NORMAL[0] in values else None,
+    )
+
+
+class TouchNotSeenError(FlexsheetError, ValueError):
+    """Raised when the simulated camera does not see the marker of a touch."""
+
+    code = "touch-not-seen"
+    remedy = "Give an apparatus whose marker the camera sees: a ball, or a smaller offset."
+
+
+SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20), (-15, 20),
+                       (12, -18), (12, 18))  # fmt: skip
+SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
+SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
+"""Standard deviations of the simulated pad from the point, and of the finger's angles."""
+
+
+def simulate_touches(
+    scene: Scene,
+    apparatus: Apparatus,
+    *,
+    calibration: StereoCalibration | None,
+    seed: int,
+) -> list[Touch]:
+    """Simulate touches of a known point, seen by the simulated stereo camera.
+
+    Each orientation of `SIMULATED_TILTS_DEG` is touched once. The positions are those of the
+    triangulator's detector. calibration: its optics; None: the scene's. Raises TouchNotSeenError.
+    """
+    geometry = StereoGeometry.of(scene.camera, calibration)
+    true_scene = apply_apparatus(scene, apparatus)
+    random = np.random.default_rng(seed)
+    touches = []
+    for number, tilt_deg in enumerate(SIMULATED_TILTS_DEG):
+        tilt_rad = np.radians(tilt_deg)
+        held = tilt_rad + random.normal(0.0, SIMULATED_TILT_RAD, 2)
+        finger = apparatus.finger.model_copy(update={"finger_tilt_rad": tuple(held.tolist())})
+        camera = TwinCamera(
+            make_true_camera(true_scene.camera),
+            finger_radius_m=true_scene.finger.radius_m,
+            seed=seed + number,
+            nail=Nail.of(finger),
+        )
+        pad = SIMULATED_POINT_M + random.normal(0.0, SIMULATED_HAND_M, 3)
+        touches.append(
+            Touch(
+                marker_m=_see_marker(camera, scene, geometry, pad, tilt_deg),
+                point_m=SIMULATED_POINT_M,
+                world_from_finger=world_from_finger(scene.finger.direction_world, tilt_rad),
+            )
+        )
+    return touches
+
+
+def _see_marker(
+    camera: TwinCamera,
+    scene: Scene,
+    geometry: StereoGeometry,
+    pad: Floats,
+    tilt_deg: tuple[float, float],
+) -> Floats:
+    left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
+    given = TriangulatorParameters()
+    reason, measured = detect(
+        left,
+        right,
+        geometry=geometry,
+        config=DetectorConfig(
+            blob_filter=BlobFilter(
+                min_contrast=given.marker_min_contrast,
+                min_area_px=given.marker_min_area_px,
+                max_area_px=given.marker_max_area_px,
+                window_half_px=given.window_half_px,
+            ),
+            refine=MARKER_METHODS["subpixel_fit"],
+            triangulate=TRIANGULATION_METHODS["dlt"],
+            max_reprojection_px=given.max_reprojection_px,
+        ),
+        volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
+        gate=None,
+    )
+    if reason != "ok" or measured is None:
+        raise TouchNotSeenError(
+            f"the camera does not see the marker at a tilt of {tilt_deg[0]:g}°, {tilt_deg[1]:g}°: "
+            f"{reason}"
+        )
+    return measured.point_world

@@ -1,0 +1,145 @@
+"""`flexsheet calibrate marker`: fit the marker's position on the finger to touches."""
+
+from __future__ import annotations
+
+import shlex
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    check_folder,
+    examples,
+    print_fields,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from flexsheet.messages.marker_calibration import MarkerCalibration
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `flexsheet calibrate`."""
+    app.command(
+        "marker",
+        epilog=examples(
+            "flexsheet calibrate marker --rows touches.csv --scene lab.yaml -o marker.yaml",
+            "flexsheet calibrate marker --twin launch/scenes/cylinder.yaml --apparatus seed:3 "
+            "-o marker.yaml",
+        ),
+    )(marker)
+
+
+def marker(
+    *,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Marker calibration file to write.")
+    ],
+    rows: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="CSV file of touches; columns: docs/set-up-marker.md."),
+    ] = None,
+    scene_file: Annotated[
+        Path, typer.Option("--scene", metavar="FILE", help="Scene file of the finger, for --rows.")
+    ] = SCENE_FILE,
+    twin: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENE", help="Scene file whose finger is simulated instead."),
+    ] = None,
+    apparatus: Annotated[
+        str | None,
+        typer.Option(metavar="FILE|seed:N", help="What is true in the simulation, for --twin."),
+    ] = None,
+    calibration_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration", metavar="FILE", help="Stereo calibration of the camera, for --twin."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Random seed of the simulation.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit where the marker is on the finger, relative to the pad.
+
+    The touches of known points are rows of a CSV file (--rows, --scene) or are simulated (--twin).
+    """
+    from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
+    from flexsheet.launch.calibration.touches import read_touches, simulate_touches
+    from flexsheet.launch.plans.apparatus import load_apparatus
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.apparatus import nominal_apparatus
+    from flexsheet.messages.calibration import load_calibration
+    from flexsheet.messages.marker_calibration import MarkerCalibration, save_marker_calibration
+
+    check_folder("-o", output)
+    if (rows is None) == (twin is None):
+        raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
+    for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
+        if value is not None and twin is None:
+            raise CommandError(f"{name} {value}: is for --twin SCENE only; remove it", BAD_INPUT)
+    command = ["flexsheet", "calibrate", "marker"]
+    if rows is not None:
+        scene = load_scene(scene_file)
+        touches = read_touches(rows, scene)
+        command += ["--rows", str(rows), "--scene", str(scene_file)]
+        source = str(rows)
+    else:
+        assert twin is not None
+        scene = load_scene(twin)
+        true = nominal_apparatus(scene) if apparatus is None else load_apparatus(apparatus, scene)
+        optics = None if calibration_file is None else load_calibration(calibration_file)
+        touches = simulate_touches(scene, true, calibration=optics, seed=seed)
+        command += ["--twin", str(twin), "--seed", str(seed)]
+        command += [] if apparatus is None else ["--apparatus", apparatus]
+        command += [] if calibration_file is None else ["--calibration", str(calibration_file)]
+        source = f"twin of {scene.name}"
+    try:
+        fit = fit_marker(touches)
+    except MarkerFitError as error:
+        raise CommandError(f"{source}: {error}; {error.remedy}", BAD_INPUT) from error
+    calibration = MarkerCalibration(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        code_version=version("flexsheet"),
+        source=source,
+        scene=scene.name,
+        marker_from_pad_m=tuple(fit.marker_from_pad_m.tolist()),
+        standard_deviations_m=tuple(fit.standard_deviations_m.tolist()),
+        point_offset_m=tuple(fit.point_offset_m.tolist()),
+        residual_rms_m=fit.residual_rms_m,
+        residual_worst_m=float(fit.residuals_m.max()),
+        touches=len(touches),
+        orientations=fit.orientations,
+    )
+    save_marker_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    _print_result(calibration, output, as_json)
+
+
+def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -> None:
+    if as_json:
+        values = calibration.model_dump(mode="json")
+        print_json({"calibration": str(output), **values})
+        return
+    offsets = zip(calibration.marker_from_pad_m, calibration.standard_deviations_m, strict=True)
+    print_fields(
+        [
+            ("calibration", output),
+            ("touches", f"{calibration.touches} in {calibration.orientations} orientations"),
+            *(
+                (f"marker from pad, {axis}", f"{1e3 * value:.2f} ± {1e3 * deviation:.2f} mm")
+                for axis, (value, deviation) in zip("xyz", offsets, strict=True)
+            ),
+            (
+                "residuals",
+                f"{1e3 * calibration.residual_rms_m:.2f} mm rms, "
+                f"{1e3 * calibration.residual_worst_m:.2f} mm max",
+            ),
+        ]
+    )

@@ -1,0 +1,61 @@
+"""Define the marker's calibration file, from `flexsheet calibrate marker` for the triangulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from flexsheet.messages.calibration_file import (
+    CalibrationMismatchError,
+    read_calibration,
+    write_calibration,
+)
+from flexsheet.messages.scene import FingerLengths, NonNegative, Part, Scene
+
+MARKER_CALIBRATION_VERSION = 1
+
+
+class MarkerCalibration(Part):
+    """Position of the marker on a finger, with its uncertainty."""
+
+    version: Literal[1] = 1
+    date: str = Field(description="ISO 8601, UTC")
+    code_version: str
+    source: str = Field(description="file of the touches, or scene of the simulator")
+    scene: str = Field(description="name of the scene in which the finger was calibrated")
+    marker_from_pad_m: FingerLengths = Field(
+        description="centre of the marker from the pad's contact point, in the finger's frame"
+    )
+    standard_deviations_m: tuple[NonNegative, NonNegative, NonNegative]
+    point_offset_m: FingerLengths = Field(description="common error of the touched points, world")
+    residual_rms_m: NonNegative
+    residual_worst_m: NonNegative
+    touches: Annotated[int, Field(ge=1)]
+    orientations: Annotated[int, Field(ge=1)]
+
+
+def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
+    """Raise CalibrationMismatchError unless the calibration is of this scene."""
+    if calibration.scene != scene.name:
+        raise CalibrationMismatchError(
+            f'scene: the marker was calibrated in scene "{calibration.scene}", not in '
+            f'"{scene.name}": give the file of this scene, or run `flexsheet calibrate marker`'
+        )
+
+
+def save_marker_calibration(
+    calibration: MarkerCalibration, path: Path, *, comment: str = ""
+) -> None:
+    """Write the calibration file; FileWriteError if the disk refuses it."""
+    title = f"Calibration of a finger's marker, {calibration.date}."
+    write_calibration(calibration, path, title=title, comment=comment)
+
+
+def load_marker_calibration(path: Path) -> MarkerCalibration:
+    """Read the calibration file; CalibrationFileError if it is invalid."""
+    command = "flexsheet calibrate marker"
+    return read_calibration(
+        MarkerCalibration, path, version=MARKER_CALIBRATION_VERSION, command=command
+    )

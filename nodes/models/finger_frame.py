@@ -1,0 +1,28 @@
+"""Define the finger's frame: origin at the pad, x to the hand, z out of the nail."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.models.rigid import rotation_from_vector
+
+Floats = NDArray[np.float64]
+
+
+def world_from_finger(
+    direction_world: Sequence[float], tilt_rad: Sequence[float] = (0.0, 0.0)
+) -> Floats:
+    """Return the rotation (3, 3) of a finger.
+
+    direction_world: (3,) from the tip to the hand; without a tilt, y is level.
+    tilt_rad: rotation of the finger about the world's x and y.
+    """
+    x = np.asarray(direction_world, dtype=np.float64)
+    x = x / np.linalg.norm(x)
+    z = np.cross(x, [1.0, 0.0, 0.0])
+    z /= np.linalg.norm(z)
+    level = np.column_stack([x, np.cross(z, x), z])
+    return np.asarray(rotation_from_vector((*tilt_rad, 0.0)) @ level)

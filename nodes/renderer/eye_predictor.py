@@ -1,0 +1,83 @@
+"""Predict the tracked eyes at the display time of a frame."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.base import Header
+from flexsheet.messages.types import Eye
+from flexsheet.nodes.node import Input
+
+Floats = NDArray[np.float64]
+
+WINDOW_S = 0.15
+"""Duration over which the velocity is measured: longer than a few frames of a head tracker."""
+
+MIN_MESSAGES = 3
+"""Minimum number of positions for a velocity; before, the newest position is used."""
+
+MAX_SPEED_M_PER_S = 1.0
+"""Maximum speed of a head; a faster velocity is an error of the tracker, and is not used."""
+
+MAX_AHEAD_S = 0.1
+"""Maximum time of the extrapolation."""
+
+MAX_SHIFT_M = 0.03
+"""Maximum displacement by the extrapolation."""
+
+
+class EyePredictor:
+    """Predictor of the eyes by their measured velocity, a line through the last positions.
+
+    max_age_s: age beyond which the eyes count as not tracked.
+    """
+
+    def __init__(self, *, max_age_s: float) -> None:
+        self._max_age_s = max_age_s
+        self._positions: deque[tuple[int, Floats]] = deque()
+        self._clock: tuple[str, int] | None = None
+
+    def add(self, eye: Eye, header: Header) -> None:
+        """Add a message; an invalid one, a gap or another clock starts a new line."""
+        clock, at_ns = (header.clock_id, header.epoch), header.source_ns
+        known = self._positions
+        if not eye.valid:
+            known.clear()
+            return
+        if known and (clock != self._clock or not 0 < at_ns - known[-1][0] < 1e9 * self._max_age_s):
+            known.clear()
+        self._clock = clock
+        known.append((at_ns, np.asarray(eye.centre_world_m, dtype=np.float64)))
+        while at_ns - known[0][0] > 1e9 * WINDOW_S:
+            known.popleft()
+
+    def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
+        """Return the eyes `horizon_s` from now; None without a message or if it is too old.
+
+        An invalid message is returned as it is.
+        """
+        eye, age_s = tracked.message, tracked.age_s()
+        if eye is None or age_s > self._max_age_s:
+            return None
+        ahead_s = min(max(age_s + horizon_s, 0.0), MAX_AHEAD_S)
+        shift = ahead_s * self._velocity()
+        length = float(np.linalg.norm(shift))
+        if not eye.valid or length == 0.0:
+            return eye
+        shift *= min(1.0, MAX_SHIFT_M / length)
+        return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
+
+    def _velocity(self) -> Floats:
+        """Return the velocity (3,), m/s; zero if it is unknown or implausible."""
+        if len(self._positions) < MIN_MESSAGES:
+            return np.zeros(3)
+        newest_ns = self._positions[-1][0]
+        times = np.array([(at_ns - newest_ns) * 1e-9 for at_ns, _ in self._positions])
+        positions = np.array([position for _, position in self._positions])
+        times -= times.mean()
+        velocity = times @ (positions - positions.mean(axis=0)) / float(times @ times)
+        plausible = float(np.linalg.norm(velocity)) <= MAX_SPEED_M_PER_S
+        return np.asarray(velocity) if plausible else np.zeros(3)

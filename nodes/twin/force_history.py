@@ -1,0 +1,104 @@
+"""Apply the rubber's hysteresis and creep to the force of the elastic membrane.
+
+Creep is quasi-linear viscoelasticity (Fung, Biomechanics, 1981): the force is the sum of all past
+changes of the elastic force, each times a relaxation function of its age. The function is a sum of
+exponentials with one time constant per decade, so that the force falls by a constant share per
+decade. It is one at the age `REFERENCE_S`, at which the modulus is measured.
+
+Hysteresis that does not depend on the rate multiplies the force by 1 + h while the elastic force
+rises and by 1 - h while it falls. After a reversal the factor changes over a relative change of the
+force by `REVERSAL_RATIO`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.apparatus import Apparatus
+
+Floats = NDArray[np.float64]
+
+REFERENCE_S = 1.0
+"""Age of a force at which the relaxation function is one."""
+
+TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
+"""Time constants of the relaxation: forces relax from about 50 ms to some hours."""
+
+REVERSAL_RATIO = 0.1
+"""Relative change of the elastic force over which the hysteresis reverses, to 1/e."""
+
+MIN_FORCE_N = 1e-3
+"""Elastic force below which the direction of a change is not counted."""
+
+CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
+"""Share of the energy that a cycle loses by relaxation, over the relaxation per decade."""
+
+
+class ForceHistory:
+    """Hold the history of one force of the sheet.
+
+    hysteresis_ratio: share of the loading's energy that a cycle from zero force loses, the part
+        lost by creep included.
+    creep_ratio_per_decade: relative loss of force per decade of time.
+    """
+
+    def __init__(self, hysteresis_ratio: float, creep_ratio_per_decade: float) -> None:
+        lost = max(hysteresis_ratio - CREEP_LOSS_RATIO * creep_ratio_per_decade, 0.0)
+        lost *= 1.0 + 2.0 * REVERSAL_RATIO
+        self._amplitude = lost / (2.0 - lost)
+        self._creep = creep_ratio_per_decade
+        self._relaxing = np.zeros(len(TIME_CONSTANTS_S))
+        self._elastic_n: float | None = None
+        self._direction, self._time_s = 0.0, 0.0
+
+    @classmethod
+    def of(cls, apparatus: Apparatus | None) -> Self | None:
+        """Return the history of an apparatus's sheet; None for elastic rubber."""
+        if apparatus is None:
+            return None
+        sheet = apparatus.sheet
+        if not sheet.hysteresis_ratio and not sheet.creep_ratio_per_decade:
+            return None
+        return cls(sheet.hysteresis_ratio, sheet.creep_ratio_per_decade)
+
+    def update(self, time_s: float, elastic_n: float) -> float:
+        """Add an elastic force (N) at a time and return the force (N) of the rubber.
+
+        The force changes linearly between two calls. The first one has the age `REFERENCE_S`.
+        Raises ValueError if the time decreases.
+        """
+        if self._elastic_n is None:
+            self._relaxing = elastic_n * np.exp(-REFERENCE_S / TIME_CONSTANTS_S)
+        else:
+            elapsed_s = time_s - self._time_s
+            if elapsed_s < 0.0:
+                raise ValueError(f"time {time_s} s is before {self._time_s} s")
+            change_n = elastic_n - self._elastic_n
+            ratios = elapsed_s / TIME_CONSTANTS_S
+            # Mean of the exponential over the interval, in which the force changes linearly.
+            kept = -np.expm1(-ratios) / ratios if elapsed_s else np.ones(len(ratios))
+            self._relaxing = self._relaxing * np.exp(-ratios) + change_n * kept
+            self._turn(self._elastic_n, elastic_n)
+        self._time_s, self._elastic_n = time_s, elastic_n
+        final = 1.0 - self._creep * float(np.exp(-REFERENCE_S / TIME_CONSTANTS_S).sum())
+        relaxed_n = final * elastic_n + self._creep * float(self._relaxing.sum())
+        return relaxed_n * (1.0 + self._amplitude * self._direction)
+
+    def _turn(self, before_n: float, now_n: float) -> None:
+        sizes = max(abs(before_n), MIN_FORCE_N), max(abs(now_n), MIN_FORCE_N)
+        travel = math.log(sizes[1] / sizes[0])
+        wanted = math.copysign(1.0, travel)
+        self._direction = wanted + (self._direction - wanted) * math.exp(
+            -abs(travel) / REVERSAL_RATIO
+        )
+
+
+def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
+    """Return the force (n,), N, of rubber at times (n,) by its elastic force (n,)."""
+    return np.array(
+        [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
+    )
