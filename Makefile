@@ -92,7 +92,7 @@ test-long: $(DEV_STAMP) cached
 		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
-# Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
+# Longer than the tests: what docs/messaging.md and docs/results.md hold.
 bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
