@@ -92,7 +92,7 @@ test-long: $(DEV_STAMP) cached
 		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
-# Longer than the tests: what docs/results.md and docs/image-correction.md contain.
+# Longer than the tests: the figures of docs/results.md.
 bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction

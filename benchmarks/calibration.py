@@ -1,4 +1,4 @@
-"""Compare methods of finding corners and of fitting the rig, for docs/calibration.md.
+"""Compare methods of finding corners and of fitting the rig, for docs/camera.md.
 
 python -m benchmarks.calibration [--left GLOB --right GLOB --board 9x6 --square-mm 24.23]
 
