@@ -111,7 +111,7 @@ def type_section(kind: type[BaseModel]) -> str:
 
 def _field_notes(field: FieldInfo) -> str:
     """Return bounds, default and description of a field."""
-    notes = [note for extra in _constraints(field) if (note := _constraint(extra))]
+    notes = describe_bounds(field)
     if field.default_factory is not None:
         notes.append("empty by default")
     elif not field.is_required():
@@ -119,6 +119,11 @@ def _field_notes(field: FieldInfo) -> str:
     if field.description:
         notes.append(field.description)
     return "; ".join(notes)
+
+
+def describe_bounds(field: FieldInfo) -> list[str]:
+    """Return the bounds of a field's values as text, for example `> 0`."""
+    return [note for extra in _constraints(field) if (note := _constraint(extra))]
 
 
 def _constraints(field: FieldInfo) -> Iterator[Any]:
