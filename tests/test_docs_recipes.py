@@ -52,7 +52,7 @@ def run_script(script: str, cwd: Path, *arguments: str) -> str:
         done = subprocess.run(
             [sys.executable, "-c", script, *arguments],
             cwd=cwd,
-            env={**os.environ, "FLEXSHEET_RUNS": runs, "PYTHONPATH": str(cwd)},
+            env={**os.environ, "FLEXSHEET_RUNS": runs, "PYTHONPATH": f"{cwd}{os.pathsep}{ROOT}"},
             capture_output=True, text=True, timeout=DEADLINE_S, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -103,7 +103,6 @@ def test_the_library_script_runs(tmp_path: Path) -> None:
     (tmp_path / "launch" / "demo.yaml").write_text(
         "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
     )
-    (tmp_path / "tests").symlink_to(ROOT / "tests")
     assert len(run_script(script, tmp_path).splitlines()) == 3
     assert len([line for line in script.splitlines() if line.strip()]) <= 12
 

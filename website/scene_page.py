@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from flexsheet.launch.objects.meshes import MeshFile
 from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
-from website.messages_page import describe_bounds
+from website.messages_page import describe_bounds, format_table
 from website.parameters_page import unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
@@ -131,7 +131,7 @@ def _variants(key: str, kind: type[BaseModel]) -> list[str]:
     sections = []
     for variant in get_args(field.annotation):
         model = MeshFile if variant is Mesh else variant
-        tag = next(iter(get_args(model.model_fields[field.discriminator].annotation)))
+        tag = next(iter(get_args(model.model_fields[str(field.discriminator)].annotation)))
         sections += [
             f"### {key}: {tag.replace('_', ' ')}\n",
             _first_paragraph(model),
@@ -189,11 +189,5 @@ def _first_paragraph(kind: type[BaseModel]) -> str:
     return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()) + "\n"
 
 
-def _table(rows: Iterator[tuple[str, ...]]) -> str:
-    heads = ("key", "type", "unit", "default", "effect")
-    return (
-        "\n".join(
-            f"| {' | '.join(cells)} |" for cells in (heads, tuple("---" for _ in heads), *rows)
-        )
-        + "\n"
-    )
+def _table(rows: Iterable[tuple[str, ...]]) -> str:
+    return format_table(("key", "type", "unit", "default", "effect"), rows)
