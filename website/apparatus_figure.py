@@ -168,13 +168,13 @@ def _eye() -> list[str]:
 
 def _labels() -> list[str]:
     texts: Sequence[tuple[str, Point, Pixel, str]] = (
-        ("robot arm", (-0.46, 0.14, 0.0), (150, 80), "middle"),
+        ("robot arm", (-0.46, 0.14, 0.0), (95, 110), "middle"),
         ("robot arm", (0.46, 0.14, 0.0), (640, 145), "middle"),
         ("clamp", (-EDGE_M, -0.12, 0.0), (240, 300), "end"),
         ("rubber sheet", (-0.10, 0.13, 0.0), (265, 110), "end"),
         ("virtual object", (0.05, -0.02, -0.05), (500, 345), "start"),
         ("finger with marker", KNUCKLE, (425, 425), "start"),
-        ("stereo camera", CAMERA, (240, 55), "end"),
+        ("stereo camera", CAMERA, (265, 60), "end"),
         ("eye", EYE, (205, 400), "end"),
         ("projector", PROJECTOR, (620, 70), "start"),
     )
