@@ -12,6 +12,7 @@ from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_page
 from website.finish import NetworkError, finish
 from website.graph import LAB, TWIN, GraphDrawing
 from website.pages import generate
+from website.scene_page import missing_effects
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
 """Topics that the drawings of the graph omit, as their page explains."""
@@ -63,6 +64,10 @@ def test_generated_files_are_up_to_date() -> None:
         str(path) for path, text in generate(DOCS).items() if (DOCS / path).read_text() != text
     ]
     assert stale == [], "run: make pages"
+
+
+def test_each_key_of_a_scene_file_has_a_described_effect() -> None:
+    assert missing_effects() == [], "describe the field, or add it to EFFECTS of the page"
 
 
 def test_all_pages_are_linked_from_a_page_of_the_site() -> None:

@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import pytest
 
 import flexsheet
 from flexsheet.nodes import node_class
-from tests.doc_pages import blocks
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -139,26 +137,6 @@ def test_a_wheel_holds_the_package_only(tmp_path: Path) -> None:
         "flexsheet/launch/scenes/cylinder.yaml",
     ):
         assert wanted in names
-
-
-def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
-    """The script runs with a graph of one node, which publishes fingertips."""
-    (script,) = (
-        block.text for block in blocks(ROOT / "README.md") if "flexsheet.load_graph" in block.text
-    )
-    (tmp_path / "launch").mkdir()
-    (tmp_path / "launch" / "demo.yaml").write_text(
-        "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
-    )
-    with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as runs:
-        done = subprocess.run(
-            [sys.executable, "-c", script],
-            cwd=tmp_path, env={**os.environ, "FLEXSHEET_RUNS": runs},
-            capture_output=True, text=True, timeout=DEADLINE_S, check=False,
-        )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 3
-    assert len([line for line in script.splitlines() if line.strip()]) <= 12
 
 
 def copy_of_sources(folder: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -73,7 +73,7 @@ def _topic_table() -> str:
         for topic in TOPICS.values()
     ]
     heads = ("topic", "type", "delivery", "rate", "writers", "recorded", "at most", "what")
-    return _table(heads, rows)
+    return format_table(heads, rows)
 
 
 def _rate(topic: Topic) -> str:
@@ -95,7 +95,7 @@ def _header_table() -> str:
     rows = [
         (f"`{name}`", types[name].__name__, described.get(name, "")) for name in Header.__slots__
     ]
-    return _table(("field", "type", "what"), rows)
+    return format_table(("field", "type", "what"), rows)
 
 
 def type_section(kind: type[BaseModel]) -> str:
@@ -105,12 +105,12 @@ def type_section(kind: type[BaseModel]) -> str:
         for name, field in kind.model_fields.items()
     ]
     text = inspect.cleandoc(kind.__doc__ or "")
-    return f"### {kind.__name__}\n\n{text}\n\n{_table(('field', 'type', 'notes'), rows)}"
+    return f"### {kind.__name__}\n\n{text}\n\n{format_table(('field', 'type', 'notes'), rows)}"
 
 
 def _field_notes(field: FieldInfo) -> str:
     """Return bounds, default and description of a field."""
-    notes = [note for extra in _constraints(field) if (note := _constraint(extra))]
+    notes = describe_bounds(field)
     if field.default_factory is not None:
         notes.append("empty by default")
     elif not field.is_required():
@@ -118,6 +118,11 @@ def _field_notes(field: FieldInfo) -> str:
     if field.description:
         notes.append(field.description)
     return "; ".join(notes)
+
+
+def describe_bounds(field: FieldInfo) -> list[str]:
+    """Return the bounds of a field's values as text, for example `> 0`."""
+    return [note for extra in _constraints(field) if (note := _constraint(extra))]
 
 
 def _constraints(field: FieldInfo) -> Iterator[Any]:
@@ -158,6 +163,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(argument)
 
 
-def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+def format_table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Return a Markdown table."""
     lines = [heads, tuple("---" for _ in heads), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"

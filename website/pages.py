@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 
 from website import (
+    apparatus_figure,
     arm_states_page,
     commands_page,
     errors_page,
     messages_page,
     parameters_page,
     registers_page,
+    scene_page,
     tolerances_page,
     tracking_page,
 )
@@ -33,6 +35,7 @@ def generate(docs: Path) -> dict[Path, str]:
         Path("cli.md"): commands_page.reference(),
         Path("parameters.md"): parameters_page.reference(),
         Path("errors.md"): errors_page.reference(),
+        Path("scene-file.md"): scene_page.reference(),
         Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
         Path("apparatus.md"): tolerances_page.page(
@@ -42,6 +45,7 @@ def generate(docs: Path) -> dict[Path, str]:
             (docs / "tracking.md").read_text(encoding="utf-8"), docs / "charts/tracking-regret.json"
         ),
         **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
+        Path("images") / "apparatus.svg": apparatus_figure.svg(),
     }
 
 

@@ -1,0 +1,131 @@
+"""Test the programs of the documentation that need a bag or a running graph."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.topics import find_topic
+from flexsheet.messages.types import SheetTarget
+from tests.doc_pages import DOCS, ROOT, blocks
+from tests.fingertips import fingertip
+from tests.waiting import DEADLINE_S
+
+GUARD_SCRIPT = """
+import asyncio
+from pathlib import Path
+import flexsheet
+
+async def main():
+    graph = flexsheet.RunningGraph(flexsheet.load_graph(Path("guard.yaml")))
+    async with graph:
+        await graph.wait_ready()
+        async for status, header in flexsheet.read_topic(graph, "status"):
+            if header.writer == "guard" and status.note:
+                print(status.note)
+                return
+
+asyncio.run(main())
+"""
+
+
+def python_block(page: str, mark: str) -> str:
+    """Return the only Python block of a page that contains a text."""
+    (text,) = (
+        block.text
+        for block in blocks(DOCS / page)
+        if block.language == "python" and mark in block.text
+    )
+    return text
+
+
+def run_script(script: str, cwd: Path, *arguments: str) -> str:
+    with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as runs:
+        done = subprocess.run(
+            [sys.executable, "-c", script, *arguments],
+            cwd=cwd,
+            env={**os.environ, "FLEXSHEET_RUNS": runs, "PYTHONPATH": f"{cwd}{os.pathsep}{ROOT}"},
+            capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def write_stroke(path: Path, count: int) -> None:
+    """Write a bag in which the finger moves by 1 mm in x per message."""
+    with BagWriter(path) as bag:
+        for number in range(count):
+            now_ns = 1_000_000_000 + number * 16_000_000
+            for topic, message in (
+                ("fingertip", fingertip(np.array([number * 1e-3, 0.0, 0.0]))),
+                ("sheet_target", sheet_target(now_ns, push_depth_m=number * 5e-4)),
+            ):
+                header = Header(number, now_ns, now_ns, "host-1", "test", 1)
+                bag.write(find_topic(topic), message, header, log_time_ns=now_ns)
+
+
+def sheet_target(valid_at_ns: int, push_depth_m: float) -> SheetTarget:
+    return SheetTarget(
+        phase="contact",
+        reason="ok",
+        valid_at_ns=valid_at_ns,
+        world_from_sheet=np.eye(4),
+        twist_world=np.zeros(6),
+        stretch_ratio=1.05,
+        contact_world_m=np.zeros(3),
+        normal_world=np.array([0.0, 0.0, 1.0]),
+        contact_sheet_m=np.zeros(2),
+        push_depth_m=push_depth_m,
+    )
+
+
+def test_the_plot_script_reads_a_bag(tmp_path: Path) -> None:
+    write_stroke(tmp_path / "stroke.mcap", count=20)
+    run_script(python_block("plot-data.md", "BagReader"), tmp_path, "stroke.mcap")
+    assert (tmp_path / "stroke.png").stat().st_size > 0
+    rows = np.loadtxt(tmp_path / "fingertip.csv", delimiter=",", skiprows=1)
+    assert rows.shape == (20, 4)
+    np.testing.assert_allclose(rows[:, 1], np.arange(20) * 1e-3, atol=1e-9)
+
+
+def test_the_library_script_runs(tmp_path: Path) -> None:
+    """The script runs with a graph of one node, which publishes fingertips."""
+    script = python_block("library.md", "flexsheet.load_graph")
+    (tmp_path / "launch").mkdir()
+    (tmp_path / "launch" / "demo.yaml").write_text(
+        "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
+    )
+    assert len(run_script(script, tmp_path).splitlines()) == 3
+    assert len([line for line in script.splitlines() if line.strip()]) <= 12
+
+
+def test_the_launch_file_of_the_node_tutorial_runs(tmp_path: Path) -> None:
+    (launch_file,) = (
+        block.text
+        for block in blocks(DOCS / "write-your-own-node.md")
+        if block.language == "yaml" and "guard:" in block.text
+    )
+    (tmp_path / "guard.yaml").write_text(launch_file)
+    (tmp_path / "speed_guard.py").write_text(
+        python_block("write-your-own-node.md", "class SpeedGuard(")
+    )
+    (tmp_path / "launch").symlink_to(ROOT / "launch")
+    assert run_script(GUARD_SCRIPT, tmp_path).startswith("finger at ")
+
+
+def test_figures_of_the_readme_stand_on_the_page_of_results() -> None:
+    """Each number of the README's table of results is a number of docs/results.md."""
+    number = re.compile(r"(?<![\d.])\d+\.\d+(?![\d.])")
+    readme = (ROOT / "README.md").read_text()
+    table = readme[readme.index("| quantity") :].split("\n\n")[0]
+    numbers = set(number.findall(table))
+    assert numbers
+    assert numbers <= set(number.findall((DOCS / "results.md").read_text()))
