@@ -351,7 +351,7 @@ async def test_the_eye_is_where_the_apparatus_has_it() -> None:
             believed = SCENE.projector.world_from_projector.position_m
             moved = true.projector.world_from_projector.position_m - believed
             assert moved == pytest.approx([0, 0, 2e-3])
-            eye = harness.node._true_eye(true, 0.0)
+            eye = harness.node._true_eye(true, 0.0, viewpoint)
             assert eye == pytest.approx([x_m, 0.0, 0.4])
         finally:
             await harness.node.close()
@@ -363,7 +363,7 @@ async def test_the_eye_of_a_nominal_apparatus_is_the_scenes() -> None:
     try:
         true = harness.node._true_scene(SCENE)
         assert true.model_dump_json() == SCENE.model_dump_json()
-        eye = harness.node._true_eye(true, 3.0)
+        eye = harness.node._true_eye(true, 3.0, "centre")
         assert np.array_equal(eye, SCENE.eyes.centre_world_m)
     finally:
         await harness.node.close()
