@@ -33,13 +33,13 @@ from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from tests.fingertips import fingertip
-from tests.scenes import make_weightless
+from tests.scenes import make_weightless, set_density
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-HEAVY_SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
-SCENE = make_weightless(HEAVY_SCENE)
+SCENE = make_weightless(Scene.model_validate(YAML(typ="safe").load(SCENE_FILE)))
+HEAVY_SCENE = set_density(SCENE, 1200.0)
 RADIUS = SCENE.object.geometry.radius_m
 SHAPE = CylinderShape(RADIUS, SCENE.object.geometry.length_m)
 FRAME_NS = 16_666_667
