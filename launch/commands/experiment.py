@@ -60,6 +60,21 @@ MapOption = Annotated[
         help="Image file for a map of the error at each visible point; doubles the duration.",
     ),
 ]
+WorkersOption = Annotated[
+    int,
+    typer.Option(
+        "--workers", min=1, max=64, help="Number of simultaneous trials on this computer."
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a dask.distributed scheduler whose workers run the trials, such as "
+        "tcp://host:8786; default: this computer.",
+    ),
+]
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
