@@ -61,7 +61,9 @@ Bools = NDArray[np.bool_]
 STEP_S = 1.0 / 30.0
 """Time step of the bound."""
 
-WINDOW_STEPS = 120
+WINDOW_STEPS = 60
+"""Steps of a window; the time of a solution grows faster than their number."""
+
 MAX_DEVIATION_M = 0.05
 DEVIATION_M = 1e-4
 """Displacement of the contact by which the joints' slopes are computed."""
@@ -73,6 +75,10 @@ DIRECTIONS = np.array(
 )
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 """Unit vectors (26, 3). The largest component along them is at least 0.91 of a vector's length."""
+
+SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
+SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
+"""Unit vectors (7, 3) along which the tool speed is limited, in both senses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +121,9 @@ def find_least_deviation(
     for quantity in range(motion.values.shape[1]):
         value = motion.values[:, quantity]
         to_value = _block_rows(motion.slopes[:, quantity, :] * scale)
-        middle = 0.5 * (motion.low[quantity] + motion.high[quantity])
-        if np.isfinite(middle):
-            half = 0.5 * (motion.high[quantity] - motion.low[quantity])
-            add(to_value, value - middle, np.full(steps, half))
+        low, high = motion.low[quantity], motion.high[quantity]
+        if np.isfinite([low, high]).all():
+            add(to_value, value - 0.5 * (low + high), np.full(steps, 0.5 * (high - low)))
         for operator, bound in (
             (first, motion.max_rate[quantity] * step_s),
             (second, motion.max_acceleration[quantity] * step_s**2),
@@ -265,7 +270,7 @@ class FollowedContact:
                 joints[number] = flanges[number] = np.nan
                 reachable.append(False)
         joint = joints.reshape(len(sheets), 4, 12)
-        along = np.einsum("ncsx,dx->ncsd", flanges, DIRECTIONS).reshape(len(sheets), 4, -1)
+        along = np.einsum("ncsx,dx->ncsd", flanges, SPEED_DIRECTIONS).reshape(len(sheets), 4, -1)
         values = np.concatenate([joint, along], axis=2)
         slopes = (values[:, 1:] - values[:, :1]) / DEVIATION_M
         count = along.shape[2]
