@@ -21,6 +21,7 @@ from flexsheet.launch.experiments.follow import (
 from flexsheet.launch.experiments.offline import (
     Evaluation,
     Metric,
+    NodeCalibrations,
     OfflineEvaluator,
     exceeded_tolerances,
 )
@@ -49,6 +50,12 @@ FINGERTIP = frozenset({Metric.FINGERTIP})
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return load_scene(ROOT / "launch" / "scenes" / "cylinder.yaml")
+
+
+@pytest.fixture(scope="module")
+def evaluator(scene: Scene) -> OfflineEvaluator:
+    """Return the evaluator with the calibration of the demo's camera."""
+    return OfflineEvaluator(scene, NodeCalibrations.of(load_graph(DEMO)))
 
 
 def changed(scene: Scene, section: str, **values: Any) -> Apparatus:
@@ -189,8 +196,7 @@ def test_robustness_prints_rows_and_summary(
 # Offline evaluation against hand-computed cases
 
 
-def test_a_shifted_camera_shifts_the_fingertip(scene: Scene) -> None:
-    evaluator = OfflineEvaluator(scene)
+def test_a_shifted_camera_shifts_the_fingertip(scene: Scene, evaluator: OfflineEvaluator) -> None:
     nominal = evaluator.evaluate(nominal_apparatus(scene), FINGERTIP)
     shifted = evaluator.evaluate(
         changed(scene, "camera", position_offset_m=[1e-3, 0.0, 0.0]), FINGERTIP
@@ -203,17 +209,19 @@ def test_a_shifted_camera_shifts_the_fingertip(scene: Scene) -> None:
     assert shifted.change_from(nominal)[Metric.FINGERTIP] == pytest.approx(1.0, abs=0.03)
 
 
-def test_a_late_stamp_moves_the_fingertip_by_speed_times_time(scene: Scene) -> None:
-    evaluator = OfflineEvaluator(scene)
+def test_a_late_stamp_moves_the_fingertip_by_speed_times_time(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
     nominal = evaluator.evaluate(nominal_apparatus(scene), FINGERTIP)
     late = evaluator.evaluate(changed(scene, "camera", stamp_offset_s=0.005), FINGERTIP)
     expected_mm = 1e3 * 0.005 * scene.working_range.speed_m_per_s
     assert late.change_from(nominal)[Metric.FINGERTIP] == pytest.approx(expected_mm, rel=0.05)
 
 
-def test_the_nominal_sheet_is_tangent_and_a_shifted_pair_of_arms_is_not(scene: Scene) -> None:
+def test_the_nominal_sheet_is_tangent_and_a_shifted_pair_of_arms_is_not(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
     metrics = frozenset({Metric.SHEET})
-    evaluator = OfflineEvaluator(scene)
     nominal = evaluator.evaluate(nominal_apparatus(scene), metrics)
     bases = {side: {"base_position_offset_m": [0.0, 0.0, 1e-3]} for side in ("left", "right")}
     moved = evaluator.evaluate(changed(scene, "arms", **bases), metrics)
@@ -237,8 +245,9 @@ def test_a_stiffer_sheet_pushes_harder(scene: Scene) -> None:
     np.testing.assert_allclose(stiff.felt_n, 1.1 * nominal.felt_n, rtol=2e-3)
 
 
-def test_parallax_is_that_of_points_behind_the_screen(scene: Scene) -> None:
-    evaluator = OfflineEvaluator(scene)
+def test_parallax_is_that_of_points_behind_the_screen(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
     eye = scene.eyes.centre_world_m
     moved = eye + np.array([0.02, 0.0, 0.0])
     _, points = evaluator._object_points
