@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "topic": ("topic",),
     "bag": ("bag",),
     "arms": ("arms",),
-    "experiment": ("experiment",),
+    "experiment": ("experiment", "experiment_sweeps"),
     "apparatus": ("apparatus",),
     "demo": ("demo",),
     "try": ("trying",),

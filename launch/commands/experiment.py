@@ -68,6 +68,21 @@ MapOption = Annotated[
         help="Image file for a map of the error at each visible point; doubles the duration.",
     ),
 ]
+WorkersOption = Annotated[
+    int,
+    typer.Option(
+        "--workers", min=1, max=64, help="Number of simultaneous trials on this computer."
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a dask.distributed scheduler whose workers run the trials, such as "
+        "tcp://host:8786; default: this computer.",
+    ),
+]
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
@@ -99,6 +114,7 @@ def _record(
     epilog=examples(
         "flexsheet experiment stroke --seconds 30",
         "flexsheet experiment stroke --set triangulator.tracking=none --json",
+        "flexsheet experiment stroke --repeats 10 --ablations --radii --output runs/table-1",
     )
 )
 def stroke(
@@ -106,13 +122,61 @@ def stroke(
     seconds: Annotated[
         float, typer.Option(min=1.0, max=600.0, help="Duration of the motion, s.")
     ] = 10.0,
+    repeats: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=1000,
+            help="Number of strokes, each with another seed in a graph of its own; gives the 95 % "
+            "interval of the mean.",
+        ),
+    ] = 1,
+    ablations: Annotated[
+        bool,
+        typer.Option(
+            "--ablations",
+            help="Also measure without prediction, with each tracking method, with stretch only, "
+            "and at 15, 30 and 60 Hz.",
+        ),
+    ] = False,
+    radii: Annotated[
+        bool, typer.Option("--radii", help="Also measure a cylinder of twice the radius.")
+    ] = False,
+    workers: WorkersOption = 1,
+    scheduler: SchedulerOption = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stroke the cylinder over 60 degrees, and measure the sheet's errors (section V, Table I)."""
+    """Stroke the cylinder over 60 degrees, and measure the sheet's errors (section V, Table I).
+
+    With several strokes or variants, the same --output continues an interrupted sweep.
+    """
+    if repeats > 1 or ablations or radii:
+        from flexsheet.launch.experiments import stroke_table
+
+        folder = make_result_folder(output, "strokes")
+        variants = stroke_table.make_variants(
+            launch_file, folder, apparatus=apparatus, ablations=ablations, radii=radii
+        )
+        with progress_words() as progress:
+            table = stroke_table.run_stroke_table(
+                variants,
+                settings or (),
+                folder,
+                progress,
+                seconds=seconds,
+                repeats=repeats,
+                workers=workers,
+                scheduler=scheduler,
+            )
+        if as_json:
+            print_json(table)
+        else:
+            _print_stroke_table(table)
+        return
     from flexsheet.launch.experiments import stroke as experiment
     from flexsheet.launch.experiments.run import make_stroke_procedure
 
@@ -397,3 +461,28 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
                 row.append(f"{measured['mean']:.3f} ± {measured['std']:.3f}")
         rows.append(row)
     print_table(columns, rows)
+
+
+def _print_stroke_table(table: dict[str, Any]) -> None:
+    """Print one line per variant: means over the strokes with their 95 % intervals."""
+
+    def shown(found: dict[str, Any] | None) -> str:
+        if found is None:
+            return "-"
+        if found["interval"] is None:
+            return f"{found['mean']:.3f}"
+        return f"{found['mean']:.3f} ± {found['interval']:.3f}"
+
+    columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]
+    keys = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
+    print_table(
+        columns,
+        [
+            [row["variant"], row["strokes"], *(shown(row[key]) for key in keys)]
+            for row in table["rows"]
+        ],
+    )
+    for row in table["rows"]:
+        for error in row["failed"]:
+            words.print(f"{row['variant']}: a stroke failed: {error}", markup=False)
+    words.print(f"rows: {table['folder']}")

@@ -165,3 +165,53 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
     panels[0].legend(fontsize=8)
     figure.suptitle("Force of the simulated sheet and of the object")
     figure.savefig(path, dpi=110)
+
+
+SHOWN_PARAMETERS = 30
+METRIC_COLOURS = {
+    "sheet_mm": "C0",
+    "image_mm": "C1",
+    "force_percent": "C2",
+    "fingertip_mm": "C3",
+}
+MIN_SHOWN_RATIO = 1e-3
+
+
+def draw_sensitivity(result: dict[str, Any], path: Path) -> None:
+    """Draw the effects of the most important parameters, over the scene's tolerances.
+
+    A dot is the larger effect of plus and minus one sigma, the line ends at that of three.
+    """
+    shown = result["ranking"][:SHOWN_PARAMETERS]
+    figure = Figure(figsize=(9, 1.4 + 0.32 * max(len(shown), 3)), layout="constrained")
+    axis = figure.subplots()
+    step = 0.8 / len(METRIC_COLOURS)
+    for number, one in enumerate(shown):
+        for line, (metric, colour) in enumerate(METRIC_COLOURS.items()):
+            ratios = {
+                size: max(
+                    (
+                        row[metric] / result["tolerances"][metric]
+                        for row in result["rows"]
+                        if row["parameter"] == one["parameter"]
+                        and abs(row["sigma"]) == size
+                        and row[metric] is not None
+                    ),
+                    default=0.0,
+                )
+                for size in (1.0, 3.0)
+            }
+            if ratios[3.0] < MIN_SHOWN_RATIO:
+                continue
+            at = number + (line - 1.5) * step
+            axis.plot([max(ratios[1.0], MIN_SHOWN_RATIO), ratios[3.0]], [at, at], color=colour)
+            axis.plot([max(ratios[1.0], MIN_SHOWN_RATIO)], [at], "o", color=colour, markersize=3)
+    for metric, colour in METRIC_COLOURS.items():
+        axis.plot([], [], color=colour, label=metric.rpartition("_")[0])
+    axis.axvline(1.0, color="black", linewidth=0.8)
+    axis.set_xscale("log")
+    axis.set_yticks(range(len(shown)), [one["parameter"] for one in shown], fontsize=7)
+    axis.invert_yaxis()
+    axis.set_xlabel("effect over the scene's tolerance: dot 1 σ, end of line 3 σ")
+    axis.legend(fontsize=7, loc="lower right")
+    figure.savefig(path, dpi=110)

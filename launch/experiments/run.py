@@ -35,16 +35,22 @@ def new_folder(name: str, parent: Path = RUNS) -> Path:
     return folder
 
 
-async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start the plan's graph, run the procedure on it and stop it.
-
-    Raises the procedure's errors, and NodeFailedError when a node fails permanently.
-    """
+def require_scene(plan: ResolvedGraph) -> Scene:
+    """Return the graph's scene.  Raises ExperimentError for a graph without one."""
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(
             f'{plan.launch_file}: missing key "scene", which an experiment requires'
         )
+    return scene
+
+
+async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
+    """Start the plan's graph, run the procedure on it and stop it.
+
+    Raises the procedure's errors, and NodeFailedError when a node fails permanently.
+    """
+    scene = require_scene(plan)
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()

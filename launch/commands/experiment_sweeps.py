@@ -1,0 +1,262 @@
+"""`flexsheet experiment robustness`, `sensitivity` and `follow`: truth that differs from belief."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.experiment import (
+    DEMO_FILE,
+    LaunchOption,
+    OutputOption,
+    SchedulerOption,
+    SettingsOption,
+    WorkersOption,
+    make_result_folder,
+    print_followed,
+)
+from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
+from flexsheet.launch.commands.output import (
+    examples,
+    print_json,
+    print_table,
+    progress_words,
+    words,
+)
+from flexsheet.nodes.twin.tolerance_table import Profile
+
+ProfileOption = Annotated[
+    Profile, typer.Option("--profile", help="Equipment of the laboratory that is drawn.")
+]
+CalibratedOption = Annotated[
+    bool,
+    typer.Option(
+        "--calibrated",
+        "--commissioned",
+        help="Draw what remains after the devices' calibration.",
+    ),
+]
+SecondsOption = Annotated[
+    float, typer.Option("--seconds", min=1.0, max=600.0, help="Duration of each stroke, s.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `flexsheet experiment`."""
+    app.command(
+        epilog=examples(
+            "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
+            "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
+        )
+    )(robustness)
+    app.command(
+        epilog=examples(
+            "flexsheet experiment sensitivity --calibrated",
+            "flexsheet experiment sensitivity --parameters sheet.modulus_ratio --json",
+        )
+    )(sensitivity)
+    app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))(
+        follow
+    )
+
+
+def robustness(
+    *,
+    seeds: Annotated[
+        str,
+        typer.Option(
+            "--seeds",
+            metavar="A-B",
+            help="Draws to evaluate; 0-99 are for development, the others for reports.",
+        ),
+    ],
+    profile: ProfileOption = Profile.MODERN,
+    calibrated: CalibratedOption = False,
+    seconds: SecondsOption = 10.0,
+    workers: WorkersOption = 1,
+    scheduler: SchedulerOption = None,
+    keep_bags: Annotated[
+        bool, typer.Option("--keep-bags", help="Keep the bag of each trial in the folder.")
+    ] = False,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Evaluate drawn apparatuses: sheet, fingertip, image and force over many laboratories.
+
+    Each draw is a process of its own with a graph and a stroke. Image and force are evaluated at
+    rest, without the graph. The same --output continues an interrupted sweep.
+    """
+    from flexsheet.launch.experiments import robustness as experiment
+
+    selected = experiment.parse_seeds(seeds)
+    folder = make_result_folder(output, "robustness")
+    with progress_words() as progress:
+        result = experiment.run_robustness(
+            launch_file,
+            settings or (),
+            folder,
+            selected,
+            progress,
+            profile=profile,
+            calibrated=calibrated,
+            seconds=seconds,
+            workers=workers,
+            scheduler=scheduler,
+            keep_bags=keep_bags,
+        )
+    if as_json:
+        print_json(result)
+        return
+    rows = [
+        [
+            row["seed"],
+            *(_shown(row[metric]) for metric in experiment.METRICS),
+            ", ".join(row["out_of_tolerance"]) or "-",
+            ", ".join(row["flagged"]) or "-",
+        ]
+        for row in result["rows"]
+    ]
+    for statistic in ("median", "p95", "worst"):
+        values = [_shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
+        rows.append([statistic, *values, "", ""])
+    print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
+    for one in result["failed"]:
+        words.print(f"seed {one['seed']} failed: {one['error']}", markup=False)
+    words.print(f"rows: {folder}")
+
+
+def sensitivity(
+    *,
+    parameters: Annotated[
+        str | None,
+        typer.Option(
+            "--parameters",
+            metavar="KEY,...",
+            help="Rows of the table of tolerances, separated by commas; default: all.",
+        ),
+    ] = None,
+    with_graph: Annotated[
+        bool,
+        typer.Option(
+            "--graph",
+            help="Also run a graph for the parameters that matter in motion only, such as delays; "
+            "four strokes each.",
+        ),
+    ] = False,
+    profile: ProfileOption = Profile.MODERN,
+    calibrated: CalibratedOption = False,
+    seconds: SecondsOption = 10.0,
+    workers: WorkersOption = 1,
+    scheduler: SchedulerOption = None,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure what each tolerance does alone, at 1 and 3 standard deviations on both sides.
+
+    Without --graph, everything is evaluated at rest. The same --output continues an interrupted
+    sweep.
+    """
+    from flexsheet.launch.experiments import sensitivity as experiment
+    from flexsheet.launch.experiments.pictures import draw_sensitivity
+
+    selected = experiment.select_parameters(parameters)
+    folder = make_result_folder(output, "sensitivity")
+    image = folder / "sensitivity.png"
+    with progress_words() as progress:
+        result = experiment.run_sensitivity(
+            launch_file,
+            settings or (),
+            folder,
+            selected,
+            progress,
+            profile=profile,
+            calibrated=calibrated,
+            with_graph=with_graph,
+            seconds=seconds,
+            workers=workers,
+            scheduler=scheduler,
+        )
+        draw_sensitivity(result, image)
+    if as_json:
+        print_json({**result, "picture": str(image)})
+        return
+    metrics = list(result["tolerances"])
+    largest = {
+        parameter: [
+            _shown(max((abs(row[one]) for row in rows if row[one] is not None), default=None))
+            for one in metrics
+        ]
+        for parameter in (row["parameter"] for row in result["ranking"])
+        if (
+            rows := [
+                row
+                for row in result["rows"]
+                if row["parameter"] == parameter and abs(row["sigma"]) == 1.0
+            ]
+        )
+    }
+    print_table(
+        ["parameter", "worst over tolerance", *(f"{one} at 1 σ" for one in metrics)],
+        [
+            [one["parameter"], f"{one['share']:.2f}", *largest[one["parameter"]]]
+            for one in result["ranking"]
+        ],
+    )
+    for name in ("not_measured", "not_simulated"):
+        listed = dict.fromkeys(
+            row["parameter"] for row in result["rows"] if row["evaluation"] == name
+        )
+        if listed:
+            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}", markup=False)
+    words.print(f"image: {image}")
+
+
+def follow(
+    *,
+    finger_path: Annotated[
+        str,
+        typer.Option(
+            "--finger-path",
+            metavar="NAME_OR_FILE",
+            help="CSV file of a recorded finger (columns t_s,x_mm,y_mm,z_mm), or a gesture.",
+            autocompletion=complete.gestures,
+        ),
+    ],
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Follow a recorded finger, and compare with what the arms' limits allow.
+
+    The lower bound is the smallest mean error of arms that know the whole recording in advance.
+    """
+    from flexsheet.launch.experiments import follow as experiment
+    from flexsheet.launch.experiments.gestures import finger_path as load_path
+
+    path = load_path(launch_file, finger_path)
+    bag = make_result_folder(output, "follow") / "follow.mcap"
+    with progress_words() as progress:
+        result = experiment.run_follow(
+            launch_file, settings or (), bag, path, progress, apparatus=apparatus
+        )
+    if as_json:
+        print_json(result)
+        return
+    print_followed([result])
+    bound = result["lower_bound_mm"]
+    words.print(
+        f"lower bound of the arms: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
+    )
+    words.print(f"bag: {bag}")
+
+
+def _shown(value: Any) -> str:
+    return "-" if value is None else f"{value:.3g}"

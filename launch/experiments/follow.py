@@ -1,0 +1,410 @@
+"""Follow a recorded finger, and bound what arms with the same limits could do at best.
+
+The bound is the optimum of a linear program over the whole recording. It assumes that
+
+- the future of the finger is known, so delays, tracking and prediction cost nothing;
+- the sheet rolls on the undeformed object without slip, with a constant stretch;
+- joints obey their ranges, speeds and accelerations, and flanges the scene's tool speed; there is
+  no servo lag, and no limit of the jerk;
+- outside of contact the sheet may move as it likes;
+- small deviations of the contact move the joints linearly.
+
+Limits on means over a time step and on second differences are implied by the limits themselves, and
+lengths are measured from below. Windows of the recording are independent. All three only make the
+bound smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, diags_array, hstack, kron, vstack
+
+from flexsheet.launch.bags.report.followed import MAX_CONTACT_HEIGHT_M
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.demo import read_followed_path
+from flexsheet.launch.experiments.gestures import read_gestures
+from flexsheet.launch.experiments.run import (
+    Progress,
+    make_stroke_procedure,
+    require_scene,
+    run_experiment,
+)
+from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges, pose_matrix
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.models.rigid import apply, inverse, rotation_from_vector, transform
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.twin.arms import (
+    ACCELERATION_RAD_PER_S2,
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    forward,
+)
+from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
+from flexsheet.nodes.twin.paths import map_to_surface
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+STEP_S = 1.0 / 30.0
+"""Time step of the bound."""
+
+WINDOW_STEPS = 60
+"""Steps of a window; the time of a solution grows faster than their number."""
+
+MAX_DEVIATION_M = 0.05
+DEVIATION_M = 1e-4
+"""Displacement of the contact by which the joints' slopes are computed."""
+
+ROLL_STEPS = 40
+
+DIRECTIONS = np.array(
+    [one for one in product((-1.0, 0.0, 1.0), repeat=3) if any(one)], dtype=np.float64
+)
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+"""Unit vectors (26, 3). The largest component along them is at least 0.91 of a vector's length."""
+
+SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
+SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
+"""Unit vectors (7, 3) along which the tool speed is limited, in both senses."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimitedMotion:
+    """Quantities of a mechanism over time, linear in deviations from a nominal motion.
+
+    values: (n, m) of the nominal motion. slopes: (n, m, k) by the deviations (k,). max_rate,
+    max_acceleration: (m,), infinite where there is no limit. low, high: (m,), range.
+    """
+
+    values: Floats
+    slopes: Floats
+    max_rate: Floats
+    max_acceleration: Floats
+    low: Floats
+    high: Floats
+
+
+def find_least_deviation(
+    motion: LimitedMotion, weights: Floats, step_s: float, *, max_deviation: float
+) -> Floats | None:
+    """Return lengths (n,) of the deviations that minimize the weighted mean length.
+
+    weights: (n,), zero where a deviation does not count. The lengths are lower bounds, of which the
+    mean is a bound of the mean. None if no motion fulfils the limits.
+    """
+    steps, _, deviations = motion.slopes.shape
+    scale = max_deviation
+    rows: list[Any] = []
+    limits: list[Floats] = []
+
+    def add(operator: Any, nominal: Floats, bound: Floats) -> None:
+        """Limit |nominal + operator e| to bound; nominal, bound: (rows,)."""
+        known = np.isfinite(bound)
+        kept = operator[known]
+        rows.extend((kept, -kept))
+        limits.extend((bound[known] - nominal[known], bound[known] + nominal[known]))
+
+    first, second = _differences(steps, 1), _differences(steps, 2)
+    for quantity in range(motion.values.shape[1]):
+        value = motion.values[:, quantity]
+        to_value = _block_rows(motion.slopes[:, quantity, :] * scale)
+        low, high = motion.low[quantity], motion.high[quantity]
+        if np.isfinite([low, high]).all():
+            add(to_value, value - 0.5 * (low + high), np.full(steps, 0.5 * (high - low)))
+        for operator, bound in (
+            (first, motion.max_rate[quantity] * step_s),
+            (second, motion.max_acceleration[quantity] * step_s**2),
+        ):
+            if np.isfinite(bound):
+                add(operator @ to_value, operator @ value, np.full(operator.shape[0], bound))
+    count = steps * deviations
+    limited = csr_array(vstack(rows)) if rows else csr_array((0, count))
+    directions = _directions(deviations)
+    lengths = csr_array(kron(diags_array(np.ones(steps)), directions))
+    owners = csr_array(kron(diags_array(np.ones(steps)), np.ones((len(directions), 1))))
+    upper = vstack(
+        [
+            hstack([limited, csr_array((limited.shape[0], steps))]),
+            hstack([lengths, -owners]),
+        ]
+    )
+    total = max(float(weights.sum()), 1.0)
+    solved = linprog(
+        np.concatenate([np.zeros(count), weights / total]),
+        A_ub=csr_array(upper),
+        b_ub=np.concatenate([*limits, np.zeros(lengths.shape[0])]),
+        bounds=[(-1.0, 1.0)] * count + [(0.0, None)] * steps,
+        method="highs",
+    )
+    if solved.x is None or solved.status != 0:
+        return None
+    return np.asarray(scale * solved.x[count:])
+
+
+def _directions(count: int) -> Floats:
+    if count == 3:
+        return DIRECTIONS
+    return np.concatenate([np.eye(count), -np.eye(count)])
+
+
+def _differences(steps: int, order: int) -> csr_array:
+    """Return the operator of differences of an order over time, (steps - order, steps)."""
+    return csr_array(np.diff(np.eye(steps), n=order, axis=0))
+
+
+def _block_rows(rows: Floats) -> csr_array:
+    """Return (n, n k) with the rows (n, k) as blocks of a diagonal."""
+    steps, width = rows.shape
+    columns = np.arange(steps * width)
+    owners = np.repeat(np.arange(steps), width)
+    return csr_array((rows.ravel(), (owners, columns)), shape=(steps, steps * width))
+
+
+@dataclass(frozen=True, slots=True)
+class RolledSheet:
+    """A sheet that touches the object: point and rotation in the object's frame, and the point of
+    the sheet (x, y, 0) that touches.
+    """
+
+    point: Floats
+    rotation: Floats
+    on_sheet_m: Floats
+
+    def pose(self, lifted_m: float = 0.0) -> Floats:
+        """Return object_from_sheet (4, 4), lifted along the sheet's normal."""
+        contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
+        return transform(self.rotation, self.point - self.rotation @ contact)
+
+    def rolled_to(self, point: Floats, normal: Floats) -> RolledSheet:
+        """Return the sheet after rolling without slip to a near point with that normal."""
+        before = self.rotation[:, 2]
+        axis = np.cross(before, normal)
+        sine, cosine = float(np.linalg.norm(axis)), float(before @ normal)
+        turn = np.eye(3)
+        if sine > 0.0:
+            turn = rotation_from_vector(axis * (np.arctan2(sine, cosine) / sine))
+        half = rotation_from_vector(
+            np.zeros(3) if sine == 0.0 else axis * (0.5 * np.arctan2(sine, cosine) / sine)
+        )
+        moved = (half @ self.rotation).T @ (point - self.point)
+        on_sheet = self.on_sheet_m + np.array([moved[0], moved[1], 0.0])
+        return RolledSheet(point, turn @ self.rotation, on_sheet)
+
+
+class FollowedContact:
+    """The sheet that follows a finger exactly, and its reaction to deviations of the contact."""
+
+    def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
+        true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
+        self._scene = true_scene
+        self._shape = make_shape(dict(scene.object.geometry))
+        self._world_from_object = pose_matrix(scene.object.world_from_object)
+        self._arms = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
+        low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
+        self._distance_m = scene.sheet.width_m * 0.5 * (low + high)
+
+    def contact_heights_m(self, positions_world: Floats) -> Floats:
+        """Return the heights (n,) of fingertips above the undeformed object."""
+        local = apply(inverse(self._world_from_object), positions_world)
+        return self._shape.closest(local).height_m
+
+    def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
+        """Return the sheet below each finger position (n, 3), rolled there from the front."""
+        object_from_world = inverse(self._world_from_object)
+        front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
+        front, above = apply(object_from_world, front_world)
+        normal = (above - front) / np.linalg.norm(above - front)
+        x_axis = object_from_world[:3, 0] - normal * float(object_from_world[:3, 0] @ normal)
+        x_axis /= np.linalg.norm(x_axis)
+        rotation = np.column_stack([x_axis, np.cross(normal, x_axis), normal])
+        sheet = RolledSheet(front, rotation, np.zeros(3))
+        targets = apply(object_from_world, positions_world)
+        ahead = np.linspace(front, targets[0], ROLL_STEPS + 1)[1:-1]
+        for at in ahead:
+            sheet = self._roll(sheet, at)
+        sheets = []
+        for at in targets:
+            sheet = self._roll(sheet, at)
+            sheets.append(sheet)
+        return sheets
+
+    def _roll(self, sheet: RolledSheet, position: Floats) -> RolledSheet:
+        found = self._shape.closest(position, previous=sheet.point)
+        return sheet.rolled_to(found.point, found.normal)
+
+    def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
+        """Return joints and flange positions over the deviation of the contact.
+
+        The deviation is that along the sheet's x and y over the object, and along its normal, m.
+        reachable gets whether the arms reach each nominal sheet; the values of others are NaN.
+        """
+        joints = np.full((len(sheets), 4, 2, 6), np.nan)
+        flanges = np.full((len(sheets), 4, 2, 3), np.nan)
+        guesses = [START_GUESS_RAD, START_GUESS_RAD]
+        for number, sheet in enumerate(sheets):
+            try:
+                for case, pose in enumerate(self._deviated(sheet)):
+                    edges = place_edges(self._world_from_object @ pose, self._distance_m)
+                    for side, (arm, edge) in enumerate(zip(self._arms, edges, strict=True)):
+                        found = arm.solve_joints(edge, guesses[side])
+                        if case == 0:
+                            guesses[side] = found
+                        joints[number, case, side] = found
+                        flange = arm.world_from_base @ forward(found)
+                        flanges[number, case, side] = flange[:3, 3]
+                reachable.append(True)
+            except ValueError:
+                joints[number] = flanges[number] = np.nan
+                reachable.append(False)
+        joint = joints.reshape(len(sheets), 4, 12)
+        along = np.einsum("ncsx,dx->ncsd", flanges, SPEED_DIRECTIONS).reshape(len(sheets), 4, -1)
+        values = np.concatenate([joint, along], axis=2)
+        slopes = (values[:, 1:] - values[:, :1]) / DEVIATION_M
+        count = along.shape[2]
+        free = np.full(count, np.inf)
+        return LimitedMotion(
+            values=values[:, 0],
+            slopes=slopes.transpose(0, 2, 1),
+            max_rate=np.concatenate(
+                [
+                    np.tile(SPEED_RAD_PER_S, 2),
+                    np.full(count, self._scene.arms.max_tool_speed_m_per_s),
+                ]
+            ),
+            max_acceleration=np.concatenate([np.tile(ACCELERATION_RAD_PER_S2, 2), free]),
+            low=np.concatenate([np.tile(RANGE_RAD[:, 0], 2), -free]),
+            high=np.concatenate([np.tile(RANGE_RAD[:, 1], 2), free]),
+        )
+
+    def _deviated(self, sheet: RolledSheet) -> list[Floats]:
+        """Return the nominal pose, and those deviated along x, y and the normal."""
+        poses = [sheet.pose()]
+        for axis in range(2):
+            found = self._shape.closest(
+                sheet.point + DEVIATION_M * sheet.rotation[:, axis], previous=sheet.point
+            )
+            poses.append(sheet.rolled_to(found.point, found.normal).pose())
+        return [*poses, sheet.pose(DEVIATION_M)]
+
+
+def bound_errors(
+    scene: Scene,
+    times_s: Floats,
+    positions_world: Floats,
+    progress: Progress = lambda text: None,
+    *,
+    apparatus: Apparatus | None = None,
+    step_s: float = STEP_S,
+) -> dict[str, Any]:
+    """Return the lower bound of the contact error of a finger path, in mm.
+
+    times_s: (n,), increasing. positions_world: (n, 3) of the true fingertip.  mean, p95: over the
+    steps in contact; p95 is that of the motion with the least mean. Steps where the arms do not
+    reach the exact sheet, and windows without a solution, count as zero.
+    Raises ExperimentError for a path without contact.
+    """
+    followed = FollowedContact(scene, apparatus)
+    grid = np.arange(times_s[0], times_s[-1], step_s)
+    positions = np.column_stack([np.interp(grid, times_s, column) for column in positions_world.T])
+    contact = followed.contact_heights_m(positions) <= MAX_CONTACT_HEIGHT_M
+    if not contact.any():
+        raise ExperimentError(
+            "the finger path never touches the object, so the bound has no samples; give a path "
+            "in contact"
+        )
+    # The sheet is free outside of contact, so a smooth nominal motion is best for the slopes.
+    touching = PchipInterpolator(grid[contact], positions[contact]) if contact.sum() > 1 else None
+    nominal = positions[contact][:1].repeat(len(grid), axis=0)
+    if touching is not None:
+        nominal = touching(np.clip(grid, grid[contact][0], grid[contact][-1]))
+    reachable: list[bool] = []
+    motion = followed.limit(followed.roll_along(nominal), reachable)
+    lengths = np.zeros(len(grid))
+    unsolved = 0
+    windows = _windows(np.array(reachable))
+    for number, window in enumerate(windows):
+        progress(f"lower bound: {number + 1} of {len(windows)} windows")
+        part = LimitedMotion(
+            motion.values[window],
+            motion.slopes[window],
+            motion.max_rate,
+            motion.max_acceleration,
+            motion.low,
+            motion.high,
+        )
+        weights = contact[window].astype(np.float64)
+        if not weights.any():
+            continue
+        found = find_least_deviation(part, weights, step_s, max_deviation=MAX_DEVIATION_M)
+        if found is None:
+            unsolved += 1
+        else:
+            lengths[window] = found
+    errors_mm = 1e3 * lengths[contact]
+    return {
+        "mean": float(errors_mm.mean()),
+        "p95": float(np.quantile(errors_mm, 0.95)),
+        "steps": int(contact.sum()),
+        "steps_out_of_reach": int((contact & ~np.array(reachable)).sum()),
+        "windows": len(windows),
+        "windows_without_solution": unsolved,
+    }
+
+
+def _windows(reachable: Bools) -> list[slice]:
+    """Return intervals of at most WINDOW_STEPS consecutive reachable steps, with three or more."""
+    changes = np.flatnonzero(np.diff(reachable.astype(int))) + 1
+    ends = [0, *changes.tolist(), len(reachable)]
+    windows = []
+    for begin, end in pairwise(ends):
+        if reachable[begin]:
+            cuts = [*range(begin, end, WINDOW_STEPS), end]
+            windows += [slice(one, other) for one, other in pairwise(cuts) if other - one >= 3]
+    return windows
+
+
+def run_follow(
+    launch_file: Path,
+    settings: Sequence[str],
+    bag: Path,
+    path: FingerPath,
+    progress: Progress,
+    *,
+    apparatus: str | None = None,
+) -> dict[str, Any]:
+    """Follow a path in a graph; return the results of `experiment follow --json`."""
+    plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
+    scene, truth = require_scene(plan), plan.apparatus_message()
+    procedure = make_stroke_procedure([], progress, path=path)
+    run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+    followed = read_followed_path(bag, path.label)
+    recorded = read_gestures(bag)
+    begin_ns, end_ns = recorded.windows_ns[path.label]
+    inside = (recorded.truth.times_ns >= begin_ns) & (recorded.truth.times_ns <= end_ns)
+    times_s = (recorded.truth.times_ns[inside] - begin_ns) * 1e-9
+    bound = bound_errors(
+        scene, times_s, recorded.truth.positions[inside], progress, apparatus=truth
+    )
+    contact = followed["contact"]["true_delta_d_mm"]
+    return {
+        **followed,
+        "lower_bound_mm": bound,
+        "mean_over_bound": (
+            contact["mean"] / bound["mean"] if contact and bound["mean"] > 0.0 else None
+        ),
+        "apparatus": "nominal" if truth is None else truth.origin,
+        "bag": str(bag),
+    }

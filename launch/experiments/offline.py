@@ -1,0 +1,454 @@
+"""Evaluate an apparatus without a graph: fingertip, sheet, image and felt force at rest.
+
+The nodes' methods get what the scene states, and the simulator's models get what is true. Nothing
+moves, so servo lag, delays, frame rate, tremor and backlash have no effect here; a graph measures
+those. Images have no noise. The references share no code with the methods: own camera, arms,
+membrane and eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.stroke import project_presented_point
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges, pose_matrix
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
+from flexsheet.nodes import node_class
+from flexsheet.nodes.models.rigid import apply, inverse, transform
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
+from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import estimate_sheet
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.twin import rig
+from flexsheet.nodes.twin.error_map import error_map
+from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
+from flexsheet.nodes.twin.membrane import NotConvergedError, solve
+from flexsheet.nodes.twin.nail import Nail
+from flexsheet.nodes.twin.paths import map_to_surface, touchable
+from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.true_object import TrueBody
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+
+METRES_PER_PX = 0.0007
+"""Resolution of the paper's images."""
+
+STROKE_RATIOS = (0.0, 0.5, 1.0)
+"""Positions of the finger around the object, over the length that a finger can stroke upwards."""
+
+MAX_FORCE_DEPTHS_M = (0.004, 0.016)
+"""Depths of the pushes whose force is compared; limited to half and all of the scene's depth."""
+
+MIN_FORCE_N = 0.1
+"""Smallest force to which an error is related; nobody feels a fraction of a smaller one."""
+
+MAX_IMAGE_DEPTH_M = 0.03
+RENDERER_SPACING_M = 0.0025
+UNIT_COVARIANCE_PX2 = np.eye(2)
+
+
+class Metric(StrEnum):
+    """Name what is evaluated, as in the results."""
+
+    SHEET = "sheet_mm"
+    IMAGE = "image_mm"
+    FORCE = "force_percent"
+    FINGERTIP = "fingertip_mm"
+
+
+ALL_METRICS = frozenset(Metric)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCalibrations:
+    """Calibrations that the nodes of a graph use, beside the scene."""
+
+    stereo: StereoCalibration | None = None
+    sheet: SheetCalibration | None = None
+
+    @staticmethod
+    def of(plan: ResolvedGraph) -> NodeCalibrations:
+        """Read the calibration files of the graph's triangulator and planner."""
+        stereo: StereoCalibration | None = None
+        sheet: SheetCalibration | None = None
+        for node in plan.nodes.values():
+            kind = node_class(node.type)
+            if issubclass(kind, node_class("triangulator")) and node.parameters["calibration"]:
+                stereo = load_calibration(Path(node.parameters["calibration"]))
+            if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
+                sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
+        return NodeCalibrations(stereo, sheet)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Errors of one apparatus; None where a metric was not evaluated.
+
+    fingertip_m: (n, 3), measured minus true fingertip. sheet_m: (n, 3), point of the object under
+    the true finger minus the sheet's contact point. image_m: (rows, columns, 2) per case, NaN where
+    nothing is seen. felt_n, expected_n: (k,), force of the true sheet, and what the planner's
+    model of the sheet gives for the same push.
+    """
+
+    fingertip_m: Floats | None = None
+    sheet_m: Floats | None = None
+    image_m: tuple[Floats, ...] | None = None
+    felt_n: Floats | None = None
+    expected_n: Floats | None = None
+
+    def figures(self) -> dict[str, float | None]:
+        """Return the absolute errors: mean lengths, root mean square of the image, mean ratio."""
+        return {
+            Metric.SHEET: _mean_length_mm(self.sheet_m),
+            Metric.IMAGE: None if self.image_m is None else _rms_mm(self.image_m),
+            Metric.FORCE: self._force_percent(1.0),
+            Metric.FINGERTIP: _mean_length_mm(self.fingertip_m),
+        }
+
+    def change_from(self, other: Evaluation) -> dict[str, float | None]:
+        """Return by how much another evaluation of the same cases differs, in the same units.
+
+        Differences are taken of each vector, pixel and push, so that common errors cancel.
+        """
+        image = None
+        if self.image_m is not None and other.image_m is not None:
+            pairs = zip(self.image_m, other.image_m, strict=True)
+            image = _rms_mm(tuple(one - before for one, before in pairs))
+        ratio: Floats | float = 1.0
+        if other.felt_n is not None and other.expected_n is not None:
+            ratio = other.felt_n / np.maximum(other.expected_n, MIN_FORCE_N)
+        return {
+            Metric.SHEET: _mean_length_mm(_difference(self.sheet_m, other.sheet_m)),
+            Metric.IMAGE: image,
+            Metric.FORCE: self._force_percent(ratio),
+            Metric.FINGERTIP: _mean_length_mm(_difference(self.fingertip_m, other.fingertip_m)),
+        }
+
+    def _force_percent(self, reference_ratio: Floats | float) -> float | None:
+        if self.felt_n is None or self.expected_n is None:
+            return None
+        expected_n = np.maximum(self.expected_n, MIN_FORCE_N)
+        return 100.0 * float(np.abs(self.felt_n / expected_n - reference_ratio).mean())
+
+
+def _difference(one: Floats | None, other: Floats | None) -> Floats | None:
+    return None if one is None or other is None else one - other
+
+
+def _mean_length_mm(vectors_m: Floats | None) -> float | None:
+    if vectors_m is None:
+        return None
+    return 1e3 * float(np.linalg.norm(vectors_m, axis=1).mean())
+
+
+def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
+    """Return the root mean square over all seen points of all maps; None if nothing is seen."""
+    squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
+    squares = squares[np.isfinite(squares)]
+    return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A sheet in contact: pose (4, 4), and the finger's point on the undeformed object (3,)."""
+
+    world_from_sheet: Floats
+    point: Floats
+
+    @property
+    def normal(self) -> Floats:
+        return np.asarray(self.world_from_sheet[:3, 2])
+
+
+class OfflineEvaluator:
+    """Evaluate apparatuses of one scene.
+
+    Raises ExperimentError where the sheet or the arms have no solution.
+    """
+
+    def __init__(self, scene: Scene, calibrations: NodeCalibrations | None = None) -> None:
+        given = calibrations or NodeCalibrations()
+        self._scene = scene
+        self._geometry = StereoGeometry.of(scene.camera, given.stereo)
+        self._force_model = make_force_model(scene.sheet, given.sheet)
+        self._shape = make_shape(dict(scene.object.geometry))
+        self._world_from_object = pose_matrix(scene.object.world_from_object)
+        low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
+        self._stretch_ratio = 0.5 * (low + high)
+        half_m = 0.5 * touchable(scene)[1]
+        self._places_m = [ratio * half_m for ratio in STROKE_RATIOS]
+
+    @cached_property
+    def _renderer(self) -> SceneRenderer:
+        basis = deflection_cache.load_or_compute(self._scene, None)
+        return SceneRenderer(
+            self._scene, headless_context(), spacing_m=RENDERER_SPACING_M, basis=basis
+        )
+
+    def evaluate(
+        self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
+    ) -> Evaluation:
+        """Evaluate the named metrics of an apparatus."""
+        try:
+            return self._evaluate(apparatus, metrics)
+        except (NotConvergedError, ValueError) as error:
+            raise ExperimentError(f"apparatus {apparatus.origin}: {error}") from error
+
+    def _evaluate(self, apparatus: Apparatus, metrics: frozenset[Metric]) -> Evaluation:
+        scene = apply_apparatus(self._scene, apparatus)
+        contacts = [self._touch(place_m) for place_m in self._places_m]
+        tip_errors = self._measure_fingertips(scene, apparatus, contacts)
+        arms = ArmPair(self._scene, apparatus)
+        sheet = image = felt = expected = None
+        if Metric.SHEET in metrics:
+            sheet = np.array(
+                [self._sheet_error(arms, *pair) for pair in zip(contacts, tip_errors, strict=True)]
+            )
+        if Metric.FORCE in metrics:
+            felt, expected = self._compare_forces(scene, apparatus, arms, tip_errors[0])
+        if Metric.IMAGE in metrics:
+            image = self._compare_images(scene, apparatus, arms, tip_errors[0])
+        fingertip = tip_errors if Metric.FINGERTIP in metrics else None
+        return Evaluation(fingertip, sheet, image, felt, expected)
+
+    def _touch(self, around_m: float) -> Contact:
+        """Return the sheet that has rolled from the front to a place around the object."""
+        places = np.array([[0.0, around_m, 0.0], [0.0, around_m, 1e-3]])
+        point, above = map_to_surface(self._scene, places)
+        return self._lay_sheet(point, (above - point) / 1e-3, np.array([0.0, around_m, 0.0]))
+
+    @staticmethod
+    def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
+        """Return the sheet with a normal that touches `point` with its point `on_sheet_m`."""
+        x_axis = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
+        x_axis /= np.linalg.norm(x_axis)
+        rotation = np.column_stack([x_axis, np.cross(normal, x_axis), normal])
+        return Contact(transform(rotation, point - rotation @ on_sheet_m), point)
+
+    def _measure_fingertips(
+        self, scene: Scene, apparatus: Apparatus, contacts: list[Contact]
+    ) -> Floats:
+        """Return measured minus true fingertips (n, 3): the true rig, the nodes' triangulation.
+
+        The finger strokes upwards at the scene's working speed, so that a wrong stamp and a skew
+        of the two exposures count.
+        """
+        camera = rig.make_true_camera(scene.camera)
+        left_from_world = inverse(pose_matrix(camera.world_from_left))
+        offset_m = Nail.of(apparatus.finger).marker_offset_m
+        errors = []
+        for contact in contacts:
+            velocity = self._scene.working_range.speed_m_per_s * contact.world_from_sheet[:3, 1]
+            times_s = apparatus.camera.stamp_offset_s + np.array([0.0, apparatus.camera.skew_s])
+            markers = contact.point + offset_m + times_s[:, None] * velocity
+            in_left = apply(left_from_world, markers)
+            in_right = apply(camera.right_from_left, in_left)
+            pixels = [
+                rig.pixels_of(lens, rays[:2] / rays[2])
+                for lens, rays in ((camera.left, in_left[0]), (camera.right, in_right[1]))
+            ]
+            found = measure(
+                self._geometry,
+                pixels[0],
+                pixels[1],
+                method=dlt,
+                left_covariance=UNIT_COVARIANCE_PX2,
+                right_covariance=UNIT_COVARIANCE_PX2,
+            )
+            if found is None:
+                raise ExperimentError(
+                    f"apparatus {apparatus.origin}: a fingertip at {contact.point} m cannot be "
+                    "triangulated; check the camera's offsets"
+                )
+            errors.append(found.point_world - contact.point)
+        return np.array(errors)
+
+    def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
+        width_m = self._scene.sheet.width_m * self._stretch_ratio
+        return place_edges(contact.world_from_sheet, width_m)
+
+    def _sheet_error(self, arms: ArmPair, contact: Contact, tip_error: Floats) -> Floats:
+        """Return the point under the true finger minus the sheet's contact point, (3,), world."""
+        object_from_world = inverse(self._world_from_object)
+        foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
+        believed = apply(self._world_from_object, foot.point)
+        normal = self._world_from_object[:3, :3] @ foot.normal
+        before = contact.world_from_sheet
+        rolled_m = before[:3, :3].T @ (believed - before[:3, 3])
+        rolled_m[2] = 0.0
+        left, right = arms.hold(self._edges(self._lay_sheet(believed, normal, rolled_m)))
+        plane = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
+        plane /= np.linalg.norm(plane)
+        centre = apply(object_from_world, 0.5 * (left[:3, 3] + right[:3, 3]))
+        true_foot = self._shape.closest(apply(object_from_world, contact.point)[None])
+        presented = project_presented_point(
+            true_foot, centre[None], (object_from_world[:3, :3] @ plane)[None]
+        )
+        error = (true_foot.point - presented)[0]
+        return np.asarray(self._world_from_object[:3, :3] @ error)
+
+    def _compare_forces(
+        self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the felt forces (k,) and those of the planner's model at the same pushes, N."""
+        contact = self._touch(0.0)
+        left, right = arms.hold(self._edges(contact))
+        most_m = self._scene.working_range.push_depth_m
+        felt, expected = [], []
+        for depth_m, limit_m in zip(MAX_FORCE_DEPTHS_M, (0.5 * most_m, most_m), strict=True):
+            true_m = min(depth_m, limit_m)
+            pushed = solve(
+                true_rubber(scene.sheet, apparatus),
+                left,
+                right,
+                finger_tip=contact.point - true_m * contact.normal,
+                finger_radius_m=scene.finger.radius_m,
+            )
+            felt.append(float(pushed.finger_force_n @ contact.normal))
+            believed_m = true_m - float(tip_error @ contact.normal)
+            model = self._force_model.evaluate(
+                self._stretch_ratio,
+                np.array([max(believed_m, 1e-4)]),
+                position_m=(0.0, 0.0),
+                finger_radius_m=self._scene.finger.radius_m,
+            )
+            expected.append(float(model.force_n[0]))
+        return np.array(felt), np.array(expected)
+
+    def _compare_images(
+        self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
+    ) -> tuple[Floats, ...]:
+        """Return the error maps of a tilted and of a pushed sheet."""
+        tilted, upright = self._touch(self._places_m[-1]), self._touch(0.0)
+        depth_m = min(MAX_IMAGE_DEPTH_M, self._scene.working_range.push_depth_m)
+        tip = upright.point - depth_m * upright.normal
+        return (
+            self._map_errors(scene, apparatus, arms, contact=tilted, tip=None, tip_error=tip_error),
+            self._map_errors(scene, apparatus, arms, contact=upright, tip=tip, tip_error=tip_error),
+        )
+
+    def _map_errors(
+        self,
+        scene: Scene,
+        apparatus: Apparatus,
+        arms: ArmPair,
+        *,
+        contact: Contact,
+        tip: Floats | None,
+        tip_error: Floats,
+    ) -> Floats:
+        edges = self._edges(contact)
+        believed = estimate_sheet(
+            *edges,
+            height_m=self._scene.sheet.height_m,
+            twist_world=np.zeros(6),
+            ahead_s=0.0,
+            finger_tip=None if tip is None else tip + tip_error,
+        )
+        assert believed is not None
+        ramps = draw_coordinate_ramps(self._renderer, "two_pass", believed)
+        true_edges = arms.hold(edges)
+        sheet = solve(
+            true_rubber(scene.sheet, apparatus),
+            *true_edges,
+            finger_tip=tip,
+            finger_radius_m=scene.finger.radius_m,
+        )
+        eye = scene.eyes.centre_world_m
+        x, y = (seen(one, sheet, scene, eye=eye, metres_per_px=METRES_PER_PX) for one in ramps)
+        errors = error_map(x, y, METRES_PER_PX).errors_m
+        return self._correct_parallax(errors, eye)
+
+    def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
+        """Return the errors against the object as the true eye should see it.
+
+        The drawn positions are those that the eye of the scene sees on the screen plane. Another
+        eye should see the same points of the object elsewhere on it.
+        """
+        believed_eye = self._scene.eyes.centre_world_m
+        if np.array_equal(eye, believed_eye):
+            return errors_m
+        shifts = self._parallax(eye)
+        size = len(errors_m)
+        at = (np.arange(size) + 0.5 * (1 - size)) * METRES_PER_PX
+        x, y = np.meshgrid(at, -at)
+        drawn = np.stack([x, y], axis=-1) - errors_m
+        known = np.isfinite(drawn).all(axis=2)
+        column = np.rint(drawn[known][:, 0] / METRES_PER_PX + 0.5 * (size - 1)).astype(int)
+        row = np.rint(0.5 * (size - 1) - drawn[known][:, 1] / METRES_PER_PX).astype(int)
+        inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+        found = np.full((len(row), 2), np.nan)
+        found[inside] = shifts[row[inside], column[inside]]
+        corrected = errors_m.copy()
+        corrected[known] -= found
+        return corrected
+
+    def _parallax(self, eye: Floats) -> Floats:
+        """Return (rows, columns, 2) m: by how much points of the object move on the screen plane.
+
+        Rows and columns are those of the image of the scene's eye; NaN where it sees no object.
+        """
+        on_screen, points = self._object_points
+        to_screen = eye[2] / (eye[2] - points[..., 2:])
+        return np.asarray(eye[:2] + (points[..., :2] - eye[:2]) * to_screen - on_screen)
+
+    @cached_property
+    def _object_points(self) -> tuple[Floats, Floats]:
+        """Return what the scene's eye sees at each pixel of the measuring camera.
+
+        That is the point on the screen plane (rows, columns, 2), and that of the object behind it
+        (rows, columns, 3), NaN where there is none.
+        """
+        size = round(2.0 * HALF_WINDOW_M / METRES_PER_PX)
+        rays = eye_rays(
+            self._scene.eyes.centre_world_m,
+            metres_per_px=METRES_PER_PX,
+            size=size,
+            box=(0, 0, size, size),
+            samples=1,
+        )
+        body = TrueBody(self._scene).at_rest()
+        hits = first_hits(rays, body.vertices, body.triangles)
+        hit = hits.triangle >= 0
+        directions = rays.directions()
+        points = np.full((size, size, 3), np.nan)
+        points[hit] = rays.origin + directions[hit] / hits.inverse_range[hit][:, None]
+        return (rays.origin + directions)[..., :2], points
+
+
+def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
+    """Return the metrics whose errors exceed the scene's tolerances."""
+    limits = metric_tolerances(scene)
+    return [
+        metric.value
+        for metric, limit in limits.items()
+        if figures.get(metric) is not None and figures[metric] > limit
+    ]
+
+
+def metric_tolerances(scene: Scene) -> dict[Metric, float]:
+    """Return the scene's tolerance of each metric, in the metric's unit."""
+    given = scene.tolerances
+    return {
+        Metric.SHEET: 1e3 * given.sheet_position_m,
+        Metric.IMAGE: 1e3 * given.image_m,
+        Metric.FORCE: 100.0 * given.force_ratio,
+        Metric.FINGERTIP: 1e3 * given.fingertip_m,
+    }

@@ -1,0 +1,43 @@
+"""Choose free ports for the simulated arms, so that several graphs run on one computer."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.nodes import NodeRole, node_class
+
+LOOPBACK = "127.0.0.1"
+
+
+def choose_ports(launch_file: Path) -> list[str]:
+    """Return settings that give the simulated arms and their bridges free ports.
+
+    A graph without simulated arms has none.
+    """
+    nodes = load_graph(launch_file).nodes.values()
+    simulators = [one for one in nodes if issubclass(node_class(one.type), node_class("twin_arms"))]
+    if not simulators:
+        return []
+    left, right = _find_free_ports(2)
+    settings = []
+    for node in simulators:
+        settings += [f"{node.name}.left_port={left}", f"{node.name}.right_port={right}"]
+    for node in nodes:
+        if node.role is NodeRole.ARM_BRIDGE:
+            port = left if node.parameters["side"] == "left" else right
+            settings.append(f"{node.name}.port={port}")
+    return settings
+
+
+def _find_free_ports(count: int) -> list[int]:
+    """Return distinct TCP ports of loopback that are free now."""
+    sockets = [socket.socket() for _ in range(count)]
+    try:
+        for one in sockets:
+            one.bind((LOOPBACK, 0))
+        return [one.getsockname()[1] for one in sockets]
+    finally:
+        for one in sockets:
+            one.close()

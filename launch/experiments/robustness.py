@@ -1,0 +1,126 @@
+"""Evaluate drawn apparatuses: many laboratories that differ from their scene file at random."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.run import require_scene
+from flexsheet.launch.experiments.sweep import Progress, Row, raise_if_all_failed, run_sweep
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.nodes.twin.tolerance_table import Profile
+
+METRICS = ("sheet_mm", "sheet_deg", "image_mm", "force_percent", "fingertip_mm")
+MAX_TRIALS = 10_000
+_RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Parse "A-B" or "A" into seeds, both ends included.  Raises ExperimentError."""
+    match = _RANGE.fullmatch(text.strip())
+    if match is None:
+        raise ExperimentError(f'--seeds "{text}": expected A-B, such as 0-9, or one whole number')
+    first, last = int(match[1]), int(match[2] or match[1])
+    if last < first:
+        raise ExperimentError(f'--seeds "{text}": {last} is less than {first}; give {last}-{first}')
+    if last - first >= MAX_TRIALS:
+        raise ExperimentError(f'--seeds "{text}": at most {MAX_TRIALS} seeds; divide the range')
+    return list(range(first, last + 1))
+
+
+def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
+    """Return the draw as the option --apparatus takes it."""
+    return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
+
+
+def run_robustness(
+    launch_file: Path,
+    settings: Sequence[str],
+    folder: Path,
+    seeds: Sequence[int],
+    progress: Progress,
+    *,
+    profile: Profile,
+    calibrated: bool,
+    seconds: float,
+    workers: int = 1,
+    scheduler: str | None = None,
+    keep_bags: bool = False,
+) -> dict[str, Any]:
+    """Run one trial per seed, and return rows and summary of `experiment robustness --json`."""
+    plan = load_graph(launch_file, settings=settings)
+    scene = require_scene(plan)
+    common = {
+        "experiment": "robustness",
+        "launch_file": str(launch_file.resolve()),
+        "settings": list(settings),
+        "scene": scene.name,
+        "graph": plan.hash,
+        "profile": profile.value,
+        "calibrated": calibrated,
+        "seconds": seconds,
+    }
+    trials = {}
+    for seed in seeds:
+        name = f"seed-{seed:05d}"
+        trials[name] = {
+            "kind": "robustness",
+            "seed": seed,
+            "launch_file": common["launch_file"],
+            "settings": common["settings"],
+            "apparatus": apparatus_text(seed, profile, calibrated=calibrated),
+            "seconds": seconds,
+            "bag": str(folder.resolve() / f"{name}.mcap") if keep_bags else None,
+        }
+    rows = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
+    raise_if_all_failed(rows, folder)
+    found = [row for row in rows.values() if "error" not in row]
+    failed = [
+        {"seed": trials[name]["seed"], "error": row["error"]}
+        for name, row in rows.items()
+        if "error" in row
+    ]
+    return {
+        "profile": profile.value,
+        "calibrated": calibrated,
+        "rows": found,
+        "failed": failed,
+        "summary": summarize(found),
+        "measured": {
+            "sheet_mm": "graph",
+            "sheet_deg": "graph",
+            "fingertip_mm": "graph",
+            "image_mm": "offline",
+            "force_percent": "offline",
+        },
+        "out_of_tolerance": [row["seed"] for row in found if row["out_of_tolerance"]],
+        "flagged": [row["seed"] for row in found if row["flagged"]],
+        "out_of_tolerance_not_flagged": [
+            row["seed"] for row in found if row["out_of_tolerance"] and not row["flagged"]
+        ],
+        "folder": str(folder),
+    }
+
+
+def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    """Return median, 95 % quantile and worst value of each metric, and the seed of the worst.
+
+    A metric without values has None.
+    """
+    summary: dict[str, dict[str, float | None]] = {}
+    for metric in METRICS:
+        known = [(row[metric], row["seed"]) for row in rows if row[metric] is not None]
+        values = np.array([value for value, _ in known])
+        worst = max(known, default=(None, None))
+        summary[metric] = {
+            "median": float(np.median(values)) if known else None,
+            "p95": float(np.quantile(values, 0.95)) if known else None,
+            "worst": worst[0],
+            "worst_seed": worst[1],
+        }
+    return summary

@@ -1,0 +1,217 @@
+"""Report Table I with its uncertainty: repeated strokes, ablations, twice the radius."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from ruamel.yaml import YAML
+from scipy.stats import t as student_t
+
+from flexsheet.launch.experiments.run import make_settings, require_scene
+from flexsheet.launch.experiments.sweep import Progress, Row, raise_if_all_failed, run_sweep
+from flexsheet.launch.plans.apparatus import format_apparatus, load_apparatus
+from flexsheet.launch.plans.documents import read_document
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.files import write_file
+from flexsheet.messages.methods import TrackingMethod
+from flexsheet.messages.scene import Scene, require_cylinder
+
+FIRST_SEED = 4100
+"""Seed of the first stroke's finger and camera noise; no chart and no default has it."""
+
+CONFIDENCE = 0.95
+RATES_HZ = (15.0, 30.0, 60.0)
+RADIUS_FACTOR = 2.0
+"""The paper's angle and distance errors agree for a radius of 70.7 mm, twice that of its text."""
+
+ERRORS = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One configuration of the experiment; `settings` override parameters of the launch file."""
+
+    name: str
+    launch_file: Path
+    settings: tuple[str, ...] = ()
+    apparatus: str | None = None
+
+
+def make_variants(
+    launch_file: Path, folder: Path, *, apparatus: str | None, ablations: bool, radii: bool
+) -> list[Variant]:
+    """Return the configurations to measure, the given one first.
+
+    Scene, launch and apparatus files of the others are written into the folder.
+    """
+    scene = require_scene(load_graph(launch_file))
+    variants = [Variant("as configured", launch_file, apparatus=apparatus)]
+    if ablations:
+        variants += _make_ablations(launch_file, folder, scene, apparatus)
+    if radii:
+        radius_m = RADIUS_FACTOR * require_cylinder(scene).radius_m
+        larger = write_radius_variant(launch_file, folder, radius_m)
+        name = f"radius {1e3 * radius_m:.1f} mm"
+        # An apparatus belongs to one object, so the larger one is measured without differences.
+        variants.append(Variant(name, larger))
+    return variants
+
+
+def _make_ablations(
+    launch_file: Path, folder: Path, scene: Scene, apparatus: str | None
+) -> list[Variant]:
+    def vary(name: str, node_type: str, setting: str) -> Variant:
+        settings = tuple(make_settings(launch_file, node_type, setting))
+        return Variant(name, launch_file, settings, apparatus)
+
+    variants = [vary("no prediction", "planner", "prediction_horizon_s=0")]
+    variants += [
+        vary(f"tracking {method}", "triangulator", f"tracking={method}")
+        for method in get_args(TrackingMethod)
+    ]
+    variants.append(vary("stretch only", "planner", "compliance_mode=stiffness"))
+    truth = nominal_apparatus(scene) if apparatus is None else load_apparatus(apparatus, scene)
+    for rate_hz in RATES_HZ:
+        camera = truth.camera.model_copy(update={"rate_hz": rate_hz})
+        file = folder / f"camera-{rate_hz:g}-hz.yaml"
+        write_file(file, format_apparatus(truth.model_copy(update={"camera": camera})))
+        variants.append(
+            Variant(f"camera {rate_hz:g} Hz", launch_file, apparatus=str(file.resolve()))
+        )
+    return variants
+
+
+def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
+    """Write the launch file with a cylinder of another radius, whose front is at the same place.
+
+    Return the launch file. Files that it names are given by absolute paths.
+    """
+    yaml = YAML()
+    launch = yaml.load(launch_file.read_text())
+    graph = load_graph(launch_file)
+    scene_file = launch_file.parent / launch["scene"]
+    scene = yaml.load(scene_file.read_text())
+    added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
+    scene["object"]["geometry"]["radius_m"] = radius_m
+    position = scene["object"]["world_from_object"]["position_m"]
+    position[2] = float(position[2]) - added_m
+    name = f"radius-{1e3 * radius_m:.1f}-mm"
+    varied = folder / f"scene-{name}.yaml"
+    with varied.open("w") as file:
+        yaml.dump(scene, file)
+    launch["scene"] = str(varied.resolve())
+    for node, spec in launch["nodes"].items():
+        given = spec.get("parameters", {})
+        for parameter in given:
+            given[parameter] = graph.nodes[node].parameters[parameter]
+    result = folder / f"launch-{name}.yaml"
+    with result.open("w") as file:
+        yaml.dump(launch, file)
+    read_document(result)
+    return result
+
+
+def run_stroke_table(
+    variants: Sequence[Variant],
+    settings: Sequence[str],
+    folder: Path,
+    progress: Progress,
+    *,
+    seconds: float,
+    repeats: int,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> dict[str, Any]:
+    """Stroke several times per variant, each with another seed; return the JSON result."""
+    common = {
+        "experiment": "stroke",
+        "seconds": seconds,
+        "settings": list(settings),
+        "graph": load_graph(variants[0].launch_file, settings=settings).hash,
+        "apparatus": variants[0].apparatus,
+    }
+    trials: dict[str, dict[str, Any]] = {}
+    for variant in variants:
+        for number in range(repeats):
+            seed = f"seed={FIRST_SEED + number}"
+            trials[_trial_name(variant, number)] = {
+                "kind": "stroke",
+                "launch_file": str(variant.launch_file.resolve()),
+                "apparatus": variant.apparatus,
+                "seconds": seconds,
+                "settings": [
+                    *make_settings(variant.launch_file, "twin_finger", seed),
+                    *variant.settings,
+                    *settings,
+                ],
+            }
+    rows = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
+    raise_if_all_failed(rows, folder)
+    table = [
+        {
+            "variant": variant.name,
+            **summarize_strokes([rows[_trial_name(variant, number)] for number in range(repeats)]),
+        }
+        for variant in variants
+    ]
+    return {
+        **{key: value for key, value in table[0].items() if key != "variant"},
+        "seconds": seconds,
+        "repeats": repeats,
+        "confidence": CONFIDENCE,
+        "rows": table,
+        "bag": None,
+        "folder": str(folder),
+    }
+
+
+def _trial_name(variant: Variant, number: int) -> str:
+    return f"{variant.name.replace(' ', '-')}-{number:03d}"
+
+
+def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the errors over repeated strokes, latency and drops; failed strokes are counted.
+
+    mean: of the strokes' means. std: mean of their standard deviations. max: largest. interval:
+    half the width of the confidence interval of the mean; None for fewer than two strokes.
+    """
+    good = [row for row in rows if "error" not in row]
+    result: dict[str, Any] = {
+        key: summarize_means([row[key] for row in good]) if good else None for key in ERRORS
+    }
+    latency: dict[str, dict[str, float | None]] = {}
+    for event in good[0]["latency_ms"] if good else ():
+        latency[event] = {
+            quantile: _median([row["latency_ms"][event][quantile] for row in good])
+            for quantile in ("p50", "p99")
+        }
+    result["latency_ms"] = latency
+    result["drops"] = sum(row["drops"] for row in good)
+    result["strokes"] = len(good)
+    result["failed"] = [row["error"] for row in rows if "error" in row]
+    return result
+
+
+def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """Return mean, std and max over strokes, and half the confidence interval of the mean."""
+    means = np.array([one["mean"] for one in strokes])
+    interval = None
+    if len(means) > 1:
+        quantile = float(student_t.ppf(0.5 + 0.5 * CONFIDENCE, len(means) - 1))
+        interval = quantile * float(means.std(ddof=1)) / float(np.sqrt(len(means)))
+    return {
+        "mean": float(means.mean()),
+        "std": float(np.mean([one["std"] for one in strokes])),
+        "max": max(one["max"] for one in strokes),
+        "interval": interval,
+    }
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None

@@ -1,0 +1,219 @@
+"""Run the trials of a sweep as separate processes, and continue an interrupted sweep.
+
+Each trial is one process that prints its row as JSON. The folder of a sweep contains `sweep.json`
+with its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run
+on this computer or on the workers of a `dask.distributed` scheduler, which must find the launch
+file and the apparatus files under the same paths.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.messages.files import write_file
+from flexsheet.nodes.cache import EtaEstimator
+from flexsheet.nodes.fem_solver.precompute_table import stop_requested
+
+Progress = Callable[[str], None]
+Row = dict[str, Any]
+
+SETTINGS_FILE = "sweep.json"
+TRIAL_MODULE = "flexsheet.launch.experiments.trial"
+POLL_S = 0.2
+END_S = 20.0
+"""Time in which a stopped trial must end its graph."""
+
+MAX_ERROR_CHARACTERS = 600
+
+
+class TrialError(ExperimentError):
+    """Raised in the process that waits for a trial which gave no row."""
+
+    code = "trial"
+    remedy = "Run the same experiment alone; the text names what failed."
+
+
+def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Create the folder of a sweep, or check that it contains a sweep with the same settings.
+
+    Raises ExperimentError that names the first setting that differs.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / SETTINGS_FILE
+    wanted = json.loads(json.dumps(settings))
+    if not file.exists():
+        write_file(file, json.dumps(wanted, indent=1) + "\n")
+        return
+    found = _read_json(file)
+    for key in sorted({*wanted, *found}):
+        if found.get(key) != wanted.get(key):
+            raise ExperimentError(
+                f"{file}: {key} is {found.get(key)!r}, and this sweep has {wanted.get(key)!r}; "
+                "give another --output, or the same options to continue"
+            )
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise ExperimentError(f"{file}: cannot be read: {error}; delete it") from error
+    if not isinstance(content, dict):
+        raise ExperimentError(f"{file}: contains no JSON object; delete it")
+    return content
+
+
+def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
+    """Return the finished rows of a sweep by name; failed trials count as not finished."""
+    rows = {
+        name: _read_json(folder / f"{name}.json") for name in names if _row_exists(folder, name)
+    }
+    return {name: row for name, row in rows.items() if "error" not in row}
+
+
+def _row_exists(folder: Path, name: str) -> bool:
+    return (folder / f"{name}.json").exists()
+
+
+def run_sweep(
+    folder: Path,
+    settings: Mapping[str, Any],
+    trials: Mapping[str, Mapping[str, Any]],
+    progress: Progress,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> dict[str, Row]:
+    """Run the trials that have no row yet, and return all rows by name, in the trials' order.
+
+    trials: JSON description of each trial for `trial.run_trial`. workers: number of simultaneous
+    trials on this computer; a scheduler has its own. A failed trial has a row with the key `error`
+    and does not stop the others.
+    """
+    open_sweep(folder, settings)
+    done = read_rows(folder, trials)
+    missing = [name for name in trials if name not in done]
+    rows: dict[str, Row] = dict(done)
+    eta = EtaEstimator()
+
+    def report() -> None:
+        if missing:
+            left = eta.text(len(rows) - len(done), len(missing), time.monotonic())
+            progress(f"{len(rows)} of {len(trials)} trials: {left}")
+
+    if done:
+        progress(f"{len(done)} of {len(trials)} trials are finished in {folder}")
+    report()
+    with _interruptible(), _executor(workers, scheduler) as executor:
+        waiting: dict[Future[Row], str] = {
+            executor.submit(execute_trial, dict(trials[name])): name for name in missing
+        }
+        for future in as_completed(waiting):
+            name = waiting[future]
+            try:
+                row = future.result()
+            except TrialError as error:
+                row = {"error": str(error)}
+                progress(f"{name} failed: {error}")
+            write_file(folder / f"{name}.json", json.dumps(row, indent=1) + "\n")
+            rows[name] = row
+            report()
+    return {name: rows[name] for name in trials}
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Make SIGTERM raise KeyboardInterrupt in the main thread, as SIGINT does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
+    """Yield an executor; leaving the context stops running trials after an error."""
+    if scheduler is not None:
+        # Importing distributed takes half a second.
+        from flexsheet.nodes.fem_solver.dask_executor import connect_workers
+
+        with connect_workers(scheduler) as executor:
+            yield executor
+        return
+    stop = threading.Event()
+    threads = ThreadPoolExecutor(workers, initializer=lambda: stop_requested.set(stop.is_set))
+    try:
+        yield threads
+    except BaseException:
+        stop.set()
+        raise
+    finally:
+        threads.shutdown(wait=True, cancel_futures=True)
+
+
+def execute_trial(trial: Mapping[str, Any]) -> Row:
+    """Run one trial in a process of its own, and return its row.
+
+    Raises TrialError if the process fails, or if a stop was requested.
+    """
+    must_stop = stop_requested.get()
+    process = subprocess.Popen(
+        [sys.executable, "-m", TRIAL_MODULE],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Ctrl-C must reach the sweep first, which then ends its trials.
+        start_new_session=True,
+    )
+    given: str | None = json.dumps(trial)
+    while True:
+        try:
+            output, errors = process.communicate(given, timeout=POLL_S)
+            break
+        except subprocess.TimeoutExpired:
+            given = None
+            if must_stop():
+                _end(process)
+                raise TrialError("interrupted") from None
+    if process.returncode != 0:
+        last = errors.strip()[-MAX_ERROR_CHARACTERS:] or f"exit status {process.returncode}"
+        raise TrialError(last)
+    try:
+        row = json.loads(output.splitlines()[-1])
+    except (IndexError, ValueError) as error:
+        raise TrialError(f"the trial printed no row: {error}") from error
+    return dict(row)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    try:
+        process.communicate(timeout=END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+
+
+def raise_if_all_failed(rows: Mapping[str, Row], folder: Path) -> None:
+    """Raise ExperimentError if no trial has a result."""
+    errors = [row["error"] for row in rows.values() if "error" in row]
+    if errors and len(errors) == len(rows):
+        raise ExperimentError(
+            f"all {len(rows)} trials failed; see {folder}; the last: {errors[-1]}"
+        )

@@ -1,0 +1,141 @@
+"""Run one trial of a sweep: read its description as JSON from stdin, and print its row.
+
+python -m flexsheet.launch.experiments.trial
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from flexsheet.launch.commands.output import logs_on_stderr
+from flexsheet.launch.experiments import stroke
+from flexsheet.launch.experiments.flags import read_flags
+from flexsheet.launch.experiments.offline import (
+    Metric,
+    NodeCalibrations,
+    OfflineEvaluator,
+    exceeded_tolerances,
+)
+from flexsheet.launch.experiments.ports import choose_ports
+from flexsheet.launch.experiments.run import make_stroke_procedure, require_scene, run_experiment
+from flexsheet.launch.methods.results import replace_non_finite
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
+
+Row = dict[str, Any]
+
+
+@contextmanager
+def _bag_of(trial: Mapping[str, Any]) -> Iterator[Path]:
+    """Yield the path of the trial's bag; without `bag` it is deleted afterwards."""
+    if trial.get("bag"):
+        yield Path(trial["bag"])
+        return
+    with tempfile.TemporaryDirectory(prefix="flexsheet-trial-") as folder:
+        yield Path(folder) / "stroke.mcap"
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
+    """Stroke once in a graph of its own, and return the stroke's results with the flags."""
+    launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
+    settings = [*choose_ports(launch_file), *trial.get("settings", ())]
+    with _bag_of(trial) as bag:
+        procedure = make_stroke_procedure([seconds], _tell)
+        run_experiment(launch_file, settings, bag, procedure, _tell, apparatus=apparatus)
+        recording = stroke.read_recording(bag)
+        errors = stroke.stroke_errors(recording, seconds)
+        result = stroke.stroke_result(recording, errors, seconds, bag)
+        flagged = read_flags(bag)
+    if not trial.get("bag"):
+        result["bag"] = None
+    return {**result, "flagged": flagged}
+
+
+def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
+    """Return the results of one stroke; `apparatus` as of `--apparatus`, or None."""
+    return run_stroke(trial, trial.get("apparatus"))
+
+
+def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
+    """Return the errors of a drawn apparatus: sheet and fingertip in motion, the others at rest."""
+    plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
+    scene, apparatus = require_scene(plan), plan.apparatus_message()
+    assert apparatus is not None
+    moving = run_stroke(trial, trial["apparatus"])
+    metrics = frozenset({Metric.IMAGE, Metric.FORCE})
+    resting = OfflineEvaluator(scene, NodeCalibrations.of(plan)).evaluate(apparatus, metrics)
+    figures: Row = {
+        "sheet_mm": moving["true_delta_d_mm"]["mean"],
+        "sheet_deg": moving["true_delta_theta_deg"]["mean"],
+        "image_mm": resting.figures()[Metric.IMAGE],
+        "force_percent": resting.figures()[Metric.FORCE],
+        "fingertip_mm": moving["fingertip_mm"]["mean"],
+    }
+    return {
+        "seed": trial["seed"],
+        **figures,
+        "out_of_tolerance": exceeded_tolerances(scene, figures),
+        "flagged": moving["flagged"],
+        "valid_ratio": moving["valid_ratio"],
+        "latency_ms": moving["latency_ms"],
+        "drops": moving["drops"],
+        "bag": moving["bag"],
+    }
+
+
+def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
+    """Return the effects of one parameter at each of its sigmas, at rest and without a graph."""
+    plan = load_graph(Path(trial["launch_file"]))
+    scene = require_scene(plan)
+    evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
+    metrics = frozenset(Metric(name) for name in trial["metrics"])
+
+    nominal = evaluator.evaluate(nominal_apparatus(scene), metrics)
+    effects: dict[str, Any] = {}
+    for sigma in trial["sigmas"]:
+        apparatus = deviate_apparatus(
+            scene,
+            trial["parameter"],
+            sigma,
+            profile=Profile(trial["profile"]),
+            calibrated=trial["calibrated"],
+        )
+        found = evaluator.evaluate(apparatus, metrics)
+        effects[f"{sigma:g}"] = found.change_from(nominal)
+    return {"parameter": trial["parameter"], "effects": effects}
+
+
+KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
+    "stroke": run_stroke_trial,
+    "robustness": run_robustness_trial,
+    "sensitivity": run_sensitivity_trial,
+}
+
+
+def main() -> int:
+    """Run the trial that stdin describes; its row is the last line of stdout."""
+    logs_on_stderr()
+    trial = json.load(sys.stdin)
+    try:
+        row = KINDS[trial["kind"]](trial)
+    except FlexsheetError as error:
+        _tell(f"{error}")
+        return 1
+    print(json.dumps(replace_non_finite(row), allow_nan=False), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

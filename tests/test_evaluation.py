@@ -1,0 +1,434 @@
+"""Test the evaluation of apparatuses: sweeps, offline errors, and the bound of the error."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flexsheet.launch.cli import app
+from flexsheet.launch.experiments import ExperimentError, robustness, sensitivity, sweep
+from flexsheet.launch.experiments.follow import (
+    LimitedMotion,
+    bound_errors,
+    find_least_deviation,
+)
+from flexsheet.launch.experiments.offline import (
+    Evaluation,
+    Metric,
+    NodeCalibrations,
+    OfflineEvaluator,
+    exceeded_tolerances,
+)
+from flexsheet.launch.experiments.ports import choose_ports
+from flexsheet.launch.experiments.stroke_table import (
+    make_variants,
+    summarize_means,
+    summarize_strokes,
+    write_radius_variant,
+)
+from flexsheet.launch.experiments.sweep import TrialError, execute_trial, run_sweep
+from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
+from flexsheet.messages.scene import Scene, require_cylinder
+from flexsheet.nodes.twin.tolerance_table import (
+    NOT_SIMULATED,
+    TOLERANCES,
+    Profile,
+)
+
+ROOT = Path(__file__).resolve().parent.parent
+DEMO = ROOT / "launch" / "demo.yaml"
+FINGERTIP = frozenset({Metric.FINGERTIP})
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(ROOT / "launch" / "scenes" / "cylinder.yaml")
+
+
+@pytest.fixture(scope="module")
+def evaluator(scene: Scene) -> OfflineEvaluator:
+    """Return the evaluator with the calibration of the demo's camera."""
+    return OfflineEvaluator(scene, NodeCalibrations.of(load_graph(DEMO)))
+
+
+def changed(scene: Scene, section: str, **values: Any) -> Apparatus:
+    """Return the nominal apparatus with other values in one section."""
+    nominal = nominal_apparatus(scene)
+    content = nominal.model_dump(mode="json")
+    content[section] |= values
+    return Apparatus.model_validate(content)
+
+
+def row_of(seed: int) -> dict[str, Any]:
+    figures = {"sheet_mm": 0.1 * seed, "sheet_deg": 0.2, "image_mm": 0.3}
+    figures |= {"force_percent": 4.0, "fingertip_mm": 0.05}
+    return {"seed": seed, **figures, "out_of_tolerance": [], "flagged": []}
+
+
+# Sweeps
+
+
+def describe(seeds: range) -> dict[str, dict[str, Any]]:
+    return {f"seed-{seed}": {"kind": "fake", "seed": seed} for seed in seeds}
+
+
+def test_an_interrupted_sweep_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    executed: list[int] = []
+
+    def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        executed.append(trial["seed"])
+        return row_of(trial["seed"])
+
+    def interrupt(text: str) -> None:
+        if text.startswith("2 of 5"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "execute_trial", execute)
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(tmp_path, {"seconds": 3}, describe(range(5)), interrupt)
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "sweep.json",
+        "seed-0.json",
+        "seed-1.json",
+    }
+    executed.clear()
+    rows = run_sweep(tmp_path, {"seconds": 3}, describe(range(5)), lambda text: None)
+    assert executed == [2, 3, 4]
+    assert [row["seed"] for row in rows.values()] == [0, 1, 2, 3, 4]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_failed_trial_is_recorded_and_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes: list[Any] = [TrialError("the arms are out of reach"), row_of(0)]
+
+    def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        outcome = outcomes.pop(0)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return dict(outcome)
+
+    monkeypatch.setattr(sweep, "execute_trial", execute)
+    first = run_sweep(tmp_path, {}, describe(range(1)), lambda text: None)
+    assert "out of reach" in first["seed-0"]["error"]
+    with pytest.raises(ExperimentError, match=r"all 1 trials failed.*out of reach"):
+        sweep.raise_if_all_failed(first, tmp_path)
+    again = run_sweep(tmp_path, {}, describe(range(1)), lambda text: None)
+    assert again["seed-0"]["seed"] == 0
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
+    sweep.open_sweep(tmp_path, {"profile": "modern", "seconds": 10.0})
+    sweep.open_sweep(tmp_path, {"profile": "modern", "seconds": 10.0})
+    with pytest.raises(ExperimentError, match=r"profile is 'modern'.* 'paper'.*another --output"):
+        sweep.open_sweep(tmp_path, {"profile": "paper", "seconds": 10.0})
+
+
+def test_progress_names_the_time_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "execute_trial", lambda trial: row_of(trial["seed"]))
+    texts: list[str] = []
+    run_sweep(tmp_path, {}, describe(range(2)), texts.append)
+    assert texts == ["0 of 2 trials: 0 %", *texts[1:-1], "2 of 2 trials: 100 %"]
+
+
+def test_a_trial_is_a_process_whose_error_comes_back() -> None:
+    with pytest.raises(TrialError, match=r"missing\.yaml"):
+        execute_trial({"kind": "stroke", "launch_file": "missing.yaml", "seconds": 3})
+
+
+def test_graphs_of_trials_use_other_ports() -> None:
+    first, second = choose_ports(DEMO), choose_ports(DEMO)
+    assert len(first) == 4
+    nodes = load_graph(DEMO, settings=first).nodes
+    arms = nodes["twin_arms"].parameters
+    assert nodes["arm_left_bridge"].parameters["port"] == arms["left_port"]
+    assert nodes["arm_right_bridge"].parameters["port"] == arms["right_port"] != arms["left_port"]
+    assert first != second
+
+
+# Robustness
+
+
+def test_seeds_are_parsed() -> None:
+    assert robustness.parse_seeds("3-5") == [3, 4, 5]
+    assert robustness.parse_seeds("7") == [7]
+    assert robustness.apparatus_text(7, Profile.PAPER, calibrated=True) == "seed:7,paper,calibrated"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("5-3", "3 is less than 5; give 3-5"), ("a-b", "expected A-B"), ("0-99999", "at most 10000")],
+)
+def test_wrong_seeds_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ExperimentError, match=message):
+        robustness.parse_seeds(text)
+
+
+def test_robustness_prints_rows_and_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        row = row_of(trial["seed"])
+        return row | ({"out_of_tolerance": ["sheet_mm"]} if trial["seed"] == 3 else {})
+
+    monkeypatch.setattr(sweep, "execute_trial", execute)
+    arguments = ["experiment", "robustness", "--seeds", "0-3", "--output", str(tmp_path), "--json"]
+    printed = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    result = json.loads(printed.stdout)
+    assert [row["seed"] for row in result["rows"]] == [0, 1, 2, 3]
+    assert set(row_of(0)) <= set(result["rows"][0])
+    summary = result["summary"]["sheet_mm"]
+    assert summary["median"] == pytest.approx(0.15)
+    assert summary["p95"] == pytest.approx(0.285)
+    assert (summary["worst"], summary["worst_seed"]) == (pytest.approx(0.3), 3)
+    assert result["out_of_tolerance"] == result["out_of_tolerance_not_flagged"] == [3]
+    assert result["measured"]["image_mm"] == "offline"
+
+
+# Offline evaluation against hand-computed cases
+
+
+def test_a_shifted_camera_shifts_the_fingertip(scene: Scene, evaluator: OfflineEvaluator) -> None:
+    nominal = evaluator.evaluate(nominal_apparatus(scene), FINGERTIP)
+    shifted = evaluator.evaluate(
+        changed(scene, "camera", position_offset_m=[1e-3, 0.0, 0.0]), FINGERTIP
+    )
+    assert nominal.fingertip_m is not None
+    assert shifted.fingertip_m is not None
+    # A camera that is 1 mm further right than believed sees the finger 1 mm further left.
+    difference = shifted.fingertip_m - nominal.fingertip_m
+    np.testing.assert_allclose(difference, [[-1e-3, 0.0, 0.0]] * len(difference), atol=3e-5)
+    assert shifted.change_from(nominal)[Metric.FINGERTIP] == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_late_stamp_moves_the_fingertip_by_speed_times_time(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
+    nominal = evaluator.evaluate(nominal_apparatus(scene), FINGERTIP)
+    late = evaluator.evaluate(changed(scene, "camera", stamp_offset_s=0.005), FINGERTIP)
+    expected_mm = 1e3 * 0.005 * scene.working_range.speed_m_per_s
+    assert late.change_from(nominal)[Metric.FINGERTIP] == pytest.approx(expected_mm, rel=0.05)
+
+
+def test_the_nominal_sheet_is_tangent_and_a_shifted_pair_of_arms_is_not(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
+    metrics = frozenset({Metric.SHEET})
+    nominal = evaluator.evaluate(nominal_apparatus(scene), metrics)
+    bases = {side: {"base_position_offset_m": [0.0, 0.0, 1e-3]} for side in ("left", "right")}
+    moved = evaluator.evaluate(changed(scene, "arms", **bases), metrics)
+    assert nominal.sheet_m is not None
+    assert moved.sheet_m is not None
+    # At the front the normal is z, so the whole shift is an error; the error is finger minus sheet.
+    np.testing.assert_allclose(moved.sheet_m[0] - nominal.sheet_m[0], [0, 0, -1e-3], atol=1e-6)
+
+
+def test_a_stiffer_sheet_pushes_harder(scene: Scene) -> None:
+    metrics = frozenset({Metric.FORCE})
+    weightless = scene.model_copy(
+        update={"sheet": scene.sheet.model_copy(update={"density_kg_per_m3": 0.0})}
+    )
+    evaluator = OfflineEvaluator(weightless)
+    nominal = evaluator.evaluate(nominal_apparatus(weightless), metrics)
+    stiff = evaluator.evaluate(changed(weightless, "sheet", modulus_ratio=1.1), metrics)
+    assert nominal.felt_n is not None
+    assert stiff.felt_n is not None
+    # Without weight, all forces are proportional to the modulus.
+    np.testing.assert_allclose(stiff.felt_n, 1.1 * nominal.felt_n, rtol=2e-3)
+
+
+def test_parallax_is_that_of_points_behind_the_screen(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
+    eye = scene.eyes.centre_world_m
+    moved = eye + np.array([0.02, 0.0, 0.0])
+    _, points = evaluator._object_points
+    shifts = evaluator._parallax(moved)
+    row, column = np.argwhere(np.isfinite(shifts[..., 0]))[500]
+    depth_m = -points[row, column, 2]
+    # By similar triangles: a point behind the screen follows the eye by depth over its distance.
+    expected_m = 0.02 * depth_m / (eye[2] + depth_m)
+    assert shifts[row, column] == pytest.approx([expected_m, 0.0], abs=1e-12)
+
+
+def test_figures_are_means_and_root_mean_squares() -> None:
+    image = np.full((2, 2, 2), np.nan)
+    image[0, 0], image[1, 1] = [3e-3, 4e-3], [0.0, 0.0]
+    found = Evaluation(
+        fingertip_m=np.array([[3e-3, 4e-3, 0.0]]),
+        image_m=(image,),
+        felt_n=np.array([1.1, 0.8]),
+        expected_n=np.array([1.0, 1.0]),
+    ).figures()
+    assert found[Metric.FINGERTIP] == pytest.approx(5.0)
+    assert found[Metric.IMAGE] == pytest.approx(5.0 / np.sqrt(2.0))
+    assert found[Metric.FORCE] == pytest.approx(15.0)
+    assert found[Metric.SHEET] is None
+
+
+def test_tolerances_are_those_of_the_scene(scene: Scene) -> None:
+    figures = {"sheet_mm": 0.51, "image_mm": 0.49, "force_percent": 10.1, "fingertip_mm": None}
+    assert exceeded_tolerances(scene, figures) == ["sheet_mm", "force_percent"]
+
+
+# Sensitivity
+
+
+def test_each_parameter_is_evaluated_or_says_why_not() -> None:
+    assert set(TOLERANCES) >= sensitivity.TIMING
+    for parameter in TOLERANCES:
+        found = sensitivity.evaluation_of(parameter, with_graph=False)
+        assert (found is sensitivity.Evaluation.NOT_SIMULATED) == (parameter in NOT_SIMULATED)
+        assert parameter.partition(".")[0] in sensitivity.AFFECTED
+    assert (
+        sensitivity.evaluation_of("arms.*.servo_lag_s", with_graph=True)
+        is sensitivity.Evaluation.GRAPH
+    )
+
+
+def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = {"sheet.modulus_ratio": 10.0, "camera.position_offset_m": 0.3}
+
+    def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        effects = {
+            f"{sigma:g}": dict.fromkeys(trial["metrics"], abs(sigma) * sizes[trial["parameter"]])
+            for sigma in trial["sigmas"]
+        }
+        return {"parameter": trial["parameter"], "effects": effects}
+
+    monkeypatch.setattr(sweep, "execute_trial", execute)
+    names = ",".join([*sizes, "arms.*.servo_lag_s", "sheet.creep_ratio_per_decade"])
+    arguments = ["experiment", "sensitivity", "--parameters", names, "--output", str(tmp_path)]
+    printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
+    result = json.loads(printed.stdout)
+    keys = {"parameter", "sigma", "sheet_mm", "image_mm", "force_percent", "fingertip_mm"}
+    assert all(keys <= set(row) for row in result["rows"])
+    assert len(result["rows"]) == 4 * 4
+    assert [row["parameter"] for row in result["ranking"]] == [
+        "sheet.modulus_ratio",
+        "camera.position_offset_m",
+    ]
+    assert result["ranking"][0] == {
+        "parameter": "sheet.modulus_ratio",
+        "share": pytest.approx(20.0),
+        "metric": "image_mm",
+    }
+    by_parameter = {row["parameter"]: row for row in result["rows"]}
+    assert by_parameter["sheet.modulus_ratio"]["fingertip_mm"] == 0.0
+    assert by_parameter["arms.*.servo_lag_s"]["evaluation"] == "not_measured"
+    assert by_parameter["arms.*.servo_lag_s"]["sheet_mm"] is None
+    assert by_parameter["sheet.creep_ratio_per_decade"]["evaluation"] == "not_simulated"
+    assert Path(result["picture"]).stat().st_size > 1000
+
+
+def test_an_unknown_parameter_is_refused() -> None:
+    with pytest.raises(ExperimentError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
+        sensitivity.select_parameters("sheet.modulus_ration")
+
+
+# The bound of a followed finger
+
+
+def test_the_bound_of_a_jump_is_that_of_a_limited_speed() -> None:
+    """A jump S at a limited speed v costs the area S^2 / 4 v: half before, half after the jump."""
+    step_s, speed, jump = 0.01, 0.1, 0.02
+    times = np.arange(0.0, 1.0, step_s)
+    wanted = np.where(times < 0.5, 0.0, jump)
+    motion = LimitedMotion(
+        values=wanted[:, None],
+        slopes=np.ones((len(times), 1, 1)),
+        max_rate=np.array([speed]),
+        max_acceleration=np.array([np.inf]),
+        low=np.array([-np.inf]),
+        high=np.array([np.inf]),
+    )
+    found = find_least_deviation(motion, np.ones(len(times)), step_s, max_deviation=0.1)
+    assert found is not None
+    assert found.sum() * step_s == pytest.approx(jump**2 / (4.0 * speed), rel=0.02)
+    assert found.max() == pytest.approx(0.5 * jump, abs=speed * step_s)
+
+
+def test_the_bound_of_a_limited_range_is_what_lies_beyond() -> None:
+    wanted = np.linspace(0.0, 0.03, 31)
+    motion = LimitedMotion(
+        values=wanted[:, None],
+        slopes=np.ones((31, 1, 1)),
+        max_rate=np.array([np.inf]),
+        max_acceleration=np.array([np.inf]),
+        low=np.array([-0.02]),
+        high=np.array([0.02]),
+    )
+    found = find_least_deviation(motion, np.ones(31), 0.01, max_deviation=0.1)
+    np.testing.assert_allclose(found, np.maximum(wanted - 0.02, 0.0), atol=1e-9)
+
+
+def stroke_points(scene: Scene, angles: np.ndarray) -> np.ndarray:
+    radius = require_cylinder(scene).radius_m
+    return np.column_stack(
+        [np.zeros_like(angles), radius * np.sin(angles), radius * (np.cos(angles) - 1.0)]
+    )
+
+
+def test_arms_follow_a_slow_stroke_and_not_a_jump(scene: Scene) -> None:
+    times = np.arange(0.0, 2.0, 1.0 / 60.0)
+    slow = bound_errors(scene, times, stroke_points(scene, 0.2 * times))
+    assert slow["mean"] == pytest.approx(0.0, abs=1e-6)
+    assert slow["windows_without_solution"] == slow["steps_out_of_reach"] == 0
+    jump = bound_errors(scene, times, stroke_points(scene, np.where(times < 1.0, -0.3, 0.3)))
+    assert 0.1 < jump["mean"] < jump["p95"] < 0.6e3 * require_cylinder(scene).radius_m
+
+
+def test_a_path_without_contact_has_no_bound(scene: Scene) -> None:
+    times = np.arange(0.0, 0.5, 1.0 / 60.0)
+    above = stroke_points(scene, 0.1 * times) + np.array([0.0, 0.0, 0.05])
+    with pytest.raises(ExperimentError, match="never touches"):
+        bound_errors(scene, times, above)
+
+
+# Repeated strokes
+
+
+def test_the_interval_is_students() -> None:
+    strokes = [{"mean": value, "std": 0.1, "max": 1.0 + value} for value in (1.0, 2.0, 3.0)]
+    found = summarize_means(strokes)
+    assert found["mean"] == 2.0
+    assert found["max"] == 4.0
+    # The 97.5 % quantile of Student's t with two degrees of freedom is 4.3027.
+    assert found["interval"] == pytest.approx(4.30265 / np.sqrt(3.0), rel=1e-5)
+    assert summarize_means(strokes[:1])["interval"] is None
+
+
+def test_failed_strokes_are_counted() -> None:
+    found = summarize_strokes([{"error": "timeout"}])
+    assert found["strokes"] == 0
+    assert found["failed"] == ["timeout"]
+    assert found["delta_d_mm"] is None
+
+
+def test_variants_are_configurations_that_load(tmp_path: Path) -> None:
+    variants = make_variants(DEMO, tmp_path, apparatus=None, ablations=True, radii=True)
+    names = [one.name for one in variants]
+    assert len(names) == len(set(names))
+    assert {"as configured", "no prediction", "tracking none", "stretch only"} <= set(names)
+    for variant in variants:
+        load_graph(variant.launch_file, settings=variant.settings, apparatus=variant.apparatus)
+
+
+def test_twice_the_radius_keeps_the_front_and_the_files(tmp_path: Path, scene: Scene) -> None:
+    radius_m = 2.0 * require_cylinder(scene).radius_m
+    before, after = load_graph(DEMO), load_graph(write_radius_variant(DEMO, tmp_path, radius_m))
+    varied = after.scene_message()
+    assert varied is not None
+    assert require_cylinder(varied).radius_m == radius_m
+    front_m = varied.object.world_from_object.position_m[2] + radius_m
+    assert front_m == pytest.approx(0.0, abs=1e-7)
+    for node in before.nodes:
+        assert after.nodes[node].parameters == before.nodes[node].parameters
