@@ -44,7 +44,7 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.topics import Delivery, Topic, find_topic
-from flexsheet.messages.types import ArmState, PortStatus, Status
+from flexsheet.messages.types import ArmState, PortStatus, SelfCheck, Status
 from flexsheet.nodes import NodeRole
 
 M = TypeVar("M", bound=Message)
@@ -317,6 +317,7 @@ class Node:
         self.last_error = ""
         self.reported_problems = 0
         self.note = ""
+        self.self_checks: tuple[SelfCheck, ...] = ()
         self.started_ns = clock.now_ns()
         self._execution_log = ExecutionLog(clock)
         if epoch is None:
