@@ -7,22 +7,31 @@ noise; the checks see only what a triangulator or a bridge sees.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flexsheet.launch.health.doctor_hosts import check_apparatus
+from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.types import SelfCheck
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES
+from flexsheet.messages.types import SelfCheck, Status, StereoPair
 from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
+from flexsheet.nodes.console import panels
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt
+from flexsheet.nodes.twin.clutter import CLUTTER, FixedPoint, SecondMarker
+from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
 from flexsheet.nodes.twin.truth import apply_apparatus
+from tests.node_harness import build_node
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
 GEOMETRY = StereoGeometry.of(SCENE.camera)
@@ -35,6 +44,7 @@ NOISE_PX = 0.05
 NOMINAL_SEEDS = (100, 101, 102, 103)
 FAULT_SEEDS = (110, 111, 112)
 TEN_MINUTES_S = 600.0
+"""Of virtual time."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +122,23 @@ def observe(seed: int, seconds: float, fault: Fault) -> Iterator[tuple[SelfCheck
             check.on_marks(list(marks[number]), at_ns)
         if number % (FINGER_HZ // 2) == 0:
             yield check.results()
+
+
+def make_status(node: str) -> Status:
+    return Status(
+        node=node,
+        state="running",
+        pid=1,
+        uptime_s=1.0,
+        cpu_ratio=0.0,
+        resident_bytes=0,
+        inputs=(),
+        outputs=(),
+        errors=0,
+        last_error="",
+        note="",
+        plan_hash="",
+    )
 
 
 def suspected(checks: tuple[SelfCheck, ...]) -> set[str]:
@@ -225,3 +252,67 @@ def test_a_calibrated_arm_raises_no_suspicion_in_ten_minutes(seed: int) -> None:
     reports = list(move_arm(seed, TEN_MINUTES_S, 0.0))
     assert {one.cause for one in reports[-1]} == {"servo_lag", "arm_not_following"}
     assert not set().union(*map(suspected, reports))
+
+
+async def test_the_triangulator_names_a_moved_camera_from_images() -> None:
+    """Fixed beads in the images are the reference marks; they are found beside the finger."""
+    beads = tuple(SecondMarker(FixedPoint((float(x), float(y), float(z)))) for x, y, z in MARKS)
+    camera = SCENE.camera
+    pose = camera.world_from_left.model_copy(
+        update={"position_m": camera.world_from_left.position_m + np.array([1e-3, 0.0, 0.0])}
+    )
+    reported = []
+    for true in (camera, camera.model_copy(update={"world_from_left": pose})):
+        shown = TwinCamera(
+            true, finger_radius_m=0.007, seed=100, clutter=replace(CLUTTER["none"], markers=beads)
+        )
+        bench = build_node(
+            Triangulator,
+            TriangulatorParameters(reference_marks_world_m=[tuple(one) for one in MARKS.tolist()]),
+        )
+        await bench.node.setup()
+        await bench.step("scene", SCENE)
+        for number in range(150):
+            bench.clock.move_to(bench.clock.now_ns() + 33_333_333)
+            time_s = number / 30.0
+            left, right = shown.picture(
+                lambda _, time_s=time_s: np.array([0.03 * np.sin(2.0 * time_s), 0.0, 0.04]),
+                exposure_s=0.004,
+                time_s=time_s,
+            )
+            pair = StereoPair(
+                device=true.device, exposure_s=0.004, dropped_frames=0, left=left, right=right
+            )
+            await bench.step("stereo", pair, sequence=number + 1)
+        reported.append({one.cause: one for one in bench.node.self_checks})
+    nominal, moved = reported
+    assert not any(one.suspected for one in nominal.values())
+    assert nominal["camera_moved"].value < 3e-4
+    assert moved["camera_moved"].suspected
+    assert moved["camera_moved"].value == pytest.approx(1e-3, abs=2e-4)
+    assert not moved["cameras_misaligned"].suspected
+
+
+def test_doctor_and_console_show_the_cause_with_its_remedy() -> None:
+    check = SelfCheck(
+        cause="servo_lag",
+        subject="left",
+        unit="s",
+        value=0.052,
+        expected=0.03,
+        threshold=0.01,
+        suspected=True,
+    )
+    status = make_status("arm_left_bridge").model_copy(update={"self_checks": (check,)})
+    text = panels.make_nodes_table({status.node: (status, 0.0)})
+    assert "measured 52.00 ms, expected 30.00" in text
+    assert "servo_lag_s" in text
+    probe = HostProbe("main", Reachability.RESPONDING, nodes={status.node: status})
+    (finding,) = check_apparatus(probe)
+    assert (finding.check, finding.state) == ("self-check", "warning")
+    assert finding.remedy == SELF_CHECK_REMEDIES["servo_lag"]
+    fine = status.model_copy(
+        update={"self_checks": (check.model_copy(update={"suspected": False}),)}
+    )
+    probe = HostProbe("main", Reachability.RESPONDING, nodes={status.node: fine})
+    assert [one.state for one in check_apparatus(probe)] == ["ok"]

@@ -127,7 +127,9 @@ class Triangulator(Node):
             left_origin_px=pair.left_origin_px,
             right_origin_px=pair.right_origin_px,
         )
-        detection = detect_pair(gate=self.tracker.gate(at_ns))
+        gate = self.tracker.gate(at_ns)
+        found = detect_pair(gate=gate)
+        detection = self._check.exclude_marks(found, tracked=gate is not None)
         if pair.skew_s != 0.0:
             motion = self.tracker.velocity_at(at_ns)
             detection = compensate_detection_skew(detection, self.geometry, pair.skew_s, *motion)
@@ -140,9 +142,10 @@ class Triangulator(Node):
             self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
         if reason == "ok" and self.association.is_clutter_search_due(at_ns):
             # After publishing, since nothing waits for this search.
-            detection = detect_pair(gate=None)
-            self.association.track_clutter(at_ns, detection)
-        self._update_self_checks(at_ns, reason, measured, detection)
+            found = detect_pair(gate=None)
+            others = self._check.exclude_marks(found, tracked=False)
+            self.association.track_clutter(at_ns, others)
+        self._update_self_checks(at_ns, reason, measured, found)
         self._note()
 
     def _update_self_checks(

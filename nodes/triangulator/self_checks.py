@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import SelfCheck, SuspectedCause
 from flexsheet.nodes.models.residuals import ResidualMonitor
+from flexsheet.nodes.triangulator.fingertip import StereoDetection
 
 Floats = NDArray[np.float64]
 
@@ -67,6 +69,22 @@ class CameraCheck:
         if seen.any():
             # A moved camera shifts all marks; a median ignores one mark that has moved alone.
             self._camera.add(np.median(offsets[rows, nearest][seen], axis=0), at_ns)
+
+    def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
+        """Return a detection without the reference marks, which must not compete with the finger.
+
+        tracked: whether the search had a gate; a marker in the gate is then the finger's.
+        """
+        if not len(self._marks):
+            return detection
+        markers = detection.markers
+        if not tracked:
+            markers = tuple(one for one in markers if not self._is_mark(one.point))
+        clutter = tuple(one for one in detection.clutter if not self._is_mark(one.point))
+        return replace(detection, markers=markers, clutter=clutter)
+
+    def _is_mark(self, point: Floats) -> bool:
+        return bool((np.linalg.norm(self._marks - point, axis=1) <= MARK_RADIUS_M).any())
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
         """Add a triangulated fingertip (3,) with its reprojection error."""
