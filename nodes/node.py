@@ -268,6 +268,8 @@ class Node:
     measures_clocks: ClassVar[bool] = False
     """Whether stamps of other hosts are not converted to this host's clock."""
     role: ClassVar[NodeRole | None] = None
+    optional_inputs: ClassVar[frozenset[str]] = frozenset()
+    """Ports that stay unconnected in a graph in which no node writes their topic."""
     opens_devices: ClassVar[bool] = False
     """Whether it opens devices, ports or files, so that a replay must not start it."""
 

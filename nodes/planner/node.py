@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from flexsheet.messages.base import Header
@@ -38,6 +40,8 @@ def _is_finite(fingertip: Fingertip) -> bool:
 
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
+
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
 
     parameters: PlannerParameters
     scene: Input[Scene]
