@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from flexsheet.messages.types import FingertipReason
+from flexsheet.messages.types import FingertipReason, SelfCheck, SuspectedCause
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
 
@@ -109,3 +109,34 @@ FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "unconfirmed": "Wait: a new marker is accepted after a few images.",
 }
 """Remedies by `reason` of the topic `fingertip`, except "ok"."""
+
+SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
+    "camera_moved": "the stereo camera is not where the scene says",
+    "cameras_misaligned": "one of the two cameras has moved against the other",
+    "marker_offset": "the finger's marker is not at its assumed position",
+    "servo_lag": "the lag of the arm differs from the configured one",
+    "arm_not_following": "the arm does not do the commanded motion",
+}
+"""Findings by the cause that a self-check suspects."""
+
+SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
+    "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
+    "cameras_misaligned": "Fasten both cameras and lenses, and run `flexsheet calibrate stereo`.",
+    "marker_offset": "Put the marker back where it was, or calibrate its offset again.",
+    "servo_lag": "The measured lag is used. Check the payload and filters of the arm, or set "
+    "`servo_lag_s` of its bridge to the measured lag.",
+    "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",
+}
+"""Remedies by the cause that a self-check suspects."""
+
+_SHOWN_UNITS = {"m": ("mm", 1e3), "s": ("ms", 1e3), "px": ("px", 1.0), "rad": ("mrad", 1e3)}
+
+
+def describe_self_check(check: SelfCheck) -> str:
+    """Return a suspicion with its numbers, for people."""
+    unit, scale = _SHOWN_UNITS[check.unit]
+    subject = f"{check.subject}: " if check.subject else ""
+    return (
+        f"{subject}{SELF_CHECK_FINDINGS[check.cause]} (measured {check.value * scale:.2f} {unit}, "
+        f"expected {check.expected * scale:.2f} ± {check.threshold * scale:.2f} {unit})"
+    )

@@ -195,6 +195,13 @@ class ArmState(Message):
     )
     edge_force_n: NonNegative | None
     cycle_s: NonNegative = Field(description="duration of the last exchange with the arm")
+    servo_lag_s: NonNegative | None = Field(
+        default=None, description="lag of the arm behind its commands, in use; None: unknown"
+    )
+    servo_lag_uncertainty_s: NonNegative | None = Field(
+        default=None,
+        description="standard deviation of the measured lag; None: the lag is not measured",
+    )
 
 
 class Skin(Message):
@@ -390,6 +397,30 @@ class Clocks(Message):
     offsets: tuple[ClockOffset, ...]
 
 
+SuspectedCause = Literal[
+    "camera_moved",
+    "cameras_misaligned",
+    "marker_offset",
+    "servo_lag",
+    "arm_not_following",
+]
+"""What explains a residual: the stereo camera is not where the scene says; one of its two cameras
+has moved against the other; the marker is not at the assumed offset from the finger's pad; an arm
+lags more or less than configured; an arm does not do the commanded motion."""
+
+
+class SelfCheck(MessagePart):
+    """Residual that shows continuously whether what a node assumes is still true."""
+
+    cause: SuspectedCause
+    subject: str = Field(default="", description="device concerned, if there are several")
+    unit: Literal["m", "s", "px", "rad"]
+    value: Finite = Field(description="measured, mean over some seconds")
+    expected: Finite = Field(description="value if everything is as assumed")
+    threshold: Positive = Field(description="maximum deviation of an apparatus in tolerance")
+    suspected: bool = Field(description="true: the deviation exceeds the threshold persistently")
+
+
 class Status(Message):
     """State of a node, published once per second."""
 
@@ -414,6 +445,9 @@ class Status(Message):
         description="handler calls since the last status (in the first seconds: since the start) "
         "in order, for `bag verify`. Columns: input from 0, or timer -1, -2, ...; sequence of the "
         "message; epoch of its writer; time of the call, ns",
+    )
+    self_checks: tuple[SelfCheck, ...] = Field(
+        default=(), description="residuals of the node that have data"
     )
 
 

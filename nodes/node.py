@@ -44,7 +44,7 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.topics import Delivery, Topic, find_topic
-from flexsheet.messages.types import ArmState, PortStatus, Status
+from flexsheet.messages.types import ArmState, PortStatus, SelfCheck, Status
 from flexsheet.nodes import NodeRole
 
 M = TypeVar("M", bound=Message)
@@ -268,6 +268,8 @@ class Node:
     measures_clocks: ClassVar[bool] = False
     """Whether stamps of other hosts are not converted to this host's clock."""
     role: ClassVar[NodeRole | None] = None
+    optional_inputs: ClassVar[frozenset[str]] = frozenset()
+    """Ports that stay unconnected in a graph in which no node writes their topic."""
     opens_devices: ClassVar[bool] = False
     """Whether it opens devices, ports or files, so that a replay must not start it."""
 
@@ -317,6 +319,7 @@ class Node:
         self.last_error = ""
         self.reported_problems = 0
         self.note = ""
+        self.self_checks: tuple[SelfCheck, ...] = ()
         self.started_ns = clock.now_ns()
         self._execution_log = ExecutionLog(clock)
         if epoch is None:

@@ -263,6 +263,7 @@ def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
         clock_id=node.clock.id,
         clock_offsets=tuple(node.clock_table.offsets.values()),
         execution_log=node.drain_execution_log(),
+        self_checks=node.self_checks,
     )
 
 

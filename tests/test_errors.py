@@ -13,9 +13,14 @@ from flexsheet.launch.commands.explain import Entry, entries, find_entries
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
+from flexsheet.messages.notes import (
+    FINGERTIP_REMEDIES,
+    SELF_CHECK_FINDINGS,
+    SELF_CHECK_REMEDIES,
+    NodeNote,
+)
 from flexsheet.messages.topics import UnknownTopicError, find_topic
-from flexsheet.messages.types import FingertipReason
+from flexsheet.messages.types import FingertipReason, SuspectedCause
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -37,6 +42,11 @@ def test_every_kind_of_error_has_its_own_code_and_remedy() -> None:
 
 def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
     assert set(FINGERTIP_REMEDIES) == set(get_args(FingertipReason)) - {"ok"}
+
+
+def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
+    causes = set(get_args(SuspectedCause))
+    assert set(SELF_CHECK_FINDINGS) == set(SELF_CHECK_REMEDIES) == causes
 
 
 @pytest.mark.parametrize(

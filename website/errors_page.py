@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from flexsheet.launch.commands.explain import entries
-from flexsheet.messages.notes import FINGERTIP_REMEDIES
+from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES
 
 INTRODUCTION = """\
 # Errors
@@ -35,6 +35,14 @@ def reference() -> str:
             _table("code", ((entry.code, f"`{entry.phrase}`", entry.remedy) for entry in notes)),
             "## Reasons of an invalid fingertip\n",
             _table("`reason`", FINGERTIP_REMEDIES.items()),
+            "## Causes that self-checks suspect\n",
+            _table(
+                "`cause`",
+                (
+                    (cause, finding, SELF_CHECK_REMEDIES[cause])
+                    for cause, finding in SELF_CHECK_FINDINGS.items()
+                ),
+            ),
         ]
     )
 

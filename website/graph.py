@@ -119,6 +119,16 @@ LAB = GraphDrawing(
             "arm_left_bridge", "renderer", "arm_left", "190,378 190,322 790,322 790,182", (260, 316)
         ),
         _arrow("arm_right_bridge", "renderer", "arm_right", "646,388 820,388 820,182", (780, 381)),
+        _arrow(
+            "arm_left_bridge", "planner", "arm_left", "660,322 660,112 590,112 590,92", (660, 245)
+        ),
+        _arrow(
+            "arm_right_bridge",
+            "planner",
+            "arm_right",
+            "640,378 640,336 706,336 706,122 600,122 600,92",
+            (712, 205),
+        ),
         _wire("arm_left_bridge", "left RV-1A", "Modbus or MXT", "160,412 160,473", (215, 447)),
         _wire("arm_right_bridge", "right RV-1A", "Modbus or MXT", "580,412 580,473", (635, 447)),
         _wire("renderer", "projector", "light", "856,165 890,165 890,473", (908, 330), both=False),

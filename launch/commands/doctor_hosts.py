@@ -85,16 +85,18 @@ def hosts(
 
 
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
-    """Return the findings about all hosts of the running graph; an empty list for a single host."""
+    """Return the findings about all hosts of the running graph; of a single host: self-checks."""
+    from flexsheet.launch.health.doctor_hosts import SELF_CHECK
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.tools import tools_host
 
     if not any(run.plan_file.is_file() for run in list_live_runs()):
         return []
     plan, run = running_graph(None)
+    findings = asyncio.run(check_hosts(plan, tools_host(run), run, timeout_s))
     if len(plan.hosts) == 1:
-        return []
-    return asyncio.run(check_hosts(plan, tools_host(run), run, timeout_s))
+        return [one for one in findings if one.check == SELF_CHECK]
+    return findings
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:

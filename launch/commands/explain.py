@@ -43,7 +43,7 @@ class Entry:
 @cache
 def entries() -> tuple[Entry, ...]:
     """Return the entries of all errors, node notes and fingertip rejection reasons."""
-    from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
+    from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_REMEDIES, NodeNote
 
     for package in PACKAGES:
         root = import_module(f"flexsheet.{package}")
@@ -57,6 +57,7 @@ def entries() -> tuple[Entry, ...]:
         ),
         *(Entry(note.code, note.phrase, note.remedy, phrase=note.phrase) for note in NodeNote),
         *(Entry(reason, "", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()),
+        *(Entry(cause, "", remedy) for cause, remedy in SELF_CHECK_REMEDIES.items()),
     )
 
 

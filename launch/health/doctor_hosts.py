@@ -30,6 +30,7 @@ from flexsheet.launch.running.host import (
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
@@ -119,6 +120,9 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
 }
 """Check, finding and remedy when the host is on, but its launcher does not report."""
 
+SELF_CHECK = "self-check"
+"""Name of the check of the nodes' residuals."""
+
 
 def evaluate_probes(
     plan: ResolvedGraph, here: str, probes: Mapping[str, HostProbe]
@@ -146,8 +150,25 @@ def evaluate_probes(
         found.append(_check_nodes(plan, probe))
         found.append(_check_rates(probe))
         found += _check_devices(plan.nodes_on(host), probe)
+        found += check_apparatus(probe)
         found += _check_resources(probe)
     return found
+
+
+def check_apparatus(probe: HostProbe) -> Iterator[HostFinding]:
+    """Report the causes that the self-checks of a host's nodes suspect."""
+    checks = [one for status in probe.nodes.values() for one in status.self_checks]
+    suspected = [one for one in checks if one.suspected]
+    for one in suspected:
+        yield HostFinding(
+            probe.host,
+            SELF_CHECK,
+            "warning",
+            describe_self_check(one),
+            SELF_CHECK_REMEDIES[one.cause],
+        )
+    if checks and not suspected:
+        yield HostFinding(probe.host, SELF_CHECK, "ok", f"{len(checks)} residuals as expected")
 
 
 def _check_reachability(

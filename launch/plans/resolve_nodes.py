@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,16 @@ class NodeEntry:
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
+
+    def disconnect_optional(self, written: Container[str]) -> None:
+        """Disconnect optional inputs whose topics no node writes, unless the file names them."""
+        if self.type is None:
+            return
+        for port, topic in [*self.ports]:
+            optional = port.name in self.type.optional_inputs and port.name not in self.spec.topics
+            if optional and topic.name not in written:
+                self.ports.remove((port, topic))
+                self.unconnected.append((port, topic))
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
         """Return the unconnected inputs or outputs."""

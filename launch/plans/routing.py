@@ -93,8 +93,9 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Check that every input has a writer."""
+    """Check that every input has a writer; disconnect optional inputs without one."""
     for entry in entries:
+        entry.disconnect_optional(writers)
         for port_name, topic in entry.topics("input"):
             if topic.name not in writers:
                 remedy = (

@@ -10,17 +10,22 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Arming, ArmState, EStop, SheetTarget, Side
 from flexsheet.nodes.arm_bridge.command_scheduler import CommandScheduler
-from flexsheet.nodes.arm_bridge.control import ArmControl, Timeouts
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, GoalTiming, make_goal
-from flexsheet.nodes.arm_bridge.link import ArmLinkError, ArmSilentError
+from flexsheet.nodes.arm_bridge.link import ArmLinkError, ArmSilentError, ArmStatus, Freshness
 from flexsheet.nodes.arm_bridge.link_drivers import make_link
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.path_check import PathChecker
 from flexsheet.nodes.arm_bridge.report import LastExchange, make_arm_state
+from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
+from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.node import Input, Node, Output, periodic
+
+MIN_SERVO_LAG_S = 0.002
+"""Minimum lag that is measured; no arm's servo is faster."""
 
 
 class ArmBridge(Node):
@@ -51,6 +56,14 @@ class ArmBridge(Node):
             max_tracking_error_rad=given.max_tracking_error_rad,
             auto_arming=given.arming == "auto",
         )
+        self._lag = ServoLagEstimator(
+            given.servo_lag_s,
+            LagBounds(
+                min(MIN_SERVO_LAG_S, given.servo_lag_s),
+                max(given.max_servo_lag_s, given.servo_lag_s),
+            ),
+        )
+        self._servo_check = ServoCheck(given.side, given.servo_lag_s)
         self._geometry: ArmGeometry | None = None
         self._last, self._cycle_ns, self._failures = LastExchange(), 0, 0
         self._cycling = asyncio.Lock()
@@ -135,7 +148,7 @@ class ArmBridge(Node):
         self.note = f"{control.mode} {control.reason}; {self._failures} failed exchanges"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
-            state = make_arm_state(control, geometry, other, last, now_ns)
+            state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)
             self.arm.publish(state, source_ns=last.measured_ns)
 
     async def _exchange(self, geometry: ArmGeometry, other: OtherArm | None, step_s: float) -> None:
@@ -157,6 +170,20 @@ class ArmBridge(Node):
             return
         last.on_answer(self.clock.now_ns())
         control.on_measurement(status.joints_rad, status.faults, status.freshness)
+        if self.parameters.measure_servo_lag:
+            self._measure_lag(command, status)
+
+    def _measure_lag(self, command: Command, status: ArmStatus) -> None:
+        """Update the lag from an exchange that commanded a motion."""
+        if command.mode != "move":
+            self._lag.restart()
+            return
+        last = self._last
+        self._lag.on_command(last.sent_ns * 1e-9, command.joints_rad)
+        if status.freshness is Freshness.FRESH:
+            # The arm reads its joints between the command and the arrival of its answer.
+            self._lag.on_measurement(0.5e-9 * (last.sent_ns + last.measured_ns), status.joints_rad)
+            self.self_checks = self._servo_check.update(self._lag.estimate, last.measured_ns)
 
     def _read_goal(self) -> Goal | None:
         """Return the newest sheet target, extrapolated to the time when this command acts."""
@@ -167,7 +194,7 @@ class ArmBridge(Node):
             target,
             received_ns=self.sheet_target.received_ns,
             now_ns=self.clock.now_ns(),
-            timing=self._timing,
+            timing=replace(self._timing, servo_lag_s=self._lag.lag_s),
         )
 
     def _read_other(self) -> OtherArm | None:

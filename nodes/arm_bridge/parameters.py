@@ -28,7 +28,15 @@ class ArmBridgeParameters(NodeParameters):
         default=None, description="longest wait for an answer; null: the driver's default"
     )
     servo_lag_s: NonNegative = Field(
-        default=0.03, description="lag of the arm behind a command of constant velocity"
+        default=0.03,
+        description="lag of the arm behind a command of constant velocity; with "
+        "measure_servo_lag, until it is measured",
+    )
+    measure_servo_lag: bool = Field(
+        default=True, description="measure the lag while the arm moves, and use the measured one"
+    )
+    max_servo_lag_s: Positive = Field(
+        default=0.1, description="maximum lag that is measured and used"
     )
     target_period_s: Positive | None = Field(
         default=None,

@@ -9,6 +9,7 @@ from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
+from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 
 @dataclass(slots=True)
@@ -35,6 +36,8 @@ def make_arm_state(
     geometry: ArmGeometry,
     other: OtherArm | None,
     exchange: LastExchange,
+    *,
+    lag: ServoLagEstimator,
     now_ns: int,
 ) -> ArmState:
     """Return the state of an arm that has been measured at least once."""
@@ -65,4 +68,6 @@ def make_arm_state(
         edge_distance_m=distance_m,
         edge_force_n=force_n,
         cycle_s=exchange.duration_s,
+        servo_lag_s=lag.lag_s,
+        servo_lag_uncertainty_s=None if lag.estimate is None else lag.estimate.uncertainty_s,
     )

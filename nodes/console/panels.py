@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from math import isnan
 
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Fingertip, PortStatus, Status
 from flexsheet.nodes.console.controller import EyeViewState
@@ -118,6 +119,10 @@ def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
         if status.errors:
             count = f"{status.errors} error{'s' if status.errors > 1 else ''}"
             text += f"<br>{_mark(BAD, f'{count}: {status.last_error}')}"
+        for check in status.self_checks:
+            if check.suspected:
+                remedy = SELF_CHECK_REMEDIES[check.cause]
+                text += f"<br>{_mark(WARN, f'{describe_self_check(check)}. {remedy}')}"
         rows.append((escape(name), state, f"{100 * status.cpu_ratio:.0f}", text))
     return _table("Nodes", ("node", "state", "CPU, %", "note"), rows, numbers=(2,))
 

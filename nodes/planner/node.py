@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from flexsheet.messages.types import Fingertip, SheetTarget, SoftBody
+from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, SoftBody
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
-from flexsheet.nodes.planner.timing import MonotonicTimestampFilter, update_horizon_s
+from flexsheet.nodes.planner.timing import (
+    ActuationDelayEstimator,
+    MonotonicTimestampFilter,
+    update_horizon_s,
+)
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 
 FIRST_HORIZON_S = 0.05
@@ -35,10 +41,14 @@ def _is_finite(fingertip: Fingertip) -> bool:
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
+
     parameters: PlannerParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
     soft_body: Input[SoftBody]
+    arm_left: Input[ArmState]
+    arm_right: Input[ArmState]
     sheet_target: Output[SheetTarget]
 
     async def setup(self) -> None:
@@ -47,6 +57,10 @@ class Planner(Node):
         self._timestamps = MonotonicTimestampFilter()
         self._writer = ("", 0)
         self._first_step_s = 0.0
+        self._actuation = ActuationDelayEstimator(
+            self.parameters.actuation_delay_s,
+            max(self.parameters.max_actuation_delay_s, self.parameters.actuation_delay_s),
+        )
         fixed_s = self.parameters.prediction_horizon_s
         self._horizon_s = FIRST_HORIZON_S if fixed_s is None else fixed_s
         self._late_count, self._model_note = 0, ""
@@ -81,6 +95,12 @@ class Planner(Node):
             self._compliance.update(soft_body, in_contact=self._trajectory.in_contact)
             self._update_note()
 
+    def on_arm_left(self, arm: ArmState, header: Header) -> None:
+        if self.parameters.measure_actuation_delay:
+            self._actuation.on_arm(arm)
+
+    on_arm_right = on_arm_left
+
     def _update_note(self) -> None:
         late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
         compliance = self._compliance.note if self._compliance is not None else ""
@@ -101,6 +121,7 @@ class Planner(Node):
             self._late_count += 1
             self._update_note()
             return
+        self._actuation.on_fingertip(source_ns, header.publish_ns)
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = trajectory.hold("fingertip_invalid", step_s)
@@ -124,7 +145,7 @@ class Planner(Node):
             return 0.0
         before_s = self._horizon_s
         max_s = (len(fingertip.predicted_path_world_m) - 1) * fingertip.prediction_step_s
-        needed_s = age_s + self.parameters.actuation_delay_s
+        needed_s = age_s + self._actuation.delay_s
         self._horizon_s = update_horizon_s(before_s, needed_s, max_s)
         return self._horizon_s - before_s
 

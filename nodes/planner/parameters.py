@@ -23,10 +23,18 @@ class PlannerParameters(NodeParameters):
     prediction_horizon_s: NonNegative | None = Field(
         default=None,
         description="time from the exposure for which the sheet is planned; null: the "
-        "fingertips' mean age plus actuation_delay_s",
+        "fingertips' mean age plus the actuation delay",
     )
     actuation_delay_s: NonNegative = Field(
-        default=0.036, description="time from a fingertip's publication until the sheet moves"
+        default=0.036,
+        description="time from a fingertip's publication until the sheet moves; with "
+        "measure_actuation_delay, until it is measured",
+    )
+    measure_actuation_delay: bool = Field(
+        default=True, description="measure the delay from the states of the arms, and use it"
+    )
+    max_actuation_delay_s: Positive = Field(
+        default=0.15, description="maximum delay that is measured and used"
     )
     compliance_mode: ComplianceMode = Field(
         default="force_curve",

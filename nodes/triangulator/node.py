@@ -22,9 +22,14 @@ from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.triangulator.data_association import DataAssociation
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
+from flexsheet.nodes.triangulator.fingertip import (
+    DetectorConfig,
+    StereoDetection,
+    detect_all,
+)
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.skew import compensate_detection_skew
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
@@ -109,6 +114,11 @@ class Triangulator(Node):
             track_timeout_s=p.track_timeout_s,
             confirm_frames=p.confirm_frames,
         )
+        touch_point = p.touch_point_world_m
+        self._check = CameraCheck(
+            np.array(p.reference_marks_world_m, dtype=np.float64),
+            None if touch_point is None else np.array(touch_point),
+        )
         self._period = MeasuredPeriod(1.0 / scene.camera.rate_hz)
         self._restart(self.epoch)
 
@@ -139,7 +149,9 @@ class Triangulator(Node):
             left_origin_px=pair.left_origin_px,
             right_origin_px=pair.right_origin_px,
         )
-        detection = detect_pair(gate=self.tracker.gate(at_ns))
+        gate = self.tracker.gate(at_ns)
+        found = detect_pair(gate=gate)
+        detection = self._check.exclude_marks(found, tracked=gate is not None)
         if pair.skew_s != 0.0:
             motion = self.tracker.velocity_at(at_ns)
             detection = compensate_detection_skew(detection, self.geometry, pair.skew_s, *motion)
@@ -152,8 +164,24 @@ class Triangulator(Node):
             self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
         if reason == "ok" and self.association.is_clutter_search_due(at_ns):
             # After publishing, since nothing waits for this search.
-            self.association.track_clutter(at_ns, detect_pair(gate=None))
+            found = detect_pair(gate=None)
+            others = self._check.exclude_marks(found, tracked=False)
+            self.association.track_clutter(at_ns, others)
+        self._update_self_checks(at_ns, reason, measured, found)
         self._note()
+
+    def _update_self_checks(
+        self,
+        at_ns: int,
+        reason: FingertipReason,
+        measured: TriangulatedPoint | None,
+        detection: StereoDetection,
+    ) -> None:
+        if reason == "ok" and measured is not None:
+            self._check.on_finger(measured.point_world, measured.reprojection_px, at_ns)
+        marks = (*detection.markers, *detection.clutter)
+        self._check.on_marks([one.point for one in marks], at_ns)
+        self.self_checks = self._check.results()
 
     def _restart(self, epoch: int) -> None:
         self.epoch = epoch

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from flexsheet.messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
-from flexsheet.messages.scene import Positive
+from flexsheet.messages.scene import Finite, Positive
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibrationFile
 
@@ -69,3 +69,13 @@ class TriangulatorParameters(NodeParameters):
         default=3, description="number of consecutive consistent points that start a track"
     )
     prediction_horizon_s: Positive = Field(default=0.12, description="length of the predicted path")
+    reference_marks_world_m: tuple[tuple[Finite, Finite, Finite], ...] = Field(
+        default=(),
+        description="positions of fixed marks that look like the finger's marker, for the "
+        "self-check of the camera's pose",
+    )
+    touch_point_world_m: tuple[Finite, Finite, Finite] | None = Field(
+        default=None,
+        description="position of the fingertip when it rests at a known point, for the self-check "
+        "of the marker's offset",
+    )

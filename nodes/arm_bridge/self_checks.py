@@ -1,0 +1,58 @@
+"""Compare an arm's measured lag and tracking error with what is configured and expected."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexsheet.messages.types import SelfCheck, Side
+from flexsheet.nodes.models.residuals import ResidualMonitor
+from flexsheet.nodes.models.servo_lag import LagEstimate
+
+LAG_THRESHOLD_S = 0.01
+"""Deviation of the lag: five standard deviations of a calibrated lag (2 ms), half of 20 ms."""
+
+TRACKING_THRESHOLD_RAD = 0.005
+"""Tracking error beyond that of a servo with the measured lag: 2 mm at 0.4 m, four times what the
+largest tabulated backlash (0.6 mrad per joint) leaves."""
+
+
+class ServoCheck:
+    """Self-checks of one arm from the estimates of its lag."""
+
+    def __init__(self, side: Side, configured_lag_s: float) -> None:
+        self._side, self._configured_lag_s = side, configured_lag_s
+        self._lag = ResidualMonitor(1, threshold=LAG_THRESHOLD_S)
+        self._tracking = ResidualMonitor(1, threshold=TRACKING_THRESHOLD_RAD)
+        self._expected_rad = 0.0
+
+    def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
+        """Add the newest estimate; return the checks that have data."""
+        if estimate is not None:
+            self._lag.add(np.array([estimate.lag_s - self._configured_lag_s]), at_ns)
+            self._expected_rad = estimate.expected_error_rad
+            self._tracking.add(
+                np.array([max(estimate.tracking_error_rad - self._expected_rad, 0.0)]), at_ns
+            )
+        if not self._lag.has_data:
+            return ()
+        expected_rad = self._expected_rad
+        return (
+            SelfCheck(
+                cause="servo_lag",
+                subject=self._side,
+                unit="s",
+                value=self._configured_lag_s + float(self._lag.mean[0]),
+                expected=self._configured_lag_s,
+                threshold=LAG_THRESHOLD_S,
+                suspected=self._lag.suspected,
+            ),
+            SelfCheck(
+                cause="arm_not_following",
+                subject=self._side,
+                unit="rad",
+                value=expected_rad + float(self._tracking.mean[0]),
+                expected=expected_rad,
+                threshold=TRACKING_THRESHOLD_RAD,
+                suspected=self._tracking.suspected,
+            ),
+        )

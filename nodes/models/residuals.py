@@ -1,0 +1,66 @@
+"""Decide from noisy residuals whether an assumption about the apparatus is false.
+
+A residual is averaged exponentially over time.  It is suspicious once its mean has deviated from
+the expected value by more than a threshold for some time without interruption.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+MAX_GAP_S = 1.0
+"""Longest time that one sample covers; a longer pause tells nothing."""
+
+CLEAR_RATIO = 0.8
+"""Fraction of the threshold below which a suspicion ends, so that it does not flicker."""
+
+
+class ResidualMonitor:
+    """Monitor of the mean of a residual with any number of components.
+
+    mean: weighted mean of the samples, in their unit; zeros before the first.
+    suspected: whether the deviation exceeds the threshold.
+    """
+
+    def __init__(
+        self, components: int, *, threshold: float, memory_s: float = 1.5, confirm_s: float = 1.5
+    ) -> None:
+        """Set the rule: `confirm_s` is the time above the threshold before a suspicion."""
+        self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
+        self._memory_s, self._confirm_s = memory_s, confirm_s
+        self._weight_s, self._above_s = 0.0, 0.0
+        self._last_ns: int | None = None
+
+    @property
+    def has_data(self) -> bool:
+        """Return whether the mean covers enough samples to be judged."""
+        return self._weight_s >= 0.5 * self._memory_s
+
+    @property
+    def deviation(self) -> float:
+        """Return the magnitude of the mean."""
+        return float(np.linalg.norm(self.mean))
+
+    def add(self, residual: Floats, at_ns: int) -> None:
+        """Add a residual (components,) minus its expected value; not finite ones are ignored."""
+        if not np.isfinite(residual).all():
+            return
+        step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9
+        self._last_ns = at_ns
+        if step_s <= 0.0:
+            return
+        step_s = min(step_s, MAX_GAP_S)
+        self._weight_s = self._weight_s * math.exp(-step_s / self._memory_s) + step_s
+        self.mean = self.mean + step_s / self._weight_s * (residual - self.mean)
+        if not self.has_data:
+            return
+        limit = self.threshold * (CLEAR_RATIO if self.suspected else 1.0)
+        self._above_s = self._above_s + step_s if self.deviation > limit else 0.0
+        self.suspected = self._above_s >= self._confirm_s or (
+            self.suspected and self._above_s > 0.0
+        )

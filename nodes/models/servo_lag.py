@@ -1,0 +1,216 @@
+"""Estimate the lag of an arm behind its commands from commanded and measured joints.
+
+The measured joints are compared with the commanded ones at each lag of a grid.  The lag with the
+smallest variance of the difference is the estimate: the maximum-likelihood estimate for white noise
+(Knapp and Carter, The generalized correlation method for estimation of time delay, 1976).  Old
+samples are forgotten exponentially.  A constant difference, by gravity or an encoder offset, has no
+influence; motion at constant velocity therefore gives no information.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+GRID_STEP_S = 0.004
+"""Step of the grid of lags; a parabola through three of them gives the minimum."""
+
+MEMORY_S = 1.2
+"""Time constant with which samples are forgotten."""
+
+MIN_OBSERVED_S = 1.0
+"""Weight of moving samples, in seconds, before the first estimate."""
+
+MIN_SPEED_RAD_PER_S = 0.01
+"""Standard deviation of the joints' speed below which the arm does not move enough."""
+
+MAX_MISFIT_RATIO = 0.05
+"""Unexplained fraction of the motion's variance above which the measurements are not the commanded
+motion: an arm that does not move, moves otherwise, or has reversed signs."""
+
+CORRELATION_S = 0.1
+"""Time in which errors of the difference are correlated; it reduces the number of samples."""
+
+MAX_UNCERTAINTY_S = 0.004
+"""Standard deviation of an estimate above which it is not used."""
+
+MAX_SLEW_S_PER_S = 0.02
+"""Maximum rate at which the lag in use changes, so that no target jumps."""
+
+HISTORY = 256
+MIN_COMMANDS = 4
+"""Number of stored commands, and the fewest with which a measurement is compared."""
+
+MIN_STEP_S = 0.012
+"""Shortest time between two measurements in use; more would cost time and tell little."""
+
+MAX_JOINT_RAD = 10.0
+"""Largest angle of a joint; larger ones are errors."""
+
+MAX_GAP_S = 0.05
+"""Gap between commands after which the motion is not known, and the history starts again."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagBounds:
+    """Bounds of the lag (s)."""
+
+    min_s: float
+    max_s: float
+
+    def clip(self, lag_s: float) -> float:
+        """Return the lag within the bounds."""
+        return min(max(lag_s, self.min_s), self.max_s)
+
+
+@dataclass(frozen=True, slots=True)
+class LagEstimate:
+    """Identified lag with its standard deviation, s.
+
+    tracking_error_rad: standard deviation of the difference at this lag, norm over the joints.
+    expected_error_rad: the same of a critically damped servo with this lag on the same motion.
+    """
+
+    lag_s: float
+    uncertainty_s: float
+    tracking_error_rad: float
+    expected_error_rad: float
+
+
+class ServoLagEstimator:
+    """Estimator of one arm's lag; `lag_s` is always finite and within the bounds.
+
+    estimate: the newest identified lag; None before the first.
+    lag_s: the lag in use: the initial one, then a slowly changing one towards the estimate.
+    """
+
+    def __init__(self, initial_s: float, bounds: LagBounds) -> None:
+        """Start at the initial lag, s, which the bounds limit."""
+        self.estimate: LagEstimate | None = None
+        self.lag_s = bounds.clip(initial_s)
+        self._bounds = bounds
+        steps = math.ceil((bounds.max_s - bounds.min_s) / GRID_STEP_S)
+        # One step beyond each bound lets the parabola find a minimum at the bound.
+        self._lags_s = bounds.min_s + GRID_STEP_S * np.arange(-1, steps + 2)
+        self._times_s, self._joints = np.zeros(HISTORY), np.zeros((HISTORY, 6))
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the motion; `lag_s` and `estimate` remain."""
+        self._count = 0
+        count = len(self._lags_s)
+        self._weight = 0.0
+        self._means, self._squares = np.zeros((count, 6)), np.zeros(count)
+        self._speed_mean, self._speed_square = np.zeros(6), 0.0
+        self._position_mean, self._position_square = np.zeros(6), 0.0
+        self._bend_square = 0.0
+        self._last_s: float | None = None
+
+    def on_command(self, at_s: float, joints_rad: Floats) -> None:
+        """Add commanded joints (6,) rad that were sent at `at_s`."""
+        if not (math.isfinite(at_s) and _are_joints(joints_rad)):
+            self.restart()
+            return
+        if self._count and not 0.0 < at_s - self._times_s[self._count - 1] <= MAX_GAP_S:
+            self.restart()
+        if self._count == HISTORY:
+            self._count = HISTORY // 2
+            self._times_s[: self._count] = self._times_s[self._count :]
+            self._joints[: self._count] = self._joints[self._count :]
+        self._times_s[self._count], self._joints[self._count] = at_s, joints_rad
+        self._count += 1
+
+    def on_measurement(self, at_s: float, joints_rad: Floats) -> None:
+        """Add joints (6,) rad that were measured at `at_s`, after the newest command."""
+        if not (math.isfinite(at_s) and _are_joints(joints_rad)):
+            return
+        times = self._times_s[: self._count]
+        if len(times) < MIN_COMMANDS or not 0.0 <= at_s - times[-1] <= MAX_GAP_S:
+            return
+        wanted_s = at_s - self._lags_s
+        if wanted_s[-1] < times[0]:
+            return
+        step_s = 0.0 if self._last_s is None else at_s - self._last_s
+        if 0.0 < step_s < MIN_STEP_S:
+            return
+        self._last_s = at_s
+        if not 0.0 < step_s <= 2.0 * MAX_GAP_S:
+            return
+        self._add(joints_rad, wanted_s, step_s)
+        found = self._solve()
+        if found is None:
+            return
+        self.estimate = found
+        change_s = found.lag_s - self.lag_s
+        limit_s = MAX_SLEW_S_PER_S * step_s
+        self.lag_s = self._bounds.clip(self.lag_s + min(max(change_s, -limit_s), limit_s))
+
+    def _add(self, measured: Floats, wanted_s: Floats, step_s: float) -> None:
+        """Update the weighted moments of all lags by one measurement that covers `step_s`."""
+        times, joints = self._times_s[: self._count], self._joints[: self._count]
+        # Before the first lag of the grid, the newest command is held.
+        index = np.clip(np.searchsorted(times, wanted_s) - 1, 0, len(times) - 2)
+        spans = np.diff(times)
+        share = np.clip((wanted_s - times[index]) / spans[index], 0.0, 1.0)
+        commanded = joints[index] + share[:, None] * (joints[index + 1] - joints[index])
+        speeds = (joints[index[1] + 1] - joints[index[1]]) / spans[index[1]]
+        speeds_before = (joints[index[-1] + 1] - joints[index[-1]]) / spans[index[-1]]
+        bend = (speeds - speeds_before) / (wanted_s[1] - wanted_s[-1])
+        kept = math.exp(-step_s / MEMORY_S)
+        self._weight = kept * self._weight + step_s
+        gain = step_s / self._weight
+        errors = measured - commanded
+        deviation = errors - self._means
+        self._means += gain * deviation
+        self._squares += gain * ((1.0 - gain) * (deviation * deviation).sum(axis=1) - self._squares)
+        self._speed_mean, self._speed_square = _update(
+            self._speed_mean, self._speed_square, speeds, gain
+        )
+        self._position_mean, self._position_square = _update(
+            self._position_mean, self._position_square, commanded[1], gain
+        )
+        self._bend_square += gain * (float(bend @ bend) - self._bend_square)
+
+    def _solve(self) -> LagEstimate | None:
+        """Return the lag with the smallest variance, or None if the motion does not identify it."""
+        if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
+            return None
+        if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
+            return None
+        best = int(np.argmin(self._squares))
+        smallest = float(self._squares[best])
+        if not smallest <= MAX_MISFIT_RATIO * self._position_square:
+            return None
+        shift = 0.0
+        if 0 < best < len(self._squares) - 1:
+            below, above = self._squares[best - 1], self._squares[best + 1]
+            curvature = float(below + above - 2.0 * smallest)
+            shift = 0.5 * float(below - above) / curvature if curvature > 0.0 else 0.0
+        lag_s = self._bounds.clip(
+            float(self._lags_s[best]) + GRID_STEP_S * min(max(shift, -0.5), 0.5)
+        )
+        samples = max(self._weight / CORRELATION_S, 1.0)
+        uncertainty_s = math.sqrt(smallest / (samples * self._speed_square))
+        if not uncertainty_s <= MAX_UNCERTAINTY_S:
+            return None
+        # Expansion of 1 / (1 + s L / 2)^2 against exp(-s L): the difference is (s L)^2 / 4.
+        expected = 0.25 * lag_s**2 * math.sqrt(self._bend_square)
+        return LagEstimate(lag_s, uncertainty_s, math.sqrt(smallest), expected)
+
+
+def _are_joints(joints_rad: Floats) -> bool:
+    """Return whether joints (6,) are finite angles; comparisons with NaN are false."""
+    return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
+
+
+def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
+    """Return the weighted mean (6,) and the total variance with one more value (6,)."""
+    deviation = value - mean
+    return mean + gain * deviation, square + gain * (
+        (1.0 - gain) * float(deviation @ deviation) - square
+    )
