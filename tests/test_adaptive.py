@@ -259,10 +259,10 @@ def test_another_frame_rate_is_followed_at_once() -> None:
     errors = errors_m(path, times_s, follow(times_s, points))
     for begin_s, end_s in ((4.0, 8.0), (8.0, 12.0)):
         chosen = (times_s >= begin_s) & (times_s < end_s)
-        anew = errors_m(path, times_s[chosen], follow(times_s[chosen], points[chosen]))
+        restarted = errors_m(path, times_s[chosen], follow(times_s[chosen], points[chosen]))
         late = times_s[chosen] > begin_s + 0.5
-        assert rms(errors[chosen][late]) < 1.3 * rms(anew[late])
-        assert errors[chosen][:3].max() < 4.0 * rms(anew)
+        assert rms(errors[chosen][late]) < 1.3 * rms(restarted[late])
+        assert errors[chosen][:3].max() < 4.0 * rms(restarted)
 
 
 def test_a_new_track_is_predicted_from_its_first_points() -> None:

@@ -44,7 +44,7 @@ NOISE_PX = 0.05
 NOMINAL_SEEDS = (100, 101, 102, 103)
 FAULT_SEEDS = (110, 111, 112)
 TEN_MINUTES_S = 600.0
-"""Of virtual time."""
+"""Virtual time."""
 
 
 @dataclass(frozen=True)

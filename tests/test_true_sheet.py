@@ -15,9 +15,12 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.sheet_pull import SheetPull, true_friction, true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
+from tests.scenes import set_density
 from tests.test_compliance_experiment import held
 
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE = set_density(
+    load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"), 1200.0
+)
 DEPTH_M = 0.02
 
 

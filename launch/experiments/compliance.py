@@ -309,7 +309,7 @@ class ForceReference:
         elastic_n = np.interp(indented_m, depths_m, curve_n)
         history = ForceHistory.of(self._recorded.apparatus)
         assert history is not None
-        felt_n = apply_history(history, times * 1e-9, elastic_n)
+        felt_n = apply_history(history, np.asarray(times * 1e-9, dtype=np.float64), elastic_n)
         return times, np.where(elastic_n > 0.0, felt_n / np.maximum(elastic_n, 1e-9), 1.0)
 
     def _interpolate_curve_n(self, at_ns: int, depth_m: float) -> float:

@@ -394,7 +394,7 @@ def run_follow(
     recorded = read_gestures(bag)
     begin_ns, end_ns = recorded.windows_ns[path.label]
     inside = (recorded.truth.times_ns >= begin_ns) & (recorded.truth.times_ns <= end_ns)
-    times_s = (recorded.truth.times_ns[inside] - begin_ns) * 1e-9
+    times_s = np.asarray((recorded.truth.times_ns[inside] - begin_ns) * 1e-9, dtype=np.float64)
     bound = bound_errors(
         scene, times_s, recorded.truth.positions[inside], progress, apparatus=truth
     )

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 def world_from_finger(
-    direction_world: Sequence[float], tilt_rad: Sequence[float] = (0.0, 0.0)
+    direction_world: Sequence[float], tilt_rad: Sequence[float] | Floats = (0.0, 0.0)
 ) -> Floats:
     """Return the rotation (3, 3) of a finger.
 

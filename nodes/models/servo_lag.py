@@ -141,7 +141,7 @@ class ServoLagEstimator:
         self._last_s = at_s
         if not 0.0 < step_s <= 2.0 * MAX_GAP_S:
             return
-        self._add(joints_rad, wanted_s, step_s)
+        self._add(joints_rad, np.asarray(wanted_s, dtype=np.float64), step_s)
         found = self._solve()
         if found is None:
             return
