@@ -54,6 +54,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
 """Corrections for a flat sheet, for which four triangles are one plane."""
+EYE_CORRECTIONS: tuple[Correction, ...] = ("none", "two_pass")
 ROUNDS = 40
 
 
@@ -210,28 +211,22 @@ def print_places(bench: CorrectionBench) -> None:
 def print_eyes(bench: CorrectionBench) -> None:
     """Print the error of each eye's image and of the disparity, against the true sheet."""
     scene, half = bench.scene, np.array([0.5 * bench.scene.eyes.interocular_m, 0.0, 0.0])
-    benches = [
-        CorrectionBench(
-            scene.model_copy(
-                update={
-                    "eyes": scene.eyes.model_copy(
-                        update={"centre_world_m": scene.eyes.centre_world_m + side * half}
-                    )
-                }
-            ),
-            stretch=bench.stretch,
-        )
-        for side in (-1.0, 1.0)
-    ]
     cases = [(f"tilted {tilt:+d}°", bench.pushed(0.0, tilt_deg=tilt)) for tilt in (-50, 50)]
     cases += [(f"pushed {depth} mm", bench.pushed(1e-3 * depth)) for depth in (10, 30, 50)]
+    maps: dict[tuple[str, Correction], list[ErrorMap]] = {}
+    for side in (-1.0, 1.0):  # one after the other, since each has its own graphics context
+        centre = scene.eyes.centre_world_m + side * half
+        eyes = scene.eyes.model_copy(update={"centre_world_m": centre})
+        one = CorrectionBench(scene.model_copy(update={"eyes": eyes}), stretch=bench.stretch)
+        for name, case in cases:
+            situation = one.situation(*case)
+            for correction in EYE_CORRECTIONS:
+                found = one.errors(correction, *situation)
+                maps.setdefault((name, correction), []).append(found)
     heading("sheet, mm", "method", "left", "right", "disparity", "vertical", "disparity, 95 %")
-    for name, case in cases:
-        situation = bench.situation(*case)
-        for correction in ("none", "two_pass"):
-            maps = [one.errors(correction, *situation) for one in benches]
-            figures = summarize_eyes(maps[0], maps[1]).values()
-            row(name, correction, *("-" if one is None else f"{one:.3f}" for one in figures))
+    for (name, correction), (left, right) in maps.items():
+        figures = summarize_eyes(left, right).values()
+        row(name, correction, *("-" if figure is None else f"{figure:.3f}" for figure in figures))
 
 
 def print_stretches(bench: CorrectionBench) -> None:

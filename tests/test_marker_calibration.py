@@ -159,7 +159,7 @@ async def test_the_calibrated_fingertip_is_the_pad(tmp_path: Path) -> None:
         ["--twin", str(SCENE_FILE), "--apparatus", str(truth), "--calibration", str(OPTICS),
          "-o", str(file)]
     )  # fmt: skip
-    assert found["touches"] == 9
+    assert found["orientations"] >= 5
     harness = build_node(
         Triangulator, TriangulatorParameters(calibration=OPTICS, marker_calibration=file)
     )

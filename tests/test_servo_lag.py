@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexsheet.messages.types import SheetTarget
+from flexsheet.nodes.arm_bridge.goal import GoalTiming, make_goal
 from flexsheet.nodes.models.servo_lag import (
     MAX_SLEW_S_PER_S,
     LagBounds,
@@ -194,3 +196,27 @@ def test_an_implausible_actuation_delay_is_not_used(
     delay = ActuationDelayEstimator(0.036, 0.15)
     feed(delay, sent_ms, lag_s, **fields)
     assert delay.delay_s == 0.036
+
+
+@pytest.mark.parametrize("lag_s", [BOUNDS.min_s, 0.03, BOUNDS.max_s])
+def test_no_lag_extrapolates_a_target_beyond_its_limit(lag_s: float) -> None:
+    """The limiter checks the command that follows from the goal; the goal is bounded before."""
+    speed_m_per_s, max_extrapolation_s = 0.2, 0.06
+    target = SheetTarget(
+        phase="contact",
+        reason="ok",
+        valid_at_ns=1_000_000_000,
+        world_from_sheet=np.eye(4),
+        twist_world=np.array([speed_m_per_s, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        stretch_ratio=1.05,
+        contact_world_m=np.zeros(3),
+        normal_world=np.array([0.0, 0.0, 1.0]),
+        contact_sheet_m=np.zeros(2),
+        push_depth_m=0.0,
+    )
+    timing = GoalTiming(lag_s, 1.0 / 60.0, max_extrapolation_s)
+    for late_ms in range(-200, 200, 5):
+        now_ns = target.valid_at_ns + 1_000_000 * late_ms
+        goal = make_goal(target, received_ns=now_ns, now_ns=now_ns, timing=timing)
+        moved_m = abs(float(goal.motion.world_from_sheet[0, 3]))
+        assert moved_m <= speed_m_per_s * max_extrapolation_s * (1.0 + 1e-9)

@@ -13,7 +13,6 @@ from flexsheet.launch.calibration.marker_fit import Touch
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
-from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
@@ -139,13 +138,6 @@ def _make_touch(values: dict[str, float], scene: Scene) -> Touch:
     )
 
 
-class TouchNotSeenError(FlexsheetError, ValueError):
-    """Raised when the simulated camera does not see the marker of a touch."""
-
-    code = "touch-not-seen"
-    remedy = "Give an apparatus whose marker the camera sees: a ball, or a smaller offset."
-
-
 SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20), (-15, 20),
                        (12, -18), (12, 18))  # fmt: skip
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
@@ -163,7 +155,8 @@ def simulate_touches(
     """Simulate touches of a known point, seen by the simulated stereo camera.
 
     Each orientation of `SIMULATED_TILTS_DEG` is touched once. The positions are those of the
-    triangulator's detector. calibration: its optics; None: the scene's. Raises TouchNotSeenError.
+    triangulator's detector; a touch whose marker it does not accept is left out. calibration: the
+    detector's optics; None: the scene's.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
@@ -180,23 +173,17 @@ def simulate_touches(
             nail=Nail.of(finger),
         )
         pad = SIMULATED_POINT_M + random.normal(0.0, SIMULATED_HAND_M, 3)
-        touches.append(
-            Touch(
-                marker_m=_see_marker(camera, scene, geometry, pad, tilt_deg),
-                point_m=SIMULATED_POINT_M,
-                world_from_finger=world_from_finger(scene.finger.direction_world, tilt_rad),
-            )
-        )
+        seen = _see_marker(camera, scene, geometry, pad)
+        if seen is not None:
+            turned = world_from_finger(scene.finger.direction_world, tilt_rad)
+            touches.append(Touch(seen, SIMULATED_POINT_M, turned))
     return touches
 
 
 def _see_marker(
-    camera: TwinCamera,
-    scene: Scene,
-    geometry: StereoGeometry,
-    pad: Floats,
-    tilt_deg: tuple[float, float],
-) -> Floats:
+    camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
+) -> Floats | None:
+    """Return the marker's position (3,) with the pad at a point; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
     given = TriangulatorParameters()
     reason, measured = detect(
@@ -217,9 +204,4 @@ def _see_marker(
         volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
         gate=None,
     )
-    if reason != "ok" or measured is None:
-        raise TouchNotSeenError(
-            f"the camera does not see the marker at a tilt of {tilt_deg[0]:g}°, {tilt_deg[1]:g}°: "
-            f"{reason}"
-        )
-    return measured.point_world
+    return measured.point_world if reason == "ok" and measured is not None else None
