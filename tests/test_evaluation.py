@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.experiments import ExperimentError, robustness, sensitivity, sweep
+from flexsheet.launch.experiments.flags import read_flags
 from flexsheet.launch.experiments.follow import (
     LimitedMotion,
     bound_errors,
@@ -35,7 +36,11 @@ from flexsheet.launch.experiments.stroke_table import (
 from flexsheet.launch.experiments.sweep import TrialError, execute_trial, run_sweep
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene, require_cylinder
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import SelfCheck, Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,
@@ -432,3 +437,28 @@ def test_twice_the_radius_keeps_the_front_and_the_files(tmp_path: Path, scene: S
     assert front_m == pytest.approx(0.0, abs=1e-7)
     for node in before.nodes:
         assert after.nodes[node].parameters == before.nodes[node].parameters
+
+
+def test_suspected_causes_are_read_from_the_status_messages(tmp_path: Path) -> None:
+    def check(cause: SuspectedCause, *, suspected: bool) -> SelfCheck:
+        return SelfCheck(
+            cause=cause, unit="m", value=2e-3, expected=0.0, threshold=1e-3, suspected=suspected
+        )
+
+    checks = [
+        (),
+        (check("camera_moved", suspected=True), check("marker_offset", suspected=False)),
+        (check("servo_lag", suspected=True), check("camera_moved", suspected=True)),
+    ]
+    bag = tmp_path / "a.mcap"
+    with BagWriter(bag, {}) as writer:
+        for number, found in enumerate(checks, start=1):
+            status = Status(
+                node="planner", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.1,
+                resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="", note="",
+                plan_hash="plan", self_checks=found,
+            )  # fmt: skip
+            at_ns = 1_000_000_000 * number
+            header = Header(number, at_ns, at_ns, "clock", "planner", 1, "plan")
+            writer.write(TOPICS["status"], status, header, at_ns)
+    assert read_flags(bag) == ["camera_moved", "servo_lag"]

@@ -1,21 +1,17 @@
-"""Read which causes of a wrong belief the nodes reported during a recording."""
+"""Read which causes of a wrong scene the nodes suspected during a recording."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.types import Status
-
-FLAGS_FIELD = "suspected_causes"
-"""Field of `Status` with the causes that the self-checks suspect; absent where no node has any."""
+from flexsheet.messages.types import Status, SuspectedCause
 
 
-def read_flags(bag: Path) -> list[str]:
+def read_flags(bag: Path) -> list[SuspectedCause]:
     """Return the suspected causes of all nodes in a bag, each once, in the order of time."""
-    found: dict[str, None] = {}
+    found: dict[SuspectedCause, None] = {}
     for _, message, _, _ in BagReader(bag, topics=["status"]):
         if isinstance(message, Status):
-            for cause in getattr(message, FLAGS_FIELD, ()):
-                found[str(cause)] = None
+            found.update({check.cause: None for check in message.self_checks if check.suspected})
     return list(found)
