@@ -147,7 +147,7 @@ def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a complete bag of the small graph."""
     folder = tmp_path_factory.mktemp("recorded")
     launched = Launched(
-        write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=2.0"
+        write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=5.0"
     )
     # The listener hears the tenth beat a fifth of a second after the start, and says so by and by.
     wait_until(lambda: told_of_its_stop(folder / "a.mcap"), "the listener's stop in the bag")
