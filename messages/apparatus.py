@@ -213,7 +213,7 @@ class Devices(Part):
 
 
 class Apparatus(Message):
-    """What is true in the simulator, as differences from a scene."""
+    """True devices of the simulator, as differences from a scene."""
 
     scene: str = Field(description="name of the scene")
     scene_id: str | None = Field(

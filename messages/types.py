@@ -404,7 +404,7 @@ SuspectedCause = Literal[
     "servo_lag",
     "arm_not_following",
 ]
-"""What explains a residual: the stereo camera is not where the scene says; one of its two cameras
+"""Explanation of a residual: the stereo camera is not where the scene says; one of its two cameras
 has moved against the other; the marker is not at the assumed offset from the finger's pad; an arm
 lags more or less than configured; an arm does not do the commanded motion."""
 

@@ -56,7 +56,7 @@ def header(sequence: int = 1, at_ns: int = START_NS) -> Header:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """What the finger's node published for one exposure."""
+    """Messages that the finger's node published for one exposure."""
 
     truth: TwinFinger
     pair: StereoPair

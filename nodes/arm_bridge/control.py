@@ -86,7 +86,7 @@ SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
 """Distance to the target at which the sheet changes to FOLLOW_BOUNDS, until the next stop."""
 
 MEASURED_SLACK_M = 0.002
-"""How far a measured flange may exceed a limit of commands; servos ripple."""
+"""Maximum excess of a measured flange over a limit of commands; servos ripple."""
 
 SLACK_STRETCH = 1.0005
 """Stretch ratio at which the sheet counts as slack; its tension is then 0.1 N."""

@@ -1,4 +1,4 @@
-"""What a person's finger does to an object: gestures, each a function of the scene and a seed.
+"""Generate gestures of a finger on an object, each a function of the scene and a seed.
 
 What is known of such motions, and where it is from:
 

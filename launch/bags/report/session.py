@@ -130,7 +130,7 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """How often a host was reported busy, and its worst report."""
+    """Number of reports that a host is busy, and the worst of them."""
 
     reports: int = 0
     busy: int = 0
