@@ -22,7 +22,8 @@ BANNED = {
     r"\b_?(LEAST|MOST|LARGEST|SMALLEST|FURTHEST|FARTHEST|LONGEST|SHORTEST|FEWEST|FINEST)_":
         "name a limit MIN_ or MAX_",
     r'"""(Of|As|So|What|How) ': "begin a docstring with an imperative sentence",
-    r"\b(whereabouts|unlikeness|foremost|foretold|mended|anew|thereby|hitherto|heed|whilst)\b": "see docs/glossary.md",
+    r"\b(whereabouts|unlikeness|foremost|foretold|mended|anew|thereby|hitherto|heed|whilst)\b":
+        "see docs/glossary.md",
 }  # fmt: skip
 PATTERNS = {re.compile(pattern): remedy for pattern, remedy in BANNED.items()}
 

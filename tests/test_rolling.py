@@ -230,7 +230,7 @@ def test_a_convex_object_needs_no_lift() -> None:
 
 
 class Bowl(Convex):
-    """What `compute_rim_lift_m` asks of a shape: here, one that is hollow all around."""
+    """Shape that is hollow all around, for `compute_rim_lift_m`."""
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         return 0.002 * radius_m / 0.03

@@ -201,7 +201,7 @@ class Chain:
                 assert node.errors == 0, node.last_error
 
     async def picture(self, shading: Shading, *messages: tuple[str, Message]) -> TwinEye:
-        """What the eye sees and ought to see, the sheet upright and the arms at rest."""
+        """Return the seen and the expected image, with the sheet upright and the arms at rest."""
         display = Display(
             correction="two_pass",
             stereo="mono",

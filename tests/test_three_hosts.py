@@ -102,7 +102,7 @@ def stands(states: list[ArmState]) -> bool:
 
 
 def followed_rad(lab: Lab, side: str, begin: int) -> float:
-    """How far that joint turned which turned most while its arm followed."""
+    """Return the largest rotation of a joint while its arm followed, rad."""
     joints_rad = [
         state.joints_rad
         for topic, state in lab.seen[begin:]

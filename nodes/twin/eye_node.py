@@ -131,7 +131,7 @@ class TwinEyeNode(Node):
 
     @property
     def _late_light_ns(self) -> int:
-        """Return the delay of the projector's light after the time that the renderer assumes, ns."""
+        """Return the delay of the light after the time that the renderer assumes, ns."""
         truth = self.parameters.apparatus
         return 0 if truth is None else round(1e9 * truth.projector.latency_offset_s)
 
