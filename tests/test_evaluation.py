@@ -310,13 +310,15 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return {"parameter": trial["parameter"], "effects": effects}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
-    names = ",".join([*sizes, "arms.*.servo_lag_s", "sheet.creep_ratio_per_decade"])
+    names = ",".join(
+        [*sizes, "arms.*.servo_lag_s", "sheet.creep_ratio_per_decade", "finger.hand_mass_kg"]
+    )
     arguments = ["experiment", "sensitivity", "--parameters", names, "--output", str(tmp_path)]
     printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
     result = json.loads(printed.stdout)
     keys = {"parameter", "sigma", "sheet_mm", "image_mm", "force_percent", "fingertip_mm"}
     assert all(keys <= set(row) for row in result["rows"])
-    assert len(result["rows"]) == 4 * 4
+    assert len(result["rows"]) == 5 * 4
     assert [row["parameter"] for row in result["ranking"]] == [
         "sheet.modulus_ratio",
         "camera.position_offset_m",
@@ -330,7 +332,8 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert by_parameter["sheet.modulus_ratio"]["fingertip_mm"] == 0.0
     assert by_parameter["arms.*.servo_lag_s"]["evaluation"] == "not_measured"
     assert by_parameter["arms.*.servo_lag_s"]["sheet_mm"] is None
-    assert by_parameter["sheet.creep_ratio_per_decade"]["evaluation"] == "not_simulated"
+    assert by_parameter["sheet.creep_ratio_per_decade"]["evaluation"] == "not_measured"
+    assert by_parameter["finger.hand_mass_kg"]["evaluation"] == "not_simulated"
     assert Path(result["picture"]).stat().st_size > 1000
 
 

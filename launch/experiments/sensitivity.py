@@ -50,6 +50,9 @@ TIMING = frozenset(
         "arms.*.controller_period_s",
         "arms.*.controller_jitter_s",
         "arms.*.backlash_rad",
+        "sheet.friction_coefficient",
+        "sheet.hysteresis_ratio",
+        "sheet.creep_ratio_per_decade",
         "finger.marker_shape",
         "finger.marker_tilt_rad",
         "finger.tremor_frequency_hz",
@@ -64,7 +67,7 @@ TIMING = frozenset(
 )
 """Parameters without effect at rest, or on a noise-free image of a marker's centre.
 
-Stroke and fingertip of a graph show the effect of all but those of eyes and projector.
+Stroke and fingertip of a graph show the effect of all but those of sheet, eyes and projector.
 """
 
 AFFECTED: dict[str, frozenset[Metric]] = {
@@ -99,7 +102,7 @@ def evaluation_of(parameter: str, *, with_graph: bool) -> Evaluation:
         return Evaluation.NOT_SIMULATED
     if parameter not in TIMING:
         return Evaluation.OFFLINE
-    in_motion = with_graph and parameter.partition(".")[0] not in ("eyes", "projector")
+    in_motion = with_graph and parameter.partition(".")[0] not in ("sheet", "eyes", "projector")
     return Evaluation.GRAPH if in_motion else Evaluation.NOT_MEASURED
 
 

@@ -80,6 +80,9 @@ CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
 """Maximum last steps of centre, radius and blur.  The remaining error is the step's square over the
 blur, less than a thousandth of a pixel."""
 
+CONVERGED_ELONGATION_PX = 0.05
+"""Maximum last step of an ellipse's elongation."""
+
 MAX_STEP_PX = 0.7
 MAX_SHIFT_PX = 2.0
 """Bounds on one step, and on the centre's distance from its start."""
@@ -239,9 +242,11 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
         found += step
         bounded = found[:, RADIUS : BLUR + 1]
         np.maximum(np.minimum(bounded, MAX_SHAPE), MIN_SHAPE, out=bounded)
+        is_settled = (np.abs(shape) < CONVERGED_STEP_PX).all()
         if render is _render_ellipse:
             _bound_elongation(found)
-        if (np.abs(shape) < CONVERGED_STEP_PX).all():
+            is_settled &= (np.abs(step[:, ELONGATION]) < CONVERGED_ELONGATION_PX).all()
+        if is_settled:
             converged = True
             break
     return DiscSolution(found, residuals, used, information, gradient * step, converged)
