@@ -254,7 +254,7 @@ def test_a_closed_triangle_on_a_sphere_turns_the_sheet_by_its_solid_angle(
 
 
 TURNED_PER_S = 0.8
-"""Rotation of the sheet by a fast stroke, rad/s: half of what the edges' speed allows."""
+"""Rotation of the sheet by a fast stroke, rad/s: half of the edges' limit."""
 
 
 def normal_errors_deg(

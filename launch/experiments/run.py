@@ -97,7 +97,7 @@ def run_experiment(
 ) -> None:
     """Run a procedure on a launch file's graph, and record it to `bag`.
 
-    apparatus: file or seed of what is true in the simulator; see `load_apparatus`.
+    apparatus: file or seed of the true devices of the simulator; see `load_apparatus`.
     """
     plan = load_graph(launch_file, settings=settings, record=bag, apparatus=apparatus)
     precompute_graph(plan, progress)

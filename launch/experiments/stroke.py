@@ -77,7 +77,7 @@ class DrawnFrames:
     def shifted(self, late_ns: int) -> DrawnFrames:
         """Return the contents at the true time of light, `late_ns` after the stated one.
 
-        The stated age of what was drawn grows by as much.
+        The stated age of the drawn deformation increases by the same time.
         """
         late_s = np.array([late_ns * 1e-9])
         return DrawnFrames(

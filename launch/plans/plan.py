@@ -76,7 +76,7 @@ def load_graph(
     settings: "node.parameter=value" each, with a YAML value; they override the file.
     record: bag to record to; it overrides the file.
     console: add a console and a paused recorder, unless the file has them.
-    apparatus: file or "seed:N" of what is true in the simulator; None: the scene is.
+    apparatus: file or "seed:N" of the simulator's true devices; None: those of the scene.
     Raises BadInputError with all errors of the file.
     """
     document = read_document(path)

@@ -45,7 +45,7 @@ PREDICTION_STEP_S = 0.01
 """Time between the points of the predicted path: ten per period of a 10 Hz tremor."""
 
 TIMEOUT_PERIODS = 2.5
-"""Least time-out of a track in periods of the camera: one image pair may be missed."""
+"""Minimum timeout of a track in periods of the camera: one image pair may be missed."""
 
 
 class Triangulator(Node):

@@ -1,4 +1,4 @@
-"""Apply an apparatus to a scene: what is true instead of what the nodes believe."""
+"""Apply an apparatus to a scene: replace the assumed devices by the true ones."""
 
 from __future__ import annotations
 
