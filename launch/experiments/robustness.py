@@ -11,7 +11,13 @@ import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.run import require_scene
-from flexsheet.launch.experiments.sweep import Progress, Row, raise_if_all_failed, run_sweep
+from flexsheet.launch.experiments.sweep import (
+    Progress,
+    Row,
+    describe_graph,
+    raise_if_all_failed,
+    run_sweep,
+)
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.nodes.twin.tolerance_table import Profile
 
@@ -54,13 +60,10 @@ def run_robustness(
 ) -> dict[str, Any]:
     """Run one trial per seed, and return rows and summary of `experiment robustness --json`."""
     plan = load_graph(launch_file, settings=settings)
-    scene = require_scene(plan)
+    require_scene(plan)
     common = {
         "experiment": "robustness",
-        "launch_file": str(launch_file.resolve()),
-        "settings": list(settings),
-        "scene": scene.name,
-        "graph": plan.hash,
+        **describe_graph(plan, launch_file, settings),
         "profile": profile.value,
         "calibrated": calibrated,
         "seconds": seconds,

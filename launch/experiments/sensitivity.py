@@ -10,7 +10,13 @@ from typing import Any
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.offline import Metric, metric_tolerances
 from flexsheet.launch.experiments.run import require_scene
-from flexsheet.launch.experiments.sweep import Progress, Row, raise_if_all_failed, run_sweep
+from flexsheet.launch.experiments.sweep import (
+    Progress,
+    Row,
+    describe_graph,
+    raise_if_all_failed,
+    run_sweep,
+)
 from flexsheet.launch.plans.apparatus import format_apparatus
 from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.plans.plan import load_graph
@@ -125,10 +131,7 @@ def run_sensitivity(
     scene = require_scene(plan)
     common = {
         "experiment": "sensitivity",
-        "launch_file": str(launch_file.resolve()),
-        "settings": list(settings),
-        "scene": scene.name,
-        "graph": plan.hash,
+        **describe_graph(plan, launch_file, settings),
         "profile": profile.value,
         "calibrated": calibrated,
         "seconds": seconds,

@@ -14,13 +14,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.files import write_file
 from flexsheet.nodes.cache import EtaEstimator
 from flexsheet.nodes.fem_solver.precompute_table import stop_requested
@@ -42,6 +43,18 @@ class TrialError(ExperimentError):
 
     code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."
+
+
+def describe_graph(
+    plan: ResolvedGraph, launch_file: Path, settings: Sequence[str]
+) -> dict[str, Any]:
+    """Return what identifies the graph of a sweep, so that only the same graph continues it."""
+    return {
+        "launch_file": str(launch_file.resolve()),
+        "settings": list(settings),
+        "scene": None if plan.scene is None else plan.scene["name"],
+        "graph": plan.hash,
+    }
 
 
 def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
