@@ -131,8 +131,7 @@ limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-# Pages and pictures of docs/ that are generated from the code: messages, parameters, commands,
-# errors, registers, the graph.
+# The drawings of docs/images.
 pages: setup
 	$(BIN)/python -m website.pages
 
@@ -140,7 +139,7 @@ pages: setup
 charts: setup
 	$(BIN)/flexsheet chart --output docs/charts
 
-# The site: open site/index.html.  Its generator is no part of the program, so it has an environment
+# The site, with the generated reference tables and charts: open site/index.html.  Its generator is no part of the program, so it has an environment
 # of its own.
 $(SITE_STAMP): website/requirements.lock
 	$(PYTHON) -m venv $(SITE_VENV)
@@ -148,7 +147,8 @@ $(SITE_STAMP): website/requirements.lock
 		-r website/requirements.lock
 	@touch $@
 
-docs: $(SITE_STAMP)
+docs: setup $(SITE_STAMP)
+	$(BIN)/python -m website.pages site
 	$(SITE_VENV)/bin/python -m zensical build --clean --strict
 	$(SITE_VENV)/bin/python -m website.finish site
 

@@ -308,13 +308,21 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/charts"))
     parser.add_argument("--redraw", action="store_true")
     arguments = parser.parse_args()
-    numbers, picture = arguments.output / f"{NAME}.json", arguments.output / f"{NAME}.svg"
     if not arguments.redraw:
         arguments.output.mkdir(parents=True, exist_ok=True)
-        numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
-    kept = json.loads(numbers.read_text())
+        (arguments.output / f"{NAME}.json").write_text(json.dumps(measure_all(), indent=1) + "\n")
+    redraw(arguments.output)
+
+
+def redraw(folder: Path) -> None:
+    """Draw the chart from the results in a folder."""
+    results = json.loads((folder / f"{NAME}.json").read_text())
     with page_style():
-        draw(make_points(kept[BY_SIZE]), make_points(kept[BY_CONTACT]), picture)
+        draw(
+            make_points(results[BY_SIZE]),
+            make_points(results[BY_CONTACT]),
+            folder / f"{NAME}.svg",
+        )
 
 
 def make_points(kept: Sequence[dict[str, Any]]) -> list[Point]:

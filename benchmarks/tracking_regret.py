@@ -8,7 +8,7 @@ development.  The least possible error is that of the best linear predictor (Wie
 autocovariance of another, long recording of the same hand and the true measurement noise; it reads
 MAX_TAPS_S of measurements and knows no single axis from another.  A recorded finger (t_s, x_mm,
 y_mm, z_mm) is interpolated by a spline and has no such bound.  --output writes
-`tracking-regret.json`, from which `make pages` makes the tables in docs/tracking.md.
+`tracking-regret.json`, from which `make docs` makes the tables of docs/tracking.md.
 """
 
 from __future__ import annotations

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
+import tempfile
 import tomllib
 import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+from tests.shared import FOLDER_VARIABLE, compute_once
+from website.pages import build
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -48,7 +54,25 @@ class Link:
 
 
 def name(page: Path) -> str:
-    return str(page.relative_to(ROOT))
+    root = ROOT if page.is_relative_to(ROOT) else site_docs().parent
+    return str(page.relative_to(root))
+
+
+@cache
+def site_docs() -> Path:
+    """Return a folder docs/ with the generated tables, built once per run of the tests."""
+
+    def build_once() -> str:
+        folder = tempfile.mkdtemp(prefix="site-", dir=os.environ.get(FOLDER_VARIABLE))
+        build(Path(folder, "docs"))
+        return folder
+
+    return Path(compute_once("site-docs", build_once), "docs")
+
+
+def as_built(page: Path) -> Path:
+    """Return the page in `site_docs` for a page of docs/; other files as they are."""
+    return site_docs() / page.relative_to(DOCS) if page.is_relative_to(DOCS) else page
 
 
 def site_pages() -> list[Path]:

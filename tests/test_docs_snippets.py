@@ -31,7 +31,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
-from tests.doc_pages import ROOT, Block, blocks, code_spans, name, pages
+from tests.doc_pages import ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
 from tests.test_cli_help import parse
 
 LANGUAGES = {"python", "yaml", "bash", "sh", "console", "text"}
@@ -227,11 +227,22 @@ def test_each_call_in_a_block_can_be_made(page: Path) -> None:
 def test_each_call_within_the_text_can_be_made(page: Path) -> None:
     """Only complete calls are tested: without dots, bars and brackets."""
     written = {word for those in BLOCKS[page] for call in calls_of(those) for word in call}
+    check_calls_within_text(page, written)
+
+
+def check_calls_within_text(page: Path, written: set[str]) -> None:
     for line, span in code_spans(page):
         first = span.split(maxsplit=1)[0] if span.split() else ""
         if first in OURS and " " in span and not re.search(r"\.\.\.|…| \| |\[", span):
             for call in commands(span):
                 check_call(call, written, f"{name(page)}:{line}", may_name_only=True)
+
+
+def test_each_call_of_the_generated_tables_can_be_made() -> None:
+    for page in site_pages():
+        built = as_built(page)
+        if built.read_text() != page.read_text():
+            check_calls_within_text(built, set())
 
 
 def calls_of(block: Block) -> Iterator[list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,7 +12,6 @@ from ruamel.yaml import YAML
 
 from benchmarks import external_solvers
 from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
-from flexsheet.launch.methods.charts import write_overview
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute, reference, snapshots
@@ -31,7 +29,6 @@ from flexsheet.nodes.methods import measure
 from tests.soft_bodies import Here
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
-CHARTS = Path(__file__).parents[1] / "docs" / "charts"
 
 
 def small_scene() -> Scene:
@@ -128,9 +125,3 @@ def test_the_family_names_its_reference() -> None:
     assert SOFT_BODY.tolerance(scene) == 0.5
     assert "Newton" in SOFT_BODY.reference
     assert len(SOFT_BODY.methods) >= 5
-
-
-def test_the_page_of_charts_shows_what_benchmarks_left_beside_them(tmp_path: Path) -> None:
-    for name in ("soft-body.json", "soft-body-size.svg"):
-        shutil.copy(CHARTS / name, tmp_path)
-    assert "![soft-body-size](soft-body-size.svg)" in write_overview(tmp_path).read_text()

@@ -1,4 +1,4 @@
-"""Generate the arm control's states and transitions in docs/arms.md, between its marks."""
+"""Generate the arm control's states and transitions."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ from flexsheet.nodes.arm_bridge.state_machine import (
     Event,
     State,
 )
-from website.registers_page import replace_block
-
-BEGIN = "<!-- states: written by `make pages`; a test compares -->\n"
-END = "<!-- end of states -->\n"
 
 
-def page(text: str) -> str:
-    """Return the page with the generated block.  Raises ValueError if a mark is missing."""
-    return replace_block(text, BEGIN, END, f"{_render_states()}\n{_render_transitions()}")
+def render() -> str:
+    """Return the table of states and the table of transitions."""
+    return f"{_render_states()}\n{_render_transitions()}"
 
 
 def _render_states() -> str:

@@ -1,4 +1,4 @@
-"""Generate docs/cli.md: all commands with arguments, options and examples."""
+"""Generate the reference of the command line: all commands with arguments, options and examples."""
 
 from __future__ import annotations
 
@@ -10,18 +10,6 @@ from typer.main import get_command
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import examples_in
-
-INTRODUCTION = """\
-# Command line
-
-<!-- Written by `make pages`; a test compares. -->
-
-Data goes to stdout, all else to stderr; `--json` prints the data as JSON.  Exit codes: 0 success,
-1 failure, 2 invalid input, 3 a replay that differs from the recording, or `tune` without a
-sufficient method.  Terminals get colours and progress bars; NO_COLOR disables the colours.
-`flexsheet --install-completion` installs completion of commands, options, topics, nodes, families
-and files in your shell.  Meanings of errors: [errors.md](errors.md).
-"""
 
 
 def commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
@@ -39,12 +27,11 @@ def commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[
         yield from commands(command, path)
 
 
-def reference() -> str:
-    """Return the page."""
+def render() -> str:
+    """Return a list of links, and a section for each command."""
     by_name = dict(commands())
     links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in by_name)
-    sections = [INTRODUCTION, links + "\n"]
-    return "\n".join([*sections, *(_section(name, one) for name, one in by_name.items())])
+    return "\n".join([links + "\n", *(_section(name, one) for name, one in by_name.items())])
 
 
 def anchor(name: str) -> str:

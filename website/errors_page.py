@@ -1,4 +1,4 @@
-"""Generate docs/errors.md from the error classes and the catalogue of notes."""
+"""Generate the tables of errors from the error classes and the catalogue of notes."""
 
 from __future__ import annotations
 
@@ -7,28 +7,13 @@ from collections.abc import Iterable
 from flexsheet.launch.commands.explain import entries
 from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES
 
-INTRODUCTION = """\
-# Errors
 
-<!-- Written by `make pages`; a test compares. -->
-
-Every error text names what is wrong, where, and what to do.  The tables below add what each kind of
-error means.  `flexsheet explain CODE` prints an entry, and `flexsheet explain 'THE TEXT'` finds it.
-Exit codes: 0 success, 1 failure, 2 invalid input, 3 a replay that differs from the recording, or
-`tune` without a sufficient method.
-
-Notes of nodes are in the log of `flexsheet launch`, in the topic `status`
-(`flexsheet topic echo status`) and in the console.
-"""
-
-
-def reference() -> str:
-    """Return the page."""
+def render() -> str:
+    """Return the tables of errors, notes, reasons and causes."""
     errors = [entry for entry in entries() if entry.name]
     notes = [entry for entry in entries() if entry.phrase]
     return "\n".join(
         [
-            INTRODUCTION,
             "## Errors of commands and nodes\n",
             _table("code", ((entry.code, entry.meaning, entry.remedy) for entry in errors)),
             "## Notes of nodes\n",

@@ -1,4 +1,4 @@
-"""Generate docs/messages.md from the topic table and the message types."""
+"""Generate the reference of messages from the topic table and the message types."""
 
 from __future__ import annotations
 
@@ -14,51 +14,9 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.topics import TOPICS, Topic
 
-INTRODUCTION = """\
-# Messages
 
-<!-- Written by `make pages`; a test compares. -->
-
-Messages between nodes.  Units are SI and radians; positions and directions are in the
-world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless
-a name says otherwise; `a_from_b` is a 4x4 transform.  The form on sockets and in bags is described
-in `messages/wire.py` and `messages/bag.py`; delivery and clocks in [time and messaging](clocks.md).
-
-## Topics
-
-`latest`: a subscriber gets the newest message; older ones are dropped and counted.  `every`: a
-subscriber gets all messages in order; an overflow is counted and reported.  `latched`: as `every`,
-and a late subscriber first gets the last message.  Writers: "many" if any number of nodes can
-publish.
-"""
-
-HEADER_INTRODUCTION = """\
-## The header
-
-Each message has a header.
-"""
-
-TYPES_INTRODUCTION = """\
-## Types
-
-An array is described by element type and shape; equal names of lengths within one array are equal.
-Arrays never contain NaN or infinity.
-"""
-
-
-def reference() -> str:
-    """Return the page."""
-    types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
-    parts = list(dict.fromkeys(part for kind in types for part in nested_models(kind)))
-    sections = [INTRODUCTION + "\n" + _topic_table(), HEADER_INTRODUCTION + "\n" + _header_table()]
-    sections.append(TYPES_INTRODUCTION)
-    sections += [type_section(kind) for kind in types]
-    sections.append("## Parts\n\nGroups of fields within the types above.\n")
-    sections += [type_section(kind) for kind in parts]
-    return "\n".join(sections)
-
-
-def _topic_table() -> str:
+def render_topics() -> str:
+    """Return the table of topics."""
     rows = [
         (
             f"`{topic.name}`",
@@ -82,7 +40,7 @@ def _rate(topic: Topic) -> str:
     return f"{topic.rate_hz[0]:g}-{topic.rate_hz[1]:g} Hz"
 
 
-def _header_table() -> str:
+def render_header() -> str:
     """Return the table of the header's fields, with descriptions from its docstring."""
     described: dict[str, str] = {}
     for line in inspect.cleandoc(Header.__doc__ or "").splitlines():
@@ -96,6 +54,15 @@ def _header_table() -> str:
         (f"`{name}`", types[name].__name__, described.get(name, "")) for name in Header.__slots__
     ]
     return format_table(("field", "type", "what"), rows)
+
+
+def render_types() -> str:
+    """Return a section for each type of a topic, then for each part of these types."""
+    types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
+    parts = list(dict.fromkeys(part for kind in types for part in nested_models(kind)))
+    sections = [type_section(kind) for kind in types]
+    sections.append("## Parts\n\nGroups of fields within the types above.\n")
+    return "\n".join([*sections, *(type_section(kind) for kind in parts)])
 
 
 def type_section(kind: type[BaseModel]) -> str:

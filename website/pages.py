@@ -1,13 +1,21 @@
-"""Write the pages and drawings of docs/ that are generated from the code.
+"""Draw the figures of docs/, and write the input of the site's generator.
 
-python -m website.pages [DOCS]
+python -m website.pages        write the drawings of docs/images
+python -m website.pages site   write build/docs: docs/ with all generated tables and charts
+
+A line `<!-- include: NAME -->` of a page is replaced in the site by the entry NAME of `TABLES`.
 """
 
 from __future__ import annotations
 
+import re
+import shutil
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from benchmarks import soft_body_size
+from flexsheet.launch.methods import charts
 from website import (
     apparatus_figure,
     arm_states_page,
@@ -22,34 +30,63 @@ from website import (
 )
 from website.graph import DRAWINGS, svg
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+CHARTS = DOCS / "charts"
+SITE_INPUT = ROOT / "build" / "docs"
+INCLUDE = re.compile(r"^<!-- include: ([\w-]+) -->$", re.MULTILINE)
+
+TABLES: Mapping[str, Callable[[], str]] = {
+    "arm-states": arm_states_page.render,
+    "charts": lambda: render_charts(CHARTS),
+    "commands": commands_page.render,
+    "errors": errors_page.render,
+    "message-header": messages_page.render_header,
+    "message-types": messages_page.render_types,
+    "parameters": parameters_page.render,
+    "registers": registers_page.render,
+    "scene-keys": scene_page.render,
+    "tolerances": tolerances_page.render,
+    "topics": messages_page.render_topics,
+    "tracking-regret": lambda: tracking_page.render(CHARTS / "tracking-regret.json"),
+}
 
 
-def generate(docs: Path) -> dict[Path, str]:
-    """Return the contents of all generated files by their path relative to `docs`.
+def render_charts(folder: Path) -> str:
+    """Return a section for each chart of docs/charts."""
+    name = soft_body_size.NAME
+    sections = charts.render_overview(folder, link_prefix="charts/")
+    picture = f"![Time of an answer over the size of the body](charts/{name}.svg)"
+    return f"{sections}\n## {name}\n\n{picture}\n\n[Numbers](charts/{name}.json).\n"
 
-    docs: folder with apparatus.md, arms.md, modbus.md and tracking.md, which are generated in part.
-    """
-    return {
-        Path("messages.md"): messages_page.reference(),
-        Path("cli.md"): commands_page.reference(),
-        Path("parameters.md"): parameters_page.reference(),
-        Path("errors.md"): errors_page.reference(),
-        Path("scene-file.md"): scene_page.reference(),
-        Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
-        Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
-        Path("apparatus.md"): tolerances_page.page(
-            (docs / "apparatus.md").read_text(encoding="utf-8")
-        ),
-        Path("tracking.md"): tracking_page.page(
-            (docs / "tracking.md").read_text(encoding="utf-8"), docs / "charts/tracking-regret.json"
-        ),
-        **{Path("images") / name: svg(picture) for name, picture in DRAWINGS.items()},
-        Path("images") / "apparatus.svg": apparatus_figure.svg(),
-    }
+
+def drawings() -> dict[Path, str]:
+    """Return the drawings that the repository contains, by their path relative to docs/."""
+    drawn = {name: svg(picture) for name, picture in DRAWINGS.items()}
+    drawn["apparatus.svg"] = apparatus_figure.svg()
+    return {Path("images") / name: text for name, text in drawn.items()}
+
+
+def build(output: Path) -> None:
+    """Write docs/ with its generated tables to a folder, which is replaced."""
+    shutil.rmtree(output, ignore_errors=True)
+    shutil.copytree(DOCS, output)
+    for page in output.rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        page.write_text(INCLUDE.sub(lambda match: TABLES[match[1]](), text), encoding="utf-8")
+
+
+def draw_charts(folder: Path) -> None:
+    """Draw the charts of a folder from their results."""
+    for result in charts.read_charts(folder):
+        charts.write_chart(result, folder)
+    soft_body_size.redraw(folder)
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS
-    for path, text in generate(folder).items():
-        (folder / path).write_text(text, encoding="utf-8")
+    if sys.argv[1:] == ["site"]:
+        build(SITE_INPUT)
+        draw_charts(SITE_INPUT / "charts")
+    else:
+        for path, text in drawings().items():
+            (DOCS / path).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Generate docs/parameters.md: the parameters of each node."""
+"""Generate the reference of the parameters of each node."""
 
 from __future__ import annotations
 
@@ -22,22 +22,12 @@ UNITS = {
 }  # fmt: skip
 """Units by suffix of the name; longer suffixes first."""
 
-INTRODUCTION = """\
-# Parameters
 
-<!-- Written by `make pages`; a test compares. -->
-
-Parameters of each node.  Set them in a launch file under `nodes: NAME: parameters:`, or on the
-command line by `--set NAME.PARAMETER=VALUE`.  Names contain the units.  The command
-`flexsheet node describe NODE` prints the parameters with ports and timers.
-"""
-
-
-def reference() -> str:
-    """Return the page."""
+def render() -> str:
+    """Return a section for each node, and for each group of parameters."""
     kinds = [find_parameters_type(node_class(name)) for name in NODES]
     parts = dict.fromkeys(part for kind in kinds for part in nested_models(kind))
-    sections = [INTRODUCTION, *(_section(name) for name in NODES)]
+    sections = [_section(name) for name in NODES]
     return "\n".join([*sections, "## Parts\n", *(type_section(part) for part in parts)])
 
 

@@ -1,4 +1,4 @@
-"""Generate the register map of the Modbus driver in docs/modbus.md, between its marks."""
+"""Generate the register map of the Modbus driver."""
 
 from __future__ import annotations
 
@@ -15,26 +15,10 @@ from flexsheet.nodes.arm_bridge.modbus import (
     count_registers,
 )
 
-BEGIN = "<!-- registers: written by `make pages`; a test compares -->\n"
-END = "<!-- end of registers -->\n"
 KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 
 
-def page(text: str) -> str:
-    """Return the page with the generated block.  Raises ValueError if a mark is missing."""
-    return replace_block(text, BEGIN, END, registers())
-
-
-def replace_block(text: str, begin: str, end: str, content: str) -> str:
-    """Replace the text between two marks.  Raises ValueError if a mark is missing."""
-    before, first, rest = text.partition(begin)
-    _, last, after = rest.partition(end)
-    if not (first and last):
-        raise ValueError(f"the page does not contain the marks {begin.strip()} and {end.strip()}")
-    return f"{before}{first}\n{content}\n{last}{after}"
-
-
-def registers() -> str:
+def render() -> str:
     """Return the tables of both register blocks and of the fault bits."""
     bits = ["Fault bits:", "", "| bit | meaning |", "|---|---|"]
     bits += [f"| {bit} | {FAULT_TEXTS[fault]} |" for bit, fault in FAULT_BITS.items()]

@@ -1,4 +1,4 @@
-"""Generate docs/scene-file.md: every key of a scene file with unit, default and effect."""
+"""Generate the reference of scene files: each key with unit, default and effect."""
 
 from __future__ import annotations
 
@@ -16,26 +16,6 @@ from website.parameters_page import unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
 """Types that the page describes once."""
-
-INTRODUCTION = """\
-# Scene file
-
-<!-- Written by `make pages`; a test compares. -->
-
-A scene file describes the virtual object, the sheet, the devices, the working range and the
-tolerances.  This page lists every key.  A launch file names its scene with the key `scene`
-([launch files](launch-files.md)); `launch/scenes/cylinder.yaml` is a complete example.
-
-Lengths are in metres and angles in radians.  The world frame has its origin at the centre of the
-imaginary screen: x to the right, y up, z towards the user.  Names `a_from_b` are poses of frame b
-in frame a.  Unknown keys are errors.  Numbers also have the limits of their unit
-([limits](launch-files.md#limits)).  `object.support_angle_rad: A` is short for
-`object.support: {kind: strip, angle_rad: A}`.  To check a scene and the reach of the arms:
-
-```bash
-flexsheet doctor scene launch/scenes/cylinder.yaml
-```
-"""
 
 EFFECTS: Mapping[str, str] = {
     "name": "name in logs, bags and reports",
@@ -104,9 +84,9 @@ EFFECTS: Mapping[str, str] = {
 """Effects of keys whose fields have no sufficient description of their own."""
 
 
-def reference() -> str:
-    """Return the page."""
-    sections = [INTRODUCTION, "## Top level\n", _table(_rows(Scene, "", recursive=False))]
+def render() -> str:
+    """Return a table for each group of keys."""
+    sections = ["## Top level\n", _table(_rows(Scene, "", recursive=False))]
     for name, field in Scene.model_fields.items():
         kind = _single_model(field.annotation)
         if kind is None:
@@ -121,7 +101,7 @@ def reference() -> str:
 
 def missing_effects() -> list[str]:
     """Return the keys of a scene file that have no description of their effect."""
-    rows = [line for line in reference().splitlines() if line.startswith("| `")]
+    rows = [line for line in render().splitlines() if line.startswith("| `")]
     return [row.split("`")[1] for row in rows if row.split(" | ")[-1].strip(" |") == ""]
 
 

@@ -1,4 +1,4 @@
-"""Write the table of tolerances into docs/apparatus.md, between its marks."""
+"""Generate the table of tolerances of the apparatus."""
 
 from __future__ import annotations
 
@@ -9,18 +9,10 @@ from flexsheet.nodes.twin.tolerance_table import (
     Tolerance,
     expand_key,
 )
-from website.registers_page import replace_block
-
-BEGIN = "<!-- tolerances: written by `make pages`; a test compares -->\n"
-END = "<!-- end of tolerances -->\n"
 
 
-def page(text: str) -> str:
-    """Return the page with the tolerances of the code; ValueError if a mark is missing."""
-    return replace_block(text, BEGIN, END, _render())
-
-
-def _render() -> str:
+def render() -> str:
+    """Return the table; values that the simulator does not use have a mark."""
     lines = [
         "| parameter | unit | `modern` | `paper` | source | calibrated | source |",
         "|---|---|---|---|---|---|---|",

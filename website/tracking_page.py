@@ -1,4 +1,4 @@
-"""Write the regret of the tracking methods into docs/tracking.md, between its marks."""
+"""Generate the tables of the regret of the tracking methods."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from website.registers_page import replace_block
-
-BEGIN = "<!-- regret: written by `make pages`; a test compares -->\n"
-END = "<!-- end of regret -->\n"
-
 Case = dict[str, Any]
 
 
-def page(text: str, result_file: Path) -> str:
-    """Return the page with the result's tables; ValueError if a mark is missing."""
+def render(result_file: Path) -> str:
+    """Return the tables of a result of `benchmarks.tracking_regret`."""
     result = json.loads(result_file.read_text(encoding="utf-8"))
     parts = [_introduce(result), _by_measurement(result["cases"]), _by_hand(result["cases"])]
-    return replace_block(text, BEGIN, END, "\n".join(parts))
+    return "\n".join(parts)
 
 
 def _introduce(result: dict[str, Any]) -> str:

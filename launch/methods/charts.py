@@ -288,9 +288,14 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the charts of a folder, in the order of `FAMILIES`."""
-    paths = [folder / f"{name}.json" for name in FAMILIES]
-    return [_add_missing_keys(json.loads(path.read_text())) for path in paths if path.exists()]
+    """Read the charts of a folder: those of `FAMILIES` in their order, then those of benchmarks."""
+    order = list(FAMILIES)
+    paths = sorted(
+        folder.glob("*.json"),
+        key=lambda path: (order.index(path.stem) if path.stem in order else len(order), path.stem),
+    )
+    results = (json.loads(path.read_text()) for path in paths)
+    return [_add_missing_keys(result) for result in results if "points" in result]
 
 
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
@@ -304,18 +309,19 @@ def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
 def write_overview(folder: Path) -> Path:
     """Write an overview page of all charts in the folder; return its path."""
     path = folder / OVERVIEW
-    write_file(path, "\n".join(_overview_lines(folder)) + "\n")
+    write_file(path, f"# Speed against accuracy\n\n{render_overview(folder)}")
     return path
 
 
-def _overview_lines(folder: Path) -> Iterator[str]:
-    yield "# Speed against accuracy\n"
-    yield (
-        "Time and error of every method, measured on one machine and one scene by "
-        "`flexsheet chart --output docs/charts`. *In range* counts the cases in a method's stated "
-        "range. The front has the methods that no other method dominates in time and error. "
-        "The numbers of each figure are beside it as JSON.\n"
-    )
+def render_overview(folder: Path, link_prefix: str = "") -> str:
+    """Return a section for each chart in the folder.
+
+    link_prefix: path from the page to the folder, with a slash at its end.
+    """
+    return "\n".join(_overview_lines(folder, link_prefix)) + "\n"
+
+
+def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
     for result in read_charts(folder):
         name, unit = result["family"], result["unit"]
         commit = (result.get("code") or {}).get("commit") or "unknown"
@@ -323,17 +329,13 @@ def _overview_lines(folder: Path) -> Iterator[str]:
         yield (
             f"Against {result['reference']}; scene {result['scene']}, tolerance "
             f"{result['tolerance']:.3g} {unit}. {result['machine']}; code {commit[:10]}. "
-            f"[Numbers]({name}.json).\n"
+            f"[Numbers]({link_prefix}{name}.json).\n"
         )
-        yield f"![{name}: time against error of each method]({name}.svg)\n"
+        yield f"![{name}: time against error of each method]({link_prefix}{name}.svg)\n"
         yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
         yield "|---|---|---|---|---|"
         yield from map(_overview_row, summarize_methods(result["points"]))
         yield ""
-        # Benchmarks of the same methods write their charts as FAMILY-NAME.
-        for more in sorted(folder.glob(f"{name}-*.svg")):
-            if more.stem not in FAMILIES:
-                yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
