@@ -34,7 +34,8 @@ START = DOCS / "index.md"
 
 def targets(page: Path) -> set[Path]:
     """Return the pages of the site that a page links to."""
-    found = ((page.parent / link.target.partition("#")[0]).resolve() for link in links(as_built(page)))
+    all_links = links(as_built(page))
+    found = ((page.parent / link.target.partition("#")[0]).resolve() for link in all_links)
     return {target for target in found if target.suffix == ".md" and DOCS in target.parents}
 
 
