@@ -131,7 +131,7 @@ limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-# The drawings of docs/images.
+# The figures of pages from docs/results, and the drawings of docs/images.
 pages: setup
 	$(BIN)/python -m website.pages
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -119,13 +118,3 @@ def test_the_launch_file_of_the_node_tutorial_runs(tmp_path: Path) -> None:
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     assert run_script(GUARD_SCRIPT, tmp_path).startswith("finger at ")
-
-
-def test_figures_of_the_readme_stand_on_the_page_of_results() -> None:
-    """Each number of the README's table of results is a number of docs/results.md."""
-    number = re.compile(r"(?<![\d.])\d+\.\d+(?![\d.])")
-    readme = (ROOT / "README.md").read_text()
-    table = readme[readme.index("| quantity") :].split("\n\n")[0]
-    numbers = set(number.findall(table))
-    assert numbers
-    assert numbers <= set(number.findall((DOCS / "results.md").read_text()))

@@ -1,6 +1,6 @@
-"""Draw the figures of docs/, and write the input of the site's generator.
+"""Update measured figures and drawings, and write the input of the site's generator.
 
-python -m website.pages        write the drawings of docs/images
+python -m website.pages        write the figures of pages, and the drawings of docs/images
 python -m website.pages site   write build/docs: docs/ with all generated tables and charts
 
 A line `<!-- include: NAME -->` of a page is replaced in the site by the entry NAME of `TABLES`.
@@ -21,6 +21,7 @@ from website import (
     arm_states_page,
     commands_page,
     errors_page,
+    figures,
     messages_page,
     parameters_page,
     registers_page,
@@ -72,7 +73,7 @@ def build(output: Path) -> None:
     shutil.rmtree(output, ignore_errors=True)
     shutil.copytree(DOCS, output)
     for page in output.rglob("*.md"):
-        text = page.read_text(encoding="utf-8")
+        text = figures.strip(page.read_text(encoding="utf-8"))
         page.write_text(INCLUDE.sub(lambda match: TABLES[match[1]](), text), encoding="utf-8")
 
 
@@ -88,5 +89,7 @@ if __name__ == "__main__":
         build(SITE_INPUT)
         draw_charts(SITE_INPUT / "charts")
     else:
+        for page in (ROOT / "README.md", *DOCS.glob("*.md")):
+            page.write_text(figures.update(page.read_text(encoding="utf-8")), encoding="utf-8")
         for path, text in drawings().items():
             (DOCS / path).write_text(text, encoding="utf-8")

@@ -355,9 +355,12 @@ def _measure_images(
 def _print_rows(
     rows: list[dict[str, Any]], bag: Path, map_file: Path | None, *, as_json: bool
 ) -> None:
+    from flexsheet.launch.experiments import image
+
     if as_json:
         maps = {} if map_file is None else {"map": str(map_file)}
-        print_json({"rows": rows, "bag": str(bag), **maps})
+        by_method = image.summarize_methods(rows)
+        print_json({"rows": rows, "by_method": by_method, "bag": str(bag), **maps})
         return
     cells = [
         [f"{cell:.2f}" if isinstance(cell, float) else cell for cell in row.values()]

@@ -248,6 +248,23 @@ def make_rows(
     return result
 
 
+def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return the mean and the maximum error of a size for each correction, mm."""
+    return {
+        method: {
+            "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),
+            "max_mm": max(
+                abs(value)
+                for row in rows
+                if row["method"] == method
+                for key, value in row.items()
+                if key.startswith("delta_")
+            ),
+        }
+        for method in dict.fromkeys(row["method"] for row in rows)
+    }
+
+
 def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
     """Return mean, 95 % quantile and maximum over all visible points, mm; None without points."""
     sizes_mm = 1e3 * errors.sizes_m
