@@ -42,12 +42,21 @@ def compliance(
             metavar="FILE", help="Sheet calibration file, written by `flexsheet calibrate sheet`."
         ),
     ] = None,
+    delay_ms: Annotated[
+        float,
+        typer.Option(
+            "--delay-ms",
+            min=0.0,
+            max=500.0,
+            help="Delay from a measured depth until the sheet has moved by it, ms.",
+        ),
+    ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
     """Check that the sheet can render the compliance of a scene's object; exit code 1 if not.
 
     Compares the object's force with the rendered force, for pushes at the centre to the maximum
-    depth of the scene.
+    depth of the scene. Also checks that no hand can oscillate with the sheet at the delay.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
@@ -66,7 +75,7 @@ def compliance(
             curve = ObjectCurve.from_rows(compute_front_curve(scene))
     except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
-    result = compliance_result(scene, law, curve)
+    result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
     if as_json:
         print_json(result)
     else:
@@ -88,6 +97,7 @@ def compliance(
                 ("stretch", f"{result['stretch_ratio']:.3f}"),
                 ("maximum edge force", f"{result['largest_edge_force_n']:.1f} N"),
                 ("advance per depth", f"{result['advance_per_depth']:.2f}"),
+                ("low-pass filter of the depth", f"{result['filter_ms']:.0f} ms"),
                 ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),
                 ("result", result["note"] or "the error is within the tolerance"),
             ]

@@ -489,3 +489,67 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
         for error in row["failed"]:
             words.print(f"{row['variant']}: a stroke failed: {error}", markup=False)
     words.print(f"rows: {table['folder']}")
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet experiment stability",
+        "flexsheet experiment stability --hands 12 --json",
+    )
+)
+def stability(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    hands: Annotated[
+        int, typer.Option(min=1, max=100, help="Number of drawn hands of each kind.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn hands.")] = 100,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate whether a hand that touches the sheet oscillates; no graph is started.
+
+    Varies the object's stiffness, the hand's impedance and the delay, with and without the
+    planner's bounds, and compares the critical gain with the prediction.
+    """
+    import json
+
+    from flexsheet.launch.experiments import stability as experiment
+    from flexsheet.launch.experiments.pictures import draw_stability
+    from flexsheet.launch.experiments.run import require_scene
+    from flexsheet.launch.health.compliance import compute_front_curve
+    from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.nodes.planner.sheet_force import make_force_model
+
+    scene = require_scene(load_graph(launch_file, settings=settings or ()))
+    folder = make_result_folder(output, "stability")
+    with progress_words() as progress:
+        progress("computing the object's force curve")
+        result = experiment.stability_result(
+            scene,
+            make_force_model(scene.sheet),
+            compute_front_curve(scene),
+            experiment.StabilitySettings(hands=hands, seed=seed),
+            progress,
+        )
+    (folder / "stability.json").write_text(json.dumps(result, indent=1) + "\n")
+    image = folder / "stability.png"
+    draw_stability(result, image)
+    if as_json:
+        print_json({**result, "picture": str(image)})
+        return
+    rows = [*result["rows"], *result["without_bounds"]]
+    cells = []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        chosen = [row for row in rows if row["kind"] == kind]
+        unstable = [row for row in chosen if not row["stable"]]
+        cells.append([kind, len(chosen), len(unstable), f"{min(r['margin'] for r in chosen):.2f}"])
+    print_table(["loop", "cases", "not stable", "smallest gain margin"], cells)
+    error, median = result["boundary_error_percent"], result["boundary_median_percent"]
+    if error is not None:
+        words.print(
+            f"critical gain, predicted against simulated: {median:.0f} % median, "
+            f"{error:.0f} % at 95 %, {len(result['boundary'])} boundaries"
+        )
+    words.print(f"image: {image}")

@@ -68,6 +68,7 @@ def precompute(
         precompute_force_table,
         precompute_soft_body,
     )
+    from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter(
@@ -77,6 +78,8 @@ def precompute(
     scene = load_scene(scene_file)
     with progress_words() as progress:
         files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
+        progress("computing the bounds of the loop with the hand")
+        load_or_compute_bounds(scene.camera.rate_hz, cache)
         if scene.methods.sheet_force == "table":
             files["force_table"] = precompute_force_table(scene, cache, progress)
         if skin_spacing_m is not None:

@@ -167,6 +167,54 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
+def draw_stability(result: dict[str, Any], path: Path) -> None:
+    """Draw the fraction of stable hands over object stiffness and delay, one panel per loop."""
+    rows = [*result["rows"], *result["without_bounds"]]
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    objects = sorted({row["object_pa"] for row in rows})
+    delays = sorted({row["delay_ms"] for row in rows})
+    figure = Figure(figsize=(4.0 * len(kinds) + 4.2, 4.0), layout="constrained")
+    *panels, compared = figure.subplots(1, len(kinds) + 1)
+    for panel, kind in zip(panels, kinds, strict=True):
+        grid = [
+            [
+                np.mean(
+                    [
+                        row["stable"]
+                        for row in rows
+                        if (row["kind"], row["object_pa"], row["delay_ms"])
+                        == (kind, object_pa, delay_ms)
+                    ]
+                )
+                for object_pa in objects
+            ]
+            for delay_ms in delays
+        ]
+        shown = panel.imshow(grid, vmin=0.0, vmax=1.0, cmap="RdYlGn", origin="lower", aspect="auto")
+        panel.set_xticks(range(len(objects)), [f"{1e-3 * one:.3g}" for one in objects])
+        panel.set_yticks(range(len(delays)), [f"{one:.0f}" for one in delays])
+        panel.set_xlabel("object's Young's modulus, kPa")
+        panel.set_title(f"loop: {kind}")
+    panels[0].set_ylabel("delay, ms")
+    figure.colorbar(shown, ax=panels, label="fraction of hands that are stable")
+    for towards, colour in ((True, "C3"), (False, "C0")):
+        boundary = [row for row in result["boundary"] if row["towards_finger"] == towards]
+        compared.loglog(
+            [row["simulated_slope"] for row in boundary],
+            [row["predicted_slope"] for row in boundary],
+            ".",
+            color=colour,
+            label="advance" if towards else "retreat",
+        )
+    ends = np.array([0.03, 2.0])
+    compared.plot(ends, ends, color="0.5", linewidth=1)
+    compared.fill_between(ends, 0.8 * ends, 1.2 * ends, color="0.5", alpha=0.2, label="±20 %")
+    compared.set_xlabel("simulated critical slope")
+    compared.set_ylabel("predicted critical slope")
+    compared.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
 SHOWN_PARAMETERS = 30
 METRIC_COLOURS = {
     "sheet_mm": "C0",

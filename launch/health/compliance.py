@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import cache
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.models.hand_loop import OffsetBounds
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel
 from flexsheet.nodes.planner.compliance import (
     TARGET_ERROR_RATIO,
@@ -22,6 +23,7 @@ from flexsheet.nodes.planner.compliance import (
     fit_compliance,
     make_stretch_limits,
 )
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 
 Floats = NDArray[np.float64]
 
@@ -50,16 +52,21 @@ def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
 
 
 def compute_compliance(
-    scene: Scene, law: SheetForceModel, curve: ObjectCurve, *, max_depth_m: float | None = None
+    scene: Scene,
+    law: SheetForceModel,
+    curve: ObjectCurve,
+    *,
+    max_depth_m: float | None = None,
+    bounds: OffsetBounds | None = None,
 ) -> Compliance:
     """Compute the compliance that the planner renders.
 
-    max_depth_m: maximum push depth; None for that of the scene.
+    max_depth_m: maximum push depth; None for that of the scene. bounds: of the loop with the hand.
     """
     return fit_compliance(
         curve,
         law,
-        make_stretch_limits(scene.sheet, law),
+        make_stretch_limits(scene.sheet, law, bounds),
         max_depth_m=scene.working_range.push_depth_m if max_depth_m is None else max_depth_m,
         finger_radius_m=scene.finger.radius_m,
         usable_half_height_m=scene.sheet.usable_half_height_m,
@@ -67,9 +74,27 @@ def compute_compliance(
     )
 
 
-def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) -> dict[str, Any]:
-    """Return the result of `flexsheet doctor compliance --json`."""
-    shown = compute_compliance(scene, law, curve)
+def compliance_result(
+    scene: Scene,
+    law: SheetForceModel,
+    curve: ObjectCurve,
+    *,
+    delay_s: float,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Return the result of `flexsheet doctor compliance --json`.
+
+    delay_s: from a measured depth until the sheet has moved by it.
+    """
+    table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
+    shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
+    filter_s, stable = shown.choose_filter_s()
+    unstable_note = (
+        ""
+        if stable
+        else f"a hand of low damping can oscillate at a delay of {1e3 * delay_s:.0f} ms; reduce "
+        "the delay or use a stiffer object"
+    )
     depths = shown.max_depth_m * np.array(SHOWN_FRACTIONS)
     target, rendered = curve.force_n(depths), shown.rendered_force_n(depths)
     offsets = shown.normal_offset_m(depths)
@@ -96,6 +121,9 @@ def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) ->
         "force_change_by_place_ratio": compute_force_uncertainty_ratio(
             shown.centre, scene.tolerances.sheet_position_m
         ),
-        "note": shown.note,
+        "delay_ms": 1e3 * delay_s,
+        "filter_ms": 1e3 * filter_s,
+        "stable_for_every_hand": stable,
+        "note": "; ".join(filter(None, (shown.note, unstable_note))),
         "rows": rows,
     }

@@ -11,9 +11,10 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import SheetShapeMethod, resolve_method
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import NodeRole
+from flexsheet.nodes import NodeRole, node_class
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.models.sheet.membrane import NoEquilibriumError
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.renderer import deflection_cache
 
 Progress = Callable[[str], None]
@@ -30,11 +31,14 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the deflection shapes of the graph's scene for each of its renderers."""
+    """Compute the cached tables of the graph's planners and renderers."""
     scene = plan.scene_message()
     if scene is None:
         return
     for node in plan.nodes.values():
+        if issubclass(node_class(node.type), node_class("planner")):
+            progress("computing the bounds of the loop with the hand")
+            load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"])
         if node.role is NodeRole.RENDERER and _uses_deflection_shapes(
             scene, node.parameters["sheet_shape"]
         ):

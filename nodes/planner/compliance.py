@@ -7,10 +7,10 @@ remaining indentation i = d - r is the one at which the sheet's model gives the 
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-While the sheet lags behind, a growing offset removes energy from a pushing finger, so it damps.
-An advance (r falls with d) adds energy.  With a lag t and a sheet stiffness k it acts as a damper
-of -k a t, where a is the advance per depth.  Therefore the advance is bounded.  The stretch is the
-least one that renders the curve without an advance, or else the one with the smallest advance.
+While the sheet lags behind, a growing offset removes energy from a pushing finger, so it damps
+slow motion.  An advance (r falls with d) adds energy.  `nodes.models.hand_loop` gives the largest
+slopes at which every hand is stable with the delay that is measured.  The stretch is the least one
+that renders the curve without an advance, or else the one with the smallest advance.
 
 Below the threshold of touch the sheet does not advance.  Otherwise it would respond to the noise of
 the camera while a finger only strokes.
@@ -26,6 +26,7 @@ from scipy.interpolate import BSpline, PchipInterpolator
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.hand_loop import OffsetBounds
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.sheet import (
     edge_force_for_stiffness,
@@ -70,11 +71,13 @@ the skin as a cue (Bergmann Tiest & Kappers 2009); the second: without work or t
 cue (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""Maximum advance of the sheet per depth of the push.
+"""Maximum advance of the sheet per depth of the push: 1.5 times the sheet's own stiffness.
 
-It renders up to 1.5 times the sheet's own stiffness.  With a lag of 10 ms at 100 N/m it removes
-0.5 N s/m of damping, less than a finger has.
+The bounds of the closed loop with the hand are usually lower.
 """
+
+SLOPE_TOLERANCE = 0.03
+"""Excess of a slope over its bound that is accepted; the bounds have larger margins."""
 
 STRETCH_CANDIDATES = 17
 """Number of stretches that are tried between minimum and maximum."""
@@ -137,18 +140,33 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """Limits of the sheet and of the arms that stretch it."""
+    """Limits of the sheet, of the arms that stretch it, and of the loop with the hand.
+
+    bounds: of the offset's slope; None for an analysis without a hand.
+    """
 
     min_stretch_ratio: float
     max_stretch_ratio: float
     edge_force_n: float
     max_advance_per_depth: float = MAX_ADVANCE_PER_DEPTH
+    bounds: OffsetBounds | None = None
+
+    def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
+        """Return the largest advance per depth (n,) at stiffnesses (n,) of the sheet."""
+        result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
+        if self.bounds is None:
+            return result
+        longest_s = float(self.bounds.filters_s[-1])
+        bounded = self.bounds.max_advance(longest_s, stiffnesses_n_per_m)
+        return np.asarray(np.minimum(result, bounded))
 
 
-def make_stretch_limits(sheet: SheetSpec, model: SheetForceModel) -> StretchLimits:
+def make_stretch_limits(
+    sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
+) -> StretchLimits:
     """Return the usable fraction of the scene's limits, for the flat sheet.
 
-    A push adds edge force; `render_force` limits that.
+    A push adds edge force; `render_force` limits that.  bounds: of the loop with the hand.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -160,7 +178,7 @@ def make_stretch_limits(sheet: SheetSpec, model: SheetForceModel) -> StretchLimi
                 (low, middle) if _flat_edge_force_n(model, middle) > force else (middle, high)
             )
         high = low
-    return StretchLimits(least, high, force)
+    return StretchLimits(least, high, force, bounds=bounds)
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
@@ -231,7 +249,7 @@ def render_force(
     """Return the best approximation of the curve with this stretch at this position.
 
     The indentation never makes the edge force exceed its limit; beyond that the sheet moves with
-    the finger.  It grows by at most 1 + `limits.max_advance_per_depth` per depth.
+    the finger.  It grows by at most 1 + `limits.max_advance` per depth.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -256,7 +274,12 @@ def render_force(
         finger_radius_m=finger_radius_m,
     )
     saturated = _saturate(ideal, max_indentation)
-    max_growth = (1.0 + limits.max_advance_per_depth) * depths
+    stiffnesses = model.evaluate(
+        stretch_ratio, saturated, position_m=position_m, finger_radius_m=finger_radius_m
+    ).stiffness_n_per_m
+    advances = limits.max_advance(stiffnesses)
+    growth = 1.0 + np.minimum(advances[1:], advances[:-1])
+    max_growth = np.concatenate([[0.0], np.cumsum(growth * np.diff(depths))])
     indentation = max_growth + np.minimum.accumulate(saturated - max_growth)
     rendered = model.evaluate(
         stretch_ratio, indentation, position_m=position_m, finger_radius_m=finger_radius_m
@@ -368,6 +391,23 @@ class Compliance:
         if depth_m >= self.max_depth_m:
             return 1.0
         return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
+
+    def choose_filter_s(self) -> tuple[float, bool]:
+        """Return the depth's filter that keeps every hand stable, and whether one suffices.
+
+        It is the shortest that permits the slopes of a push at the centre, otherwise the longest.
+        """
+        bounds, push = self.limits.bounds, self.centre
+        if bounds is None:
+            return 0.0, True
+        slopes = 1.0 - np.diff(push.indentation_m) / np.diff(push.depths_m)
+        stiffnesses = np.maximum(push.stiffness_n_per_m[1:], push.stiffness_n_per_m[:-1])
+        for filter_s in bounds.filters_s:
+            low = -bounds.max_advance(float(filter_s), stiffnesses) - SLOPE_TOLERANCE
+            high = bounds.max_retreat(float(filter_s), stiffnesses) + SLOPE_TOLERANCE
+            if ((low <= slopes) & (slopes <= high)).all():
+                return float(filter_s), True
+        return float(bounds.filters_s[-1]), False
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
         """Return the sheet's force (n,), N, at depths (n,), by its model."""

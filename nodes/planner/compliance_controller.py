@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
 from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     Compliance,
     ObjectCurve,
+    StretchLimits,
     choose_stretch,
     fit_at_stretch,
     fit_compliance,
@@ -29,6 +31,12 @@ ComplianceMode = Literal["force_curve", "stiffness"]
 EQUAL_RATIO = 0.02
 """Relative difference below which two curves count as equal: a seventh of the noticeable one."""
 
+FIRST_DELAY_S = 0.06
+"""Delay before it is measured."""
+
+DELAY_HYSTERESIS_S = 0.03
+"""Decrease of the delay below which the bounds stay."""
+
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 """Depths at which curves are compared, over the maximum depth."""
 
@@ -38,6 +46,9 @@ class ComplianceController:
 
     hysteresis_ratio: share of the loading's energy that the rubber loses in a cycle; None: the
         scene's.
+    bounds: on the offset's slope in the loop with the hand; None without a hand.
+    delay_s: from a measured depth until the sheet has moved by it.
+    filter_s: time constant of the depth from which the offset follows; None without bounds.
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
         small pushes by the stretch only, like the paper.
     """
@@ -49,13 +60,18 @@ class ComplianceController:
         mode: ComplianceMode,
         *,
         hysteresis_ratio: float | None = None,
+        bounds: OffsetBoundsTable | None = None,
+        delay_s: float = FIRST_DELAY_S,
     ) -> None:
         self.stretch_ratio = scene.sheet.min_stretch_ratio
         self.note = ""
         self._scene, self._model, self._mode = scene, model, mode
         ratio = scene.sheet.hysteresis_ratio if hysteresis_ratio is None else hysteresis_ratio
         self._hysteresis = HysteresisCorrection(ratio) if ratio else None
-        self._limits = make_stretch_limits(scene.sheet, model)
+        self._bounds, self._delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
+        self._limits = self._make_limits()
+        self.filter_s: float | None = None if bounds is None else float(bounds.filters_s[-1])
+        self._curve: ObjectCurve | None = None
         self._compared_m = scene.working_range.push_depth_m * COMPARED_FRACTIONS
         self._fitted_n: Floats | None = None
         self._compliance: Compliance | None = None
@@ -81,7 +97,32 @@ class ComplianceController:
         self._fit(ObjectCurve.from_rows(rows), in_contact=in_contact)
         self._fitted_n = forces_n
 
+    @property
+    def delay_s(self) -> float:
+        """Return the delay from a measured depth until the sheet has moved by it."""
+        return self._delay_s
+
+    def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
+        """Update the measured delay; a new fit follows outside contact if the bounds change."""
+        self._delay_s = delay_s
+        if self._bounds is None or in_contact:
+            return
+        if self._bounded_delay_s - DELAY_HYSTERESIS_S <= delay_s <= self._bounded_delay_s:
+            return
+        before = self._bounds.at_delay(self._bounded_delay_s)
+        self._bounded_delay_s = delay_s
+        if np.array_equal(before.max_advances, self._bounds.at_delay(delay_s).max_advances):
+            return
+        self._limits = self._make_limits()
+        if self._curve is not None:
+            self._fit(self._curve, in_contact=False)
+
+    def _make_limits(self) -> StretchLimits:
+        bounds = None if self._bounds is None else self._bounds.at_delay(self._bounded_delay_s)
+        return make_stretch_limits(self._scene.sheet, self._model, bounds)
+
     def _fit(self, curve: ObjectCurve, *, in_contact: bool) -> None:
+        self._curve = curve
         scene = self._scene
         fit = fit_compliance
         if in_contact and self._compliance is not None:
@@ -97,7 +138,15 @@ class ComplianceController:
         )
         self._compliance = fitted
         self.stretch_ratio = fitted.stretch_ratio
-        self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted))))
+        hand_note = ""
+        if self._bounds is not None:
+            self.filter_s, suffices = fitted.choose_filter_s()
+            if not suffices:
+                hand_note = (
+                    f"a hand of low damping can oscillate with this object: the sheet follows "
+                    f"after {1e3 * self._delay_s:.0f} ms; reduce the delay or use a stiffer object"
+                )
+        self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
         """Return why the model is invalid for the deepest push at the centre; empty if valid."""

@@ -15,6 +15,7 @@ from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import load_force_model
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import (
@@ -64,6 +65,7 @@ class Planner(Node):
         fixed_s = self.parameters.prediction_horizon_s
         self._horizon_s = FIRST_HORIZON_S if fixed_s is None else fixed_s
         self._late_count, self._model_note = 0, ""
+        self._stopped_oscillations = 0
         path = self.parameters.sheet_calibration
         self._calibration: SheetCalibration | None = None
         if path is not None:
@@ -86,6 +88,8 @@ class Planner(Node):
             model,
             self.parameters.compliance_mode,
             hysteresis_ratio=None if measured is None else float(measured.value),
+            bounds=load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir),
+            delay_s=self._horizon_s,
         )
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._timestamps = MonotonicTimestampFilter()
@@ -104,8 +108,13 @@ class Planner(Node):
     def _update_note(self) -> None:
         late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
         compliance = self._compliance.note if self._compliance is not None else ""
+        stopped = (
+            f"{self._stopped_oscillations} oscillations of finger and sheet stopped"
+            if self._stopped_oscillations
+            else ""
+        )
         model = f"sheet force model: {self._model_note}"
-        self.note = "; ".join(filter(None, (compliance, late, model)))
+        self.note = "; ".join(filter(None, (compliance, late, stopped, model)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         trajectory, compliance = self._trajectory, self._compliance
@@ -136,7 +145,13 @@ class Planner(Node):
             point, velocity = interpolate_path(
                 fingertip.predicted_path_world_m, fingertip.prediction_step_s, self._horizon_s
             )
-            planned = trajectory.follow_finger(point, velocity, compliance, step_s)
+            compliance.set_delay(self._horizon_s, in_contact=trajectory.in_contact)
+            planned = trajectory.follow_finger(
+                point, velocity, compliance, step_s, fingertip.position_world_m
+            )
+            if trajectory.watchdog_triggers != self._stopped_oscillations:
+                self._stopped_oscillations = trajectory.watchdog_triggers
+                self._update_note()
         self._publish(planned, source_ns)
 
     def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:

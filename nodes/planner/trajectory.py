@@ -24,6 +24,7 @@ from flexsheet.nodes.planner.contact_state import (
 )
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
 from flexsheet.nodes.planner.sheet_force import make_rubber
+from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 Floats = NDArray[np.float64]
 
@@ -104,6 +105,7 @@ class SheetTrajectoryPlanner:
         contact = self._contact_state.contact
         self._command = ContactCommand("wait", "ok", contact, np.zeros(6), 0.0)
         self._normal_offset_m = 0.0
+        self._offset = StabilizedOffset()
         home = self._world_from_object @ contact.object_from_sheet
         self._state = JerkLimitedState.at_rest(
             SheetMotion(home, np.zeros(6), sheet.min_stretch_ratio, 0.0)
@@ -115,16 +117,24 @@ class SheetTrajectoryPlanner:
         velocity_world: Floats,
         compliance: ComplianceController,
         step_s: float,
+        measured_world: Floats | None = None,
     ) -> PlannedStep:
-        """Return the sheet `step_s` later, moved towards the contact with a finger (m, m/s)."""
+        """Return the sheet `step_s` later, moved towards the contact with a finger (m, m/s).
+
+        measured_world: the finger when it was measured; position_world is predicted from it.
+        """
         finger = apply(self._object_from_world, position_world)
         velocity = self._object_from_world[:3, :3] @ velocity_world
         object_from_sheet = self._object_from_world @ self.motion.world_from_sheet
         command = self._contact_state.step(finger, velocity, object_from_sheet)
         self._command = command
-        x, y = command.contact.position_sheet_m
-        self._normal_offset_m, per_depth = compliance.normal_offset(
-            command.push_depth_m, (float(x), float(y))
+        measured = finger
+        if measured_world is not None:
+            measured = apply(self._object_from_world, measured_world)
+        moved_m = float((finger - measured) @ command.contact.normal)
+        speed_m_per_s = float(velocity @ command.contact.normal)
+        offset_rate_m_per_s = self._update_offset(
+            compliance, step_s, moved_m=moved_m, speed_m_per_s=speed_m_per_s
         )
         target = SheetMotion(
             self._world_from_object @ command.contact.object_from_sheet,
@@ -132,13 +142,43 @@ class SheetTrajectoryPlanner:
             compliance.stretch_ratio,
             0.0,
         )
-        self._normal_offset_m += self._sag_m(target, float(x))
-        depth_rate_m_per_s = -float(velocity @ command.contact.normal)
+        self._normal_offset_m += self._sag_m(target, float(command.contact.position_sheet_m[0]))
         self._advance(
-            offset_along_normal(target, self._normal_offset_m, per_depth * depth_rate_m_per_s),
-            step_s,
+            offset_along_normal(target, self._normal_offset_m, offset_rate_m_per_s), step_s
         )
         return self._make_step(command)
+
+    def _update_offset(
+        self,
+        compliance: ComplianceController,
+        step_s: float,
+        *,
+        moved_m: float,
+        speed_m_per_s: float,
+    ) -> float:
+        """Update the offset behind the tangent plane and return its rate, m/s.
+
+        moved_m, speed_m_per_s: predicted motion of the finger along the object's normal.
+        """
+        x, y = self._command.contact.position_sheet_m
+        at = (float(x), float(y))
+        depth_m = self._command.push_depth_m
+        if compliance.filter_s is None:
+            self._normal_offset_m, per_depth = compliance.normal_offset(depth_m, at)
+            return -per_depth * speed_m_per_s
+        self._normal_offset_m, rate = self._offset.update(
+            depth_m + moved_m if depth_m > 0.0 else 0.0,
+            lambda filtered_m: compliance.normal_offset(filtered_m, at)[0],
+            step_s=step_s,
+            filter_s=compliance.filter_s,
+            delay_s=compliance.delay_s,
+        )
+        return rate
+
+    @property
+    def watchdog_triggers(self) -> int:
+        """Return how often an oscillation of finger and sheet was stopped."""
+        return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float) -> float:
         """Return the deflection of the sheet by its weight along its normal, x_m from its centre.

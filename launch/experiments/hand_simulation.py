@@ -1,0 +1,198 @@
+"""Simulate a hand that is coupled to the sheet, in time steps of a quarter of a millisecond.
+
+The simulation is the reference for the bounds of the planner and shares no code with them.  The
+finger is a mass on the spring and the damper of the hand, with the finger pad in series.  The sheet
+pushes it by a nonlinear force and cannot pull.  The camera samples the finger with a resolution,
+and the sheet's offset follows after a delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Curve = Callable[[Floats], Floats]
+
+STEPS_PER_PERIOD = 64
+PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
+"""Finger pad in series, at about 1 N: Hertz contact of a tissue of 0.07 to 0.2 MPa."""
+
+CAMERA_RESOLUTION_M = 2e-5
+RELEASE_M = 2e-3
+"""Distance from the equilibrium at which the finger is released."""
+
+MAX_AMPLITUDE_M = 5e-5
+"""Largest oscillation that counts as none."""
+
+SLOWEST_DECAY_PER_S = 0.5
+"""Decay of an oscillation that counts as stable."""
+
+ENERGY_FRACTION = 0.05
+"""Energy that a stable sheet may deliver in 2 s, over the energy of the release."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cases:
+    """Hands and loops that are simulated together; each field has shape (n,).
+
+    depth_m: equilibrium of the finger in the object.  gain: factor of the sheet's motion about the
+    equilibrium.  filter_s, lead_s: of the depth from which the offset follows.
+    """
+
+    mass_kg: Floats
+    damping_ns_per_m: Floats
+    stiffness_n_per_m: Floats
+    delay_s: Floats
+    depth_m: Floats
+    gain: Floats
+    filter_s: Floats
+    lead_s: Floats
+
+    def __len__(self) -> int:
+        return len(self.mass_kg)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Result of a simulation.
+
+    decay_per_s (n,): of the oscillation about its mean, between the second and the last quarter;
+    infinite if it has died out.  amplitude_m (n,): half the range of the last quarter.
+    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s after
+    the first eighth, beyond what a passive sheet returns, over that of the release.
+    """
+
+    decay_per_s: Floats
+    amplitude_m: Floats
+    energy_ratio: Floats
+
+    @property
+    def decays(self) -> NDArray[np.bool_]:
+        """Return which cases (n,) have no sustained oscillation."""
+        died_out = self.amplitude_m <= MAX_AMPLITUDE_M
+        return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
+
+    @property
+    def stable(self) -> NDArray[np.bool_]:
+        """Return which cases (n,) decay, and in which the sheet delivers no energy."""
+        return np.asarray(self.decays & (self.energy_ratio <= ENERGY_FRACTION))
+
+
+class HeldOffset:
+    """Offset of the sheet from sampled depths: filtered, delayed and extrapolated.
+
+    The sheet moves on at its last rate until the next offset takes effect, as the arms do.
+    """
+
+    def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:
+        self._cases, self._offset, self._period_s, self._step_s = cases, offset, period_s, step_s
+        self._weight = np.where(
+            cases.filter_s > 0.0,
+            -np.expm1(-period_s / np.maximum(cases.filter_s, 1e-9)),
+            1.0,
+        )
+        self._filtered = cases.depth_m.copy()
+        self._rest_m = offset(cases.depth_m)
+        delays = np.round(cases.delay_s / step_s).astype(int)
+        self._delays, self._ring = delays, int(delays.max()) + 1
+        # A ring of due times holds at most one offset per sample and case.
+        self._due = np.zeros((self._ring, len(cases)), dtype=bool)
+        self._queued = np.zeros((self._ring, 2, len(cases)))
+        self._last = self._rest_m.copy()
+        self._held, self._rate = self._rest_m.copy(), np.zeros(len(cases))
+        self._columns = np.arange(len(cases))
+
+    def sample(self, step: int, depths_m: Floats) -> None:
+        """Measure the depths (n,) and queue the offsets that follow from them."""
+        seen = CAMERA_RESOLUTION_M * np.round(depths_m / CAMERA_RESOLUTION_M)
+        before = self._filtered
+        self._filtered = before + self._weight * (seen - before)
+        lead = self._cases.lead_s / self._period_s * (self._filtered - before)
+        present = self._scale(self._offset(np.maximum(self._filtered, 0.0)))
+        wanted = self._scale(self._offset(np.maximum(self._filtered + lead, 0.0)))
+        rate = (present - self._last) / self._period_s
+        self._last = present
+        rows = (step + self._delays) % self._ring
+        self._due[rows, self._columns] = True
+        self._queued[rows, 0, self._columns] = wanted
+        self._queued[rows, 1, self._columns] = rate
+
+    def _scale(self, offsets_m: Floats) -> Floats:
+        return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
+
+    def advance(self, step: int) -> Floats:
+        """Return the sheet's offset (n,) at a step."""
+        row = step % self._ring
+        due = self._due[row]
+        self._held = np.where(due, self._queued[row, 0], self._held + self._step_s * self._rate)
+        self._rate = np.where(due, self._queued[row, 1], self._rate)
+        self._due[row] = False
+        return self._held
+
+
+def simulate_release(
+    cases: Cases, *, force: Curve, offset: Curve, period_s: float, seconds: float = 8.0
+) -> Motion:
+    """Release each finger RELEASE_M before its equilibrium and return how it comes to rest.
+
+    force: of the sheet over its indentation, N.  offset: of the sheet over the depth, m; it must
+    leave the sheet indented at the equilibrium.
+    """
+    step_s = period_s / STEPS_PER_PERIOD
+    steps = round(seconds / step_s)
+    sheet = HeldOffset(cases, offset, period_s, step_s)
+    rest_force = force(np.maximum(cases.depth_m - offset(cases.depth_m), 0.0))
+    # The bone lies deeper than the skin by the compression of the pad.
+    bone_rest = cases.depth_m + rest_force / PAD_STIFFNESS_N_PER_M
+    spring_rest = bone_rest + rest_force / cases.stiffness_n_per_m
+    bone, skin = bone_rest - RELEASE_M, cases.depth_m - RELEASE_M
+    speed = np.zeros(len(cases))
+    stored_every = STEPS_PER_PERIOD // 16
+    path = np.empty((-(-steps // stored_every), len(cases)))
+    work = np.empty_like(path)
+    done = np.zeros(len(cases))
+    indented = cases.depth_m - offset(cases.depth_m)
+    stiffness = (force(indented + 1e-4) - force(indented - 1e-4)) / 2e-4
+    for step in range(steps):
+        if step % STEPS_PER_PERIOD == 0:
+            # The camera sees the nail: the bone, less the pad's compression at rest.
+            sheet.sample(step, bone - (bone_rest - cases.depth_m))
+        pushed = force(np.maximum(skin - sheet.advance(step), 0.0))
+        compression = PAD_STIFFNESS_N_PER_M * (bone - skin)
+        skin_speed = speed + (compression - pushed) / PAD_DAMPING_NS_PER_M
+        pad_n = compression + PAD_DAMPING_NS_PER_M * (speed - skin_speed)
+        spring_n = cases.stiffness_n_per_m * (spring_rest - bone)
+        speed = speed + step_s / cases.mass_kg * (spring_n - cases.damping_ns_per_m * speed - pad_n)
+        bone, skin = bone + step_s * speed, skin + step_s * skin_speed
+        # Bounds keep a diverging case finite; it counts as unstable long before.
+        np.clip(bone, -0.5, 0.5, out=bone)
+        np.clip(skin, -0.5, 0.5, out=skin)
+        np.clip(speed, -50.0, 50.0, out=speed)
+        done -= step_s * (pushed - rest_force) * skin_speed
+        if step % stored_every == 0:
+            stored = 0.5 * stiffness * (skin - cases.depth_m) ** 2
+            path[step // stored_every], work[step // stored_every] = bone, done + stored
+    released_j = 0.5 * np.maximum(stiffness, 1.0) * RELEASE_M**2
+    return _evaluate(path, work, released_j, seconds)
+
+
+def _evaluate(path: Floats, work: Floats, released_j: Floats, seconds: float) -> Motion:
+    quarter = len(path) // 4
+    second, last = path[quarter : 2 * quarter], path[3 * quarter :]
+    early = 0.5 * np.ptp(second, axis=0)
+    late = 0.5 * np.ptp(last, axis=0)
+    elapsed_s = 0.5 * seconds
+    with np.errstate(divide="ignore"):
+        decay = np.log(np.maximum(early, 1e-12) / np.maximum(late, 1e-12)) / elapsed_s
+    died_out = late <= 0.5 * MAX_AMPLITUDE_M
+    window = round(2.0 / seconds * len(work))
+    delivered = (work[window:] - work[:-window])[quarter // 2 :]
+    return Motion(
+        decay_per_s=np.where(died_out, np.inf, decay),
+        amplitude_m=late,
+        energy_ratio=delivered.max(axis=0) / released_j,
+    )

@@ -1,0 +1,318 @@
+"""Evaluate whether a hand that touches the sheet is stable: `flexsheet experiment stability`.
+
+Two simulations, in the time domain and without a graph:
+
+- boundary: the critical slope of the sheet's offset for drawn hands and loops, compared with the
+  prediction by the eigenvalues of the sampled loop (`nodes.models.hand_loop`).
+- map: the planner's own offset for objects of several stiffnesses, with every drawn hand at
+  several delays and depths, with and without the bounds of the loop.
+
+Hands are drawn from the ranges of the literature with a seed of their own, so the planner's bounds
+were not made for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.experiments.hand_simulation import Cases, simulate_release
+from flexsheet.launch.experiments.run import Progress
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.hand_loop import (
+    Hand,
+    OffsetBounds,
+    SampledLoop,
+    compute_critical_slope,
+)
+from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel
+from flexsheet.nodes.planner.compliance import (
+    Compliance,
+    ObjectCurve,
+    fit_compliance,
+    make_stretch_limits,
+)
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
+
+Floats = NDArray[np.float64]
+
+HAND_RANGES = {
+    "finger": ((0.004, 0.01), (50.0, 800.0), (0.3, 1.2)),
+    "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
+    "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
+}
+"""Ranges of mass (kg), stiffness (N/m) and damping ratio; sources in `nodes.models.hand_loop`."""
+
+DELAYS_S = (0.01, 0.03, 0.05, 0.07, 0.1)
+RATES_HZ = (30.0, 60.0, 120.0)
+OBJECT_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+DEPTH_FRACTIONS = (0.25, 0.6, 0.95)
+GAINS = (1.0, 1.25, 1.5, 2.0, 3.0)
+"""Factors of the sheet's motion with which the margin is measured."""
+
+LINEAR_STIFFNESS_N_PER_M, LINEAR_DEPTH_M = 100.0, 0.02
+MAX_BOUNDARY_SLOPE = 1.5
+"""Critical slopes above are not compared: the finger loses contact with the sheet there."""
+
+SLOPES = 32
+FILTERS = ((0.0, False), (0.0, True), (0.08, False))
+"""Filter of the depth (s) and whether the depth is predicted over the delay."""
+
+
+@dataclass(frozen=True, slots=True)
+class StabilitySettings:
+    """Extent of the experiment.
+
+    hands: drawn per group, with the seed. rates_hz: of the camera, for the boundary.
+    object_ratios: stiffness of the objects over that of the scene's.
+    """
+
+    hands: int = 4
+    seed: int = 100
+    delays_s: Sequence[float] = DELAYS_S
+    rates_hz: Sequence[float] = RATES_HZ
+    object_ratios: Sequence[float] = OBJECT_RATIOS
+
+
+def draw_hands(count: int, seed: int) -> list[Hand]:
+    """Draw `count` hands from each group, log-uniform in mass and stiffness."""
+    rng = np.random.default_rng(seed)
+    hands = []
+    for masses, stiffnesses, dampings in HAND_RANGES.values():
+        for _ in range(count):
+            mass = float(np.exp(rng.uniform(*np.log(masses))))
+            stiffness = float(np.exp(rng.uniform(*np.log(stiffnesses))))
+            damping = 2.0 * float(rng.uniform(*dampings)) * (mass * stiffness) ** 0.5
+            hands.append(Hand(mass, damping, stiffness))
+    return hands
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Hand in a loop, released at a depth."""
+
+    hand: Hand
+    loop: SampledLoop
+    depth_m: float
+
+
+def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
+    """Return every trial with every gain (trials first)."""
+
+    def repeat(values: Iterable[float]) -> Floats:
+        return np.repeat(np.fromiter(values, dtype=np.float64), len(gains))
+
+    return Cases(
+        mass_kg=repeat(one.hand.mass_kg for one in trials),
+        damping_ns_per_m=repeat(one.hand.damping_ns_per_m for one in trials),
+        stiffness_n_per_m=repeat(one.hand.stiffness_n_per_m for one in trials),
+        delay_s=repeat(one.loop.delay_s for one in trials),
+        depth_m=repeat(one.depth_m for one in trials),
+        gain=np.tile(gains, len(trials)),
+        filter_s=repeat(one.loop.filter_s for one in trials),
+        lead_s=repeat(one.loop.lead_s for one in trials),
+    )
+
+
+def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
+    """Return the smallest slope (n,) at which a simulated hand is not stable; NaN above 1.5.
+
+    All trials have the same period.  The sheet is linear.
+    """
+    slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
+    motion = simulate_release(
+        make_cases(trials, -slopes if towards_finger else slopes),
+        force=lambda indented_m: LINEAR_STIFFNESS_N_PER_M * indented_m,
+        offset=lambda depths_m: depths_m - LINEAR_DEPTH_M,
+        period_s=trials[0].loop.period_s,
+    )
+    result = np.full(len(trials), np.nan)
+    for number, row in enumerate(motion.decays.reshape(len(trials), -1)):
+        unstable = np.flatnonzero(~row)
+        if len(unstable) and unstable[0] > 0:
+            # The boundary lies between two slopes whose ratio is 1.13.
+            result[number] = float(np.sqrt(slopes[unstable[0]] * slopes[unstable[0] - 1]))
+    return result
+
+
+def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
+    """Return the simulated and the predicted critical slope of each hand and loop."""
+    hands = draw_hands(settings.hands, settings.seed)
+    rows: list[dict[str, Any]] = []
+    for rate_hz, towards in product(settings.rates_hz, (True, False)):
+        progress(f"boundary at {rate_hz:g} Hz, {'advance' if towards else 'retreat'}")
+        trials = [
+            Trial(
+                hand,
+                SampledLoop(1.0 / rate_hz, delay_s, filter_s, lead_s=delay_s if lead else 0.0),
+                LINEAR_DEPTH_M,
+            )
+            for hand, delay_s, (filter_s, lead) in product(hands, settings.delays_s, FILTERS)
+        ]
+        simulated = find_critical_slopes(trials, towards_finger=towards)
+        for trial, measured in zip(trials, simulated, strict=True):
+            if not np.isfinite(measured):
+                continue
+            predicted = compute_critical_slope(
+                trial.hand,
+                trial.loop,
+                sheet_stiffness_n_per_m=LINEAR_STIFFNESS_N_PER_M,
+                towards_finger=towards,
+                max_slope=2.0 * MAX_BOUNDARY_SLOPE,
+            )
+            rows.append(
+                {
+                    **_describe(trial.hand, trial.loop.delay_s),
+                    "rate_hz": rate_hz,
+                    "filter_ms": 1e3 * trial.loop.filter_s,
+                    "predicted_depth": trial.loop.lead_s > 0.0,
+                    "towards_finger": towards,
+                    "simulated_slope": float(measured),
+                    "predicted_slope": predicted,
+                    "error_percent": 100.0 * (predicted / float(measured) - 1.0),
+                }
+            )
+    return rows
+
+
+def _describe(hand: Hand, delay_s: float) -> dict[str, float]:
+    return {
+        "mass_kg": hand.mass_kg,
+        "damping_ns_per_m": hand.damping_ns_per_m,
+        "stiffness_n_per_m": hand.stiffness_n_per_m,
+        "delay_ms": 1e3 * delay_s,
+    }
+
+
+def measure_map(
+    scene: Scene,
+    model: SheetForceModel,
+    curve: Floats,
+    settings: StabilitySettings,
+    progress: Progress,
+    *,
+    cache_dir: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Return a row for each object, hand, delay and kind of loop.
+
+    Kinds: "bounded" as the planner runs; "unbounded" without bounds and filter; "predicted" without
+    them and with the depth predicted over the delay.
+    """
+    hands = draw_hands(settings.hands, settings.seed + 1)
+    table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
+    period_s = 1.0 / scene.camera.rate_hz
+    rows: list[dict[str, Any]] = []
+    for ratio in settings.object_ratios:
+        # At equal Poisson ratio the force is proportional to the modulus.
+        scaled = ObjectCurve.from_rows(curve * np.array([1.0, ratio]))
+        object_pa = ratio * scene.object.material.young_modulus_pa
+        progress(f"object of {object_pa:.3g} Pa")
+        for delay_s in settings.delays_s:
+            fitted = _fit(scene, model, scaled, table.at_delay(delay_s))
+            filter_s, suffices = fitted.choose_filter_s()
+            loops = [SampledLoop(period_s, delay_s, filter_s)]
+            for row in _simulate_pushes(fitted, hands, loops):
+                rows.append(
+                    {"object_pa": object_pa, "kind": "bounded", "warned": not suffices} | row
+                )
+        fitted = _fit(scene, model, scaled, None)
+        for kind in ("unbounded", "predicted"):
+            loops = [
+                SampledLoop(period_s, delay_s, lead_s=delay_s if kind == "predicted" else 0.0)
+                for delay_s in settings.delays_s
+            ]
+            for row in _simulate_pushes(fitted, hands, loops):
+                rows.append({"object_pa": object_pa, "kind": kind, "warned": False} | row)
+    return rows
+
+
+def _fit(
+    scene: Scene, model: SheetForceModel, curve: ObjectCurve, bounds: OffsetBounds | None
+) -> Compliance:
+    return fit_compliance(
+        curve,
+        model,
+        make_stretch_limits(scene.sheet, model, bounds),
+        max_depth_m=scene.working_range.push_depth_m,
+        finger_radius_m=scene.finger.radius_m,
+        usable_half_height_m=scene.sheet.usable_half_height_m,
+        position_error_m=scene.tolerances.sheet_position_m,
+    )
+
+
+def _simulate_pushes(
+    fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop]
+) -> list[dict[str, Any]]:
+    """Return a row for each hand and loop; it is stable if it is so at every depth."""
+    indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
+    forces_n = fitted.model.evaluate(
+        fitted.stretch_ratio,
+        indented_m,
+        position_m=CENTRE,
+        finger_radius_m=fitted.finger_radius_m,
+    ).force_n
+    depths_m = np.linspace(0.0, fitted.max_depth_m, 400)
+    offsets_m = fitted.normal_offset_m(depths_m)
+
+    def offset(at_m: Floats) -> Floats:
+        # Beyond the last depth the sheet moves with the finger.
+        beyond = np.maximum(at_m - depths_m[-1], 0.0)
+        return np.asarray(np.interp(at_m, depths_m, offsets_m) + beyond)
+
+    trials = [
+        Trial(hand, loop, fraction * fitted.max_depth_m)
+        for hand, loop, fraction in product(hands, loops, DEPTH_FRACTIONS)
+    ]
+    motion = simulate_release(
+        make_cases(trials, np.array(GAINS)),
+        force=lambda at_m: np.asarray(np.interp(at_m, indented_m, forces_n)),
+        offset=offset,
+        period_s=loops[0].period_s,
+    )
+    stable: NDArray[np.bool_] = np.all(
+        motion.stable.reshape(-1, len(DEPTH_FRACTIONS), len(GAINS)), axis=1
+    )
+    rows = []
+    for (hand, loop), gains in zip(product(hands, loops), list(stable), strict=True):
+        unstable = np.flatnonzero(~gains)
+        margin = GAINS[-1] if len(unstable) == 0 else (0.0, *GAINS)[unstable[0]]
+        rows.append(
+            {
+                **_describe(hand, loop.delay_s),
+                "filter_ms": 1e3 * loop.filter_s,
+                "advance_per_depth": fitted.centre.advance_per_depth,
+                "stable": bool(gains[0]),
+                "margin": float(margin),
+            }
+        )
+    return rows
+
+
+def stability_result(
+    scene: Scene,
+    model: SheetForceModel,
+    curve: Floats,
+    settings: StabilitySettings,
+    progress: Progress,
+    *,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Return the result of `flexsheet experiment stability --json`."""
+    boundary = measure_boundary(settings, progress)
+    rows = measure_map(scene, model, curve, settings, progress, cache_dir=cache_dir)
+    errors = np.abs([row["error_percent"] for row in boundary])
+    return {
+        "scene": scene.name,
+        "seed": settings.seed,
+        "rows": [row for row in rows if row["kind"] == "bounded"],
+        "without_bounds": [row for row in rows if row["kind"] != "bounded"],
+        "boundary_error_percent": float(np.percentile(errors, 95.0)) if len(errors) else None,
+        "boundary_median_percent": float(np.median(errors)) if len(errors) else None,
+        "boundary": boundary,
+    }

@@ -1,0 +1,36 @@
+"""Cache the bounds of the sheet's offset for a camera's rate, whose computation needs seconds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from flexsheet.nodes.cache import Specification, cached, encode_fields
+from flexsheet.nodes.models import hand_loop
+from flexsheet.nodes.models.hand_loop import OffsetBoundsTable, compute_offset_bounds
+from flexsheet.nodes.planner.compliance import MAX_ADVANCE_PER_DEPTH
+
+VERSION = 1
+"""Version of the computation; another version computes the table again."""
+
+
+def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
+    """Return the cached bounds for a camera's rate, or compute and store them."""
+    depends_on = {
+        "version": VERSION,
+        "rate_hz": rate_hz,
+        "advance_limit": MAX_ADVANCE_PER_DEPTH,
+        "delays_s": hand_loop.DELAYS_S,
+        "filters_s": hand_loop.FILTERS_S,
+        "stiffnesses_n_per_m": hand_loop.SHEET_STIFFNESSES_N_PER_M,
+        "margins": [hand_loop.GAIN_MARGIN, hand_loop.DELAY_MARGIN_S, hand_loop.MIN_DECAY_PER_S],
+        "hands": [asdict(hand) for hand in hand_loop.LIMITING_HANDS],
+    }
+    specification: Specification[OffsetBoundsTable] = Specification(
+        "hand-bounds", depends_on, encode_fields, lambda content: OffsetBoundsTable(**content)
+    )
+    return cached(
+        specification,
+        cache_dir,
+        lambda: compute_offset_bounds(1.0 / rate_hz, advance_limit=MAX_ADVANCE_PER_DEPTH),
+    )

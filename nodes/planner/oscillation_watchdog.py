@@ -1,0 +1,98 @@
+"""Detect an oscillation of finger and sheet that the sheet drives, and fade its motion out."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+WINDOW_S = 1.4
+"""Time over which amplitudes are compared: its halves contain a period of 1.4 Hz."""
+
+MIN_AMPLITUDE_M = 2e-4
+"""Root mean square of the depth below which an oscillation cannot be felt as such."""
+
+GROWTH_RATIO = 1.15
+"""Growth of the amplitude from the first half of the window to the second."""
+
+STEADY_RATIO = 0.95
+SUSTAINED_S = 1.5
+"""Time after which an oscillation is stopped that the sheet drives and that does not decay."""
+
+FADE_S = 0.3
+"""Time in which the sheet's motion with the finger fades out."""
+
+SLOW_S = 0.35
+"""Time constant of the slow part of depth and offset, which is not an oscillation."""
+
+
+class OscillationWatchdog:
+    """Watchdog of the sheet's offset: reduces the sheet to a passive one.
+
+    The sheet delivers energy to the finger if its offset runs behind the depth: the integral of the
+    offset over the depth is positive in a cycle.  A person who moves back and forth against the
+    sheet loses energy to it, so that only an unstable loop triggers the watchdog.
+
+    weight: factor of the offset's motion, from 1 (follows the finger) to 0 (passive).
+    """
+
+    def __init__(self) -> None:
+        self.weight = 1.0
+        self.triggers = 0
+        self._slow: tuple[float, float] | None = None
+        self._last = (0.0, 0.0)
+        self._samples: deque[tuple[float, float, float]] = deque()
+        self._span_s = self._driven_s = 0.0
+        self._fading = False
+
+    def reset(self) -> None:
+        """Start again with a sheet that follows; called without contact."""
+        triggers = self.triggers
+        self.__init__()  # type: ignore[misc]
+        self.triggers = triggers
+
+    def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
+        """Return the weight after a measurement.
+
+        depth_m: measured. offset_m: of the sheet at the time of the measurement.
+        """
+        if self._slow is None:
+            self._slow = (depth_m, offset_m)
+        blend = -float(np.expm1(-step_s / SLOW_S))
+        slow_depth, slow_offset = self._slow
+        self._slow = (
+            slow_depth + blend * (depth_m - slow_depth),
+            slow_offset + blend * (offset_m - slow_offset),
+        )
+        now = (depth_m - self._slow[0], offset_m - self._slow[1])
+        # The force on the finger falls with the offset, so the sheet's work is offset d(depth).
+        work = 0.5 * (now[1] + self._last[1]) * (now[0] - self._last[0])
+        self._last = now
+        self._samples.append((step_s, now[0], work))
+        self._span_s += step_s
+        while self._span_s > WINDOW_S:
+            self._span_s -= self._samples.popleft()[0]
+        self._decide(step_s)
+        if self._fading:
+            self.weight = max(0.0, self.weight - step_s / FADE_S)
+        return self.weight
+
+    def _decide(self, step_s: float) -> None:
+        if self._fading or self._span_s < 0.8 * WINDOW_S:
+            return
+        _, depths, works = np.array(self._samples).T
+        half = len(depths) // 2
+        before, after = (
+            float(np.sqrt(np.mean(part**2))) for part in (depths[:half], depths[half:])
+        )
+        driven = after > MIN_AMPLITUDE_M and float(works.sum()) > 0.0 and _changes_sign(depths)
+        steady = driven and after > STEADY_RATIO * before
+        self._driven_s = self._driven_s + step_s if steady else 0.0
+        if driven and (after > GROWTH_RATIO * before or self._driven_s > SUSTAINED_S):
+            self._fading = True
+            self.triggers += 1
+
+
+def _changes_sign(depths: np.ndarray) -> bool:
+    """Return whether the depths (n,) swing to both sides at least twice."""
+    return int(np.count_nonzero(np.diff(np.sign(depths)))) >= 2

@@ -1,0 +1,269 @@
+"""Test the loop of hand and sheet: predicted bounds, simulation, filter and watchdog."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexsheet.launch.experiments.hand_simulation import simulate_release
+from flexsheet.launch.experiments.stability import (
+    StabilitySettings,
+    Trial,
+    draw_hands,
+    find_critical_slopes,
+    make_cases,
+    measure_map,
+)
+from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.hand_loop import (
+    HANDS,
+    LIMITING_HANDS,
+    Hand,
+    OffsetBoundsTable,
+    SampledLoop,
+    compute_critical_slope,
+    compute_decays_per_s,
+    compute_offset_bounds,
+)
+from flexsheet.nodes.planner.oscillation_watchdog import FADE_S, OscillationWatchdog
+from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
+
+PERIOD_S = 1.0 / 60.0
+WRIST = HANDS["wrist"]
+
+
+@pytest.fixture(scope="module")
+def bounds() -> OffsetBoundsTable:
+    return compute_offset_bounds(PERIOD_S, advance_limit=0.5)
+
+
+def test_without_offset_the_decay_is_that_of_the_hand() -> None:
+    loop = SampledLoop(PERIOD_S, 0.044)
+    (decay,) = compute_decays_per_s(WRIST, loop, sheet_stiffness_n_per_m=100.0, slopes=np.zeros(1))
+    assert decay == pytest.approx(0.5 * WRIST.damping_ns_per_m / WRIST.mass_kg, rel=1e-6)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, PERIOD_S, 0.044, 3.0 * PERIOD_S])
+def test_the_state_over_a_period_is_that_of_small_steps(delay_s: float) -> None:
+    # The free vibration by the matrix equals an explicit integration with the same rule.
+    hand, slope, stiffness = WRIST, 0.4, 100.0
+    loop = SampledLoop(PERIOD_S, delay_s, filter_s=0.03)
+    (decay,) = compute_decays_per_s(
+        hand, loop, sheet_stiffness_n_per_m=stiffness, slopes=np.array([slope])
+    )
+    steps, periods = 400, 240
+    step_s = PERIOD_S / steps
+    x, v, y = 1e-3, 0.0, 0.0
+    queue: list[tuple[int, float, float]] = []
+    held = rate = 0.0
+    energies = []
+    for n in range(steps * periods):
+        if n % steps == 0:
+            before, y = y, y + loop.filter_weight * (x - y)
+            queue.append((n + round(delay_s / step_s), slope * y, slope * (y - before) / PERIOD_S))
+        while queue and queue[0][0] <= n:
+            _, held, rate = queue.pop(0)
+        acceleration = (
+            -(hand.stiffness_n_per_m + stiffness) * x - hand.damping_ns_per_m * v + stiffness * held
+        ) / hand.mass_kg
+        v += step_s * acceleration
+        x += step_s * v
+        held += step_s * rate
+        energies.append(hand.stiffness_n_per_m * x * x + hand.mass_kg * v * v)
+    early = np.mean(energies[steps * 20 : steps * 40])
+    late = np.mean(energies[steps * 60 : steps * 80])
+    measured = 0.5 * math.log(early / late) / (40 * PERIOD_S)
+    assert measured == pytest.approx(decay, rel=0.08, abs=0.05)
+
+
+@pytest.mark.parametrize("towards", [True, False])
+def test_the_predicted_boundary_is_that_of_the_simulation(towards: bool) -> None:
+    hands = draw_hands(1, 7)
+    trials = [
+        Trial(hand, SampledLoop(PERIOD_S, delay_s, 0.0, lead_s), 0.02)
+        for hand in hands
+        for delay_s, lead_s in ((0.03, 0.03), (0.07, 0.07), (0.1, 0.1))
+    ]
+    simulated = find_critical_slopes(trials, towards_finger=towards)
+    compared = np.isfinite(simulated)
+    assert compared.sum() >= 3
+    predicted = [
+        compute_critical_slope(
+            trial.hand, trial.loop, sheet_stiffness_n_per_m=100.0, towards_finger=towards
+        )
+        for trial in trials
+    ]
+    np.testing.assert_allclose(np.array(predicted)[compared], simulated[compared], rtol=0.2)
+
+
+def test_hands_of_low_damping_determine_the_bounds() -> None:
+    loops = [SampledLoop(PERIOD_S, delay_s, filter_s) for delay_s, filter_s in
+             ((0.04, 0.03), (0.08, 0.16), (0.12, 0.08))]  # fmt: skip
+
+    def least(hands: tuple[Hand, ...], loop: SampledLoop, towards: bool) -> float:
+        return min(
+            compute_critical_slope(
+                hand, loop, sheet_stiffness_n_per_m=120.0, towards_finger=towards, max_slope=1.0
+            )
+            for hand in hands
+        )
+
+    for loop in loops:
+        for towards in (True, False):
+            among_all = least(tuple(HANDS.values()), loop, towards)
+            assert least(LIMITING_HANDS, loop, towards) <= 1.02 * among_all
+
+
+def test_bounds_fall_with_delay_and_stiffness_and_end_with_the_table(
+    bounds: OffsetBoundsTable,
+) -> None:
+    for slopes in (bounds.max_advances, bounds.max_retreats):
+        assert (np.diff(slopes, axis=0) <= 0.0).all()
+        assert (np.diff(slopes, axis=2) <= 0.0).all()
+    beyond = bounds.at_delay(0.5)
+    assert beyond.max_advance(0.16, np.array([100.0])) == 0.0
+    assert beyond.max_retreat(0.16, np.array([100.0])) == 0.0
+
+
+def test_a_prediction_of_the_depth_permits_less_than_none() -> None:
+    loop = SampledLoop(PERIOD_S, 0.044)
+    for towards in (True, False):
+        light = HANDS["relaxed finger"]
+        without, with_lead = (
+            compute_critical_slope(
+                light, one, sheet_stiffness_n_per_m=100.0, towards_finger=towards
+            )
+            for one in (loop, replace(loop, lead_s=0.044))
+        )
+        assert with_lead < 0.5 * without
+
+
+def test_a_passive_sheet_lets_every_hand_come_to_rest_without_energy() -> None:
+    trials = [Trial(hand, SampledLoop(PERIOD_S, 0.05), 0.02) for hand in draw_hands(3, 5)]
+    motion = simulate_release(
+        make_cases(trials, np.ones(1)),
+        force=lambda indented_m: 100.0 * indented_m,
+        offset=np.zeros_like,
+        period_s=PERIOD_S,
+        seconds=4.0,
+    )
+    assert motion.stable.all()
+    assert motion.energy_ratio.max() < 1e-3
+
+
+def run_coupled(
+    slope: float, *, hand: Hand, filter_s: float, seconds: float, delay_s: float = 0.05
+) -> tuple[StabilizedOffset, list[float], list[float]]:
+    """Couple a hand with `StabilizedOffset`; return it with depths and watchdog weights."""
+    controller = StabilizedOffset()
+    stiffness, rest_m = 100.0, 0.02
+    steps = 64
+    step_s = PERIOD_S / steps
+    x, v = rest_m - 1e-3, 0.0
+    held, rate = 0.0, 0.0
+    queue: list[tuple[int, float, float]] = []
+    depths, weights = [], []
+    # The hand pushes so that it rests at `rest_m` against a passive sheet.
+    push_n = stiffness * rest_m
+    for n in range(round(seconds / step_s)):
+        if n % steps == 0:
+            offset, speed = controller.update(
+                x,
+                lambda depth: slope * (depth - rest_m),
+                step_s=PERIOD_S,
+                filter_s=filter_s,
+                delay_s=delay_s,
+            )
+            queue.append((n + round(delay_s / step_s), offset, speed))
+            depths.append(x)
+            weights.append(controller.watchdog.weight)
+        while queue and queue[0][0] <= n:
+            _, held, rate = queue.pop(0)
+        force = stiffness * max(x - held, 0.0)
+        pull = push_n - hand.stiffness_n_per_m * (x - rest_m)
+        v += step_s / hand.mass_kg * (pull - hand.damping_ns_per_m * v - force)
+        x = min(max(x + step_s * v, 1e-6), 0.06)
+        held += step_s * rate
+    return controller, depths, weights
+
+
+def test_the_watchdog_stops_an_oscillation_without_bounds() -> None:
+    hand = HANDS["wrist of low damping"]
+    controller, depths, weights = run_coupled(-1.2, hand=hand, filter_s=0.0, seconds=6.0)
+    assert controller.watchdog.triggers == 1
+    first = next(n for n, weight in enumerate(weights) if weight < 1.0)
+    assert weights[first + math.ceil(FADE_S / PERIOD_S)] == 0.0
+    # Afterwards the sheet is passive, and the hand comes to rest.
+    assert np.ptp(depths[-60:]) < 2e-4
+    assert (np.diff(weights[first:]) <= 0.0).all()
+
+
+def test_the_watchdog_permits_what_the_bounds_permit(bounds: OffsetBoundsTable) -> None:
+    permitted = bounds.at_delay(0.05)
+    slope = -float(permitted.max_advance(0.16, np.array([100.0]))[0])
+    for hand in HANDS.values():
+        controller, depths, _ = run_coupled(slope, hand=hand, filter_s=0.16, seconds=6.0)
+        assert controller.watchdog.triggers == 0
+        assert np.ptp(depths[-30:]) < 2e-4
+
+
+def test_a_person_who_pushes_rhythmically_does_not_trigger_the_watchdog() -> None:
+    watchdog = OscillationWatchdog()
+    rng = np.random.default_rng(4)
+    for n in range(900):
+        time_s = n * PERIOD_S
+        depth = 0.015 + 0.006 * math.sin(2.0 * math.pi * 2.0 * time_s) * min(1.0, time_s / 5.0)
+        # A sheet that retreats late takes energy from the person.
+        late = 0.015 + 0.006 * math.sin(2.0 * math.pi * 2.0 * (time_s - 0.05)) * min(
+            1.0, time_s / 5.0
+        )
+        watchdog.update(depth + rng.normal(0.0, 5e-5), 0.5 * late, PERIOD_S)
+    assert watchdog.triggers == 0
+
+
+def test_the_watchdog_is_ready_again_after_the_contact() -> None:
+    controller, *_ = run_coupled(
+        -1.2, hand=HANDS["wrist of low damping"], filter_s=0.0, seconds=6.0
+    )
+    arguments = {"step_s": PERIOD_S, "filter_s": 0.0, "delay_s": 0.05}
+    assert controller.update(0.0, lambda depth: depth, **arguments) == (0.0, 0.0)
+    assert controller.watchdog.weight == 1.0
+    assert controller.watchdog.triggers == 1
+
+
+def test_a_sheet_that_retreats_stays_with_a_finger_that_leaves() -> None:
+    controller = StabilizedOffset()
+    for depth in [0.02] * 60 + list(np.linspace(0.02, 0.0005, 6)):
+        offset, _ = controller.update(
+            depth, lambda filtered: 0.9 * filtered, step_s=PERIOD_S, filter_s=0.16, delay_s=0.05
+        )
+        assert offset <= depth
+
+
+def test_the_planners_bounds_keep_drawn_hands_stable(rubber_scene: object) -> None:
+    scene, model, curve, folder = rubber_scene  # type: ignore[misc]
+    rows = measure_map(
+        scene,
+        model,
+        curve,
+        StabilitySettings(hands=1, seed=300, delays_s=(0.07,), object_ratios=(4.0,)),
+        lambda text: None,
+        cache_dir=folder,
+    )
+    bounded = [row for row in rows if row["kind"] == "bounded"]
+    assert all(row["stable"] for row in bounded)
+    assert any(not row["stable"] for row in rows if row["kind"] == "predicted")
+
+
+@pytest.fixture(scope="module")
+def rubber_scene(tmp_path_factory: pytest.TempPathFactory) -> object:
+    from flexsheet.nodes.planner.sheet_force import make_force_model
+    from tests.test_planner import SCENE
+
+    sheet: SheetSpec = SCENE.sheet
+    depths = SCENE.working_range.push_depth_m * np.linspace(0.0, 1.0, 12)
+    curve = np.column_stack([depths, 58.0 * depths])
+    return SCENE, make_force_model(sheet), curve, tmp_path_factory.mktemp("cache")
