@@ -1,4 +1,4 @@
-"""Define the apparatus: what is true in the simulator, as differences from the scene.
+"""Define the apparatus: the true parameters of the simulation, as differences from the scene.
 
 The scene is what the nodes believe. The apparatus is what is true, and only the simulator and the
 evaluation of experiments read it. All differences are zero, and all ratios one, in a nominal
@@ -136,7 +136,7 @@ class SheetTruth(Part):
         default=None, description="between finger and sheet; null: touched rubber sticks"
     )
     hysteresis_ratio: Share = Field(
-        default=0.0, description="share of the stored energy that a cycle loses"
+        default=0.0, description="fraction of the stored energy that a cycle loses"
     )
     creep_ratio_per_decade: Share = Field(
         default=0.0, description="relative loss of tension per decade of time"

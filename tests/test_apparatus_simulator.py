@@ -404,7 +404,7 @@ def test_the_presented_force_is_that_of_the_true_sheet() -> None:
         apparatus=given,
     )
     felt = ForceReference(stiff).evaluate(0, press)
-    assert felt.presented_n == pytest.approx(1.2 * plain.presented_n, rel=1e-3)
+    assert felt.rendered_n == pytest.approx(1.2 * plain.rendered_n, rel=1e-3)
     assert felt.wanted_n == plain.wanted_n
 
 

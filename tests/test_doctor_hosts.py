@@ -141,7 +141,7 @@ def test_where_all_is_well_nothing_is_found(three: ResolvedGraph) -> None:
     checks = {one.check for one in found}
     assert checks >= {
         "reachable", "launcher", "plan", "keys", "software", "clocks", "nodes", "rates", "camera",
-        "picture", "arm left", "arm right", "disk", "load", "memory",
+        "image", "arm left", "arm right", "disk", "load", "memory",
     }  # fmt: skip
     assert {one.host for one in found} == set(NAMES)
 
@@ -212,8 +212,8 @@ FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
         lambda v: v["main"].nodes.update(camera=said("camera", note="no pictures: gone")),
         ("main", "camera", "failed"), "program",
     ),
-    "picture": (
-        lambda v: v["main"].nodes.pop("renderer"), ("main", "picture", "failed"), "log"
+    "image": (
+        lambda v: v["main"].nodes.pop("renderer"), ("main", "image", "failed"), "log"
     ),
     "arm": (
         lambda v: v["right"].arms.update(right=arm("right", mode="disconnected", reason="away")),

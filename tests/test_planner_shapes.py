@@ -593,10 +593,10 @@ def test_an_inverted_mesh_is_rejected() -> None:
         SmoothMeshShape(vertices, triangles[:, ::-1], 0.01)
 
 
-@pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
-def test_an_object_that_turns_no_side_to_the_user_is_rejected(turn_rad: float) -> None:
+@pytest.mark.parametrize("rotation_rad", [math.pi, 1.5])
+def test_an_object_that_turns_no_side_to_the_user_is_rejected(rotation_rad: float) -> None:
     with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
-        Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
+        Desk(scene_with(SOLIDS["plane"], rpy_rad=(rotation_rad, 0.0, 0.0)))
 
 
 def test_a_tilt_beyond_a_right_angle_is_cut() -> None:

@@ -256,7 +256,7 @@ def test_the_family_of_shapes_distinguishes_them(monkeypatch: pytest.MonkeyPatch
     scene = SCENE.model_copy(update={"working_range": shallow, "sheet": spec})
     errors: dict[str, float] = {}
     for trial in sheet_shape_family(simulate_points).trials(scene):
-        if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "place": "centre"}:
+        if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "position": "centre"}:
             errors[trial.method] = trial.error(trial.run())
             assert trial.in_range == (trial.method in ("reduced_order", "membrane"))
         elif errors:

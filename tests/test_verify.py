@@ -140,7 +140,7 @@ def test_what_a_node_did_live_it_does_again_to_the_last_bit(bag: Path, name: str
     result = verify(bag, name)
     assert_as_live(result)
     # The camera, which could reach for devices, does not say what it took: it takes all.
-    assert result.as_taken == (name != "camera")
+    assert result.by_execution_log == (name != "camera")
     assert result.missing == 0
     output = {"camera": "stereo", "triangulator": "fingertip", "planner": "sheet_target",
               "fem_solver": "soft_body"}[name]  # fmt: skip
@@ -157,7 +157,7 @@ def test_without_the_execution_log_the_recorders_order_differs(bag: Path, tmp_pa
     old = rewritten(bag, tmp_path / "old.mcap", log=False)
     result = verify(old, "planner")
     assert result.same_bytes
-    assert not result.as_taken
+    assert not result.by_execution_log
     assert not result.as_live
 
 

@@ -3,7 +3,7 @@
 Each topic becomes a JSON channel of the same name with its numbers; arrays of more than `PLOTTED`
 values are left out. Images and 3D data become separate channels:
 
-    stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/expected     foxglove.RawImage
+    stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
     finger      the fingertip with its predicted path                     foxglove.SceneUpdate
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
@@ -235,7 +235,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
             yield f"{topic}/right", message.right
         case Frame():
             for image in message.pixels:
-                yield f"{topic}/picture", image
+                yield f"{topic}/image", image
         case TwinEye():
             yield f"{topic}/seen", message.seen
             yield f"{topic}/expected", message.expected

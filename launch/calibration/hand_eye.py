@@ -144,14 +144,14 @@ class BoardDetection:
 class PoseResidual:
     """Residual of one pose.
 
-    shift_m, turn_rad: difference between the flange poses from the images and from the joints.
+    shift_m, rotation_rad: difference between the flange poses from the images and from the joints.
     rms_px: of the corners, projected with the pose from the joints. reason: for excluding the pose;
     empty for an inlier.
     """
 
     name: str
     shift_m: float
-    turn_rad: float
+    rotation_rad: float
     rms_px: float
     reason: str
 
@@ -635,7 +635,7 @@ def _make_result(
             PoseResidual(
                 name=detection.name,
                 shift_m=float(np.linalg.norm(one.measured[3:])),
-                turn_rad=float(np.linalg.norm(one.measured[:3])),
+                rotation_rad=float(np.linalg.norm(one.measured[:3])),
                 rms_px=one.rms_px,
                 reason="" if good else "inconsistent with the other poses",
             )

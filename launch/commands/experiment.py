@@ -301,7 +301,7 @@ def compliance(
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
     if as_json:
-        print_json({**result, "picture": str(image)})
+        print_json({**result, "figure": str(image)})
         return
     columns = ["position", "depth, mm", "object, N", "rendered, N", "error, %", "offset, mm"]
     cells = [
@@ -411,7 +411,7 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
-        columns += [f"+{each['lead_ms']:.0f} ms rms", "lag, ms"]
+        columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
     rows = []
     for result in results:
         now, *ahead = result["prediction"]

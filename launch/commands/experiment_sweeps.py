@@ -184,7 +184,7 @@ def sensitivity(
         )
         draw_sensitivity(result, image)
     if as_json:
-        print_json({**result, "picture": str(image)})
+        print_json({**result, "figure": str(image)})
         return
     metrics = list(result["tolerances"])
     largest = {

@@ -283,7 +283,7 @@ def _evaluate_prediction(
     if len(at_ns) >= MIN_SAMPLES and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
         lag = estimate_lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
     return {
-        "lead_ms": lead_s * 1e3,
+        "horizon_ms": lead_s * 1e3,
         **error_mm(follower - leader),
         "lag_ms": None if lag is None else lag * 1e3,
     }

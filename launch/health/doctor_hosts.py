@@ -394,7 +394,7 @@ def find_rate_problem(port: PortStatus) -> str | None:
 OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
     NodeRole.CAMERA: ("camera", "check whether another program uses the camera: docs/camera.md"),
     NodeRole.RENDERER: (
-        "picture",
+        "image",
         f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
     ),
 }

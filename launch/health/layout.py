@@ -424,13 +424,13 @@ def make_layout_result(layout: Layout) -> dict[str, Any]:
     return {
         "scene": layout.scene.name,
         "reachable": layout.reachable,
-        "share": float(layout.reached.mean()),
-        "share_at_working_speed": float(layout.followed.mean()),
+        "fraction": float(layout.reached.mean()),
+        "fraction_at_working_speed": float(layout.followed.mean()),
         "speed_everywhere_m_per_s": layout.speed_m_per_s(1.0),
         "speed_at_half_m_per_s": layout.speed_m_per_s(0.5),
         "samples": len(layout.samples.poses),
         "arms": {side: _arm_result(layout, reach) for side, reach in layout.arms()},
-        "broken_ways": list(layout.blocked_paths),
+        "blocked_paths": list(layout.blocked_paths),
         "remedies": [{"what": one.what, **one.values} for one in layout.remedies],
     }
 
@@ -439,11 +439,11 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
     binding = reach.binding
     present = sorted(set(binding[binding >= 0].tolist()))
     return {
-        "share": float(reach.reachable.mean()),
-        "share_at_working_speed": float(reach.trackable.mean()),
+        "fraction": float(reach.reachable.mean()),
+        "fraction_at_working_speed": float(reach.trackable.mean()),
         "branch": reach.branch._asdict(),
         "binding": [_summarize_limit(layout, number, binding) for number in present],
-        "least_margins": find_min_margins(layout, reach),
+        "min_margins": find_min_margins(layout, reach),
     }
 
 
@@ -455,7 +455,7 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
     first = int(where[order[0]])
     return {
         "limit": LIMITS[number],
-        "share": float(len(where) / len(binding)),
+        "fraction": float(len(where) / len(binding)),
         "first_tilt_rad": float(samples.tilt_rad[first]),
         "first_depth_m": float(samples.depth_m[first]),
         "first_contact_world_m": samples.contact_world_m[first].tolist(),
@@ -472,8 +472,8 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
         "workspace": (("workspace",), "m"),
         "flange distance": (("flange distance",), "m"),
         "edge force": (("edge force",), "N"),
-        "joint speed": (SPEEDS, "share"),
-        "tool speed": (("tool speed",), "share"),
+        "joint speed": (SPEEDS, "ratio"),
+        "tool speed": (("tool speed",), "ratio"),
     }
     result: dict[str, dict[str, float | str]] = {}
     for kind, (limits, unit) in kinds.items():

@@ -98,7 +98,7 @@ def format_apparatus(apparatus: Apparatus) -> str:
     yaml.width = 4096
     text = io.StringIO()
     text.write(
-        f"# Apparatus of scene {apparatus.scene}, {apparatus.origin}: what is true in the\n"
+        f"# Apparatus of scene {apparatus.scene}, {apparatus.origin}: true parameters of the\n"
         "# simulator, as differences from `nominal`. See docs/apparatus.md.\n"
     )
     yaml.dump(apparatus.model_dump(mode="json", exclude_none=True), text)
