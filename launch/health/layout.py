@@ -498,7 +498,7 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    grid = _Grid.from_layout(layout)
+    grid = _TiltDepthGrid.from_layout(layout)
     present = {int(n) for _, reach in layout.arms() for n in set(_binding_limits(reach).tolist())}
     colors = {n: f"C{i % 10}" for i, n in enumerate(sorted(present - {-1}))}
     required = 1e3 * layout.scene.working_range.speed_m_per_s
@@ -531,7 +531,7 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
+class _TiltDepthGrid:
     """Cells over tilt and depth. rows, columns: cell of each sample (n,). frame: plot
     options.
     """
@@ -541,7 +541,7 @@ class _Grid:
     frame: dict[str, Any]
 
     @classmethod
-    def from_layout(cls, layout: Layout) -> _Grid:
+    def from_layout(cls, layout: Layout) -> _TiltDepthGrid:
         tilt, depth = layout.samples.tilt_rad, layout.samples.depth_m
         most = layout.scene.working_range.tilt_rad
         deepest = layout.scene.working_range.push_depth_m

@@ -24,7 +24,7 @@ from flexsheet.messages.scene import Projector, Scene
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
-from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
@@ -473,7 +473,7 @@ class EyeSituation:
     """
 
     scene: Scene
-    rubber: Rubber
+    rubber: TrueRubber
     world_from_flange_left: Floats
     world_from_flange_right: Floats
     finger_tip: Floats | None
@@ -524,7 +524,7 @@ def true_sheet(
     world_from_flange_right: Floats,
     finger_tip: Floats | None,
     *,
-    rubber: Rubber,
+    rubber: TrueRubber,
     friction_coefficient: float | None = None,
 ) -> DeformedSheet:
     """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or

@@ -59,8 +59,8 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class Rubber:
-    """Describe the sheet at rest.
+class TrueRubber:
+    """Dimensions and material of the true sheet at rest.
 
     width_m: between the clamps when slack; height_m: along them.
     density_kg_per_m3: 0 for a sheet without weight.
@@ -143,7 +143,7 @@ class _Mesh:
     midway between their neighbours.
     """
 
-    def __init__(self, rubber: Rubber, x: Floats, y: Floats, slack_tension: float) -> None:
+    def __init__(self, rubber: TrueRubber, x: Floats, y: Floats, slack_tension: float) -> None:
         self.slack_tension = slack_tension
         columns, rows = len(x), len(y)
         self.shape = (rows, columns)
@@ -386,7 +386,7 @@ class _Finger:
 
 
 def solve(
-    rubber: Rubber,
+    rubber: TrueRubber,
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
     *,
@@ -497,7 +497,7 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
     return nodes
 
 
-def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber) -> Floats:
+def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
     """Return (nodes,) 1 at the focus, decreasing to 0 at the distance of the clamps."""
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus

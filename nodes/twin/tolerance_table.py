@@ -138,7 +138,7 @@ class LogUniform:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class OneOf:
     """One of a few values, all equally likely; in order, so that more sigmas mean a later one."""
 
     values: tuple[float, ...]
@@ -229,7 +229,7 @@ _ROWS = (
               "drift 0.2 mrad, from memory", calibrated=Normal(0.0, 0.045e-3),
               calibrated_source="docs/camera.md: residual 0.024 px of 540"),
     Tolerance("camera.rate_hz", "Hz", 1.0, Always(60.0), "USB3 cameras: 60 to 120 Hz",
-              paper=Choice((15.0, 30.0, 48.0)), calibrated_source=""),
+              paper=OneOf((15.0, 30.0, 48.0)), calibrated_source=""),
     Tolerance("camera.read_out_s", "ms (paper: frames)", MS, Uniform(1.5e-3, 4e-3),
               "computed: 614,400 bytes over USB3, or over 1394a at 0.9 frame",
               paper=Always(0.9), frame_periods=(Profile.PAPER,)),
@@ -261,7 +261,7 @@ _ROWS = (
               "KR16: response 50 ms, tracking 120 ms (Arbo)", paper=Uniform(0.0, 40e-3),
               calibrated=HalfNormal(1e-3), pair=Uniform(0.0, 0.5e-3),
               calibrated_source="launch/experiments/lag.py: standard error 0.6 to 1.9 ms"),
-    Tolerance("arms.*.controller_period_s", "ms", MS, Choice((1e-3, 2e-3, 4e-3)),
+    Tolerance("arms.*.controller_period_s", "ms", MS, OneOf((1e-3, 2e-3, 4e-3)),
               "RV-1A: 7.1 ms (docs/mxt.md); newer controllers: 1 to 4 ms",
               paper=Always(7.1e-3)),
     Tolerance("arms.*.controller_jitter_s", "ms", MS, Uniform(0.02e-3, 0.1e-3), J,
