@@ -350,7 +350,7 @@ def test_a_board_behind_the_camera_is_rejected(tmp_path: Path) -> None:
         read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
 
 
-class Live:
+class LiveCapture:
     """PoseRecorder with images of the simulated camera and a separate clock."""
 
     def __init__(self, folder: Path) -> None:
@@ -372,7 +372,7 @@ class Live:
 
 
 def test_a_pose_is_recorded_when_the_arm_rests_at_a_new_one(tmp_path: Path) -> None:
-    live = Live(tmp_path)
+    live = LiveCapture(tmp_path)
     dark = np.zeros((480, 640), np.uint8)
     assert live.taker.update_images(dark, dark, 0.0) == "no message from the arm yet"
     here = live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3))
@@ -482,7 +482,7 @@ def test_bad_input_to_the_command_is_named(
 
 
 def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
-    live = Live(tmp_path)
+    live = LiveCapture(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
     with pytest.raises(ArmPosesError, match="images of 640x480 px"):
         read_detections(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)

@@ -108,7 +108,7 @@ class Before(Message):
     note: str | None = None
 
 
-class More(Message):
+class WithDefaults(Message):
     """Type that Before can become without a migration."""
 
     mode: Literal["on", "off", "auto"]
@@ -123,7 +123,7 @@ class Renamed(Message):
     note: str | None = None
 
 
-class Demanding(Before):
+class WithRequiredField(Before):
     rate_hz: float
 
 
@@ -133,7 +133,7 @@ class Narrower(Message):
     note: str | None = None
 
 
-class Poorer(Message):
+class WithoutField(Message):
     mode: Literal["on", "off"]
     note: str | None = None
 
@@ -144,13 +144,13 @@ class Retyped(Message):
     note: str | None = None
 
 
-@pytest.mark.parametrize("today", [Before, More])
+@pytest.mark.parametrize("today", [Before, WithDefaults])
 def test_gains_need_nothing(today: type[Message]) -> None:
     assert is_compatible(Before.model_json_schema(), today.model_json_schema())
     today.model_validate(Before(mode="on", size_mm=1.0).model_dump())
 
 
-@pytest.mark.parametrize("today", [Renamed, Demanding, Narrower, Poorer, Retyped])
+@pytest.mark.parametrize("today", [Renamed, WithRequiredField, Narrower, WithoutField, Retyped])
 def test_anything_else_does(today: type[Message]) -> None:
     assert not is_compatible(Before.model_json_schema(), today.model_json_schema())
     fingerprint = compute_fingerprint(Before).hex()
