@@ -45,7 +45,7 @@ ZERO_6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class LensTruth(Part):
-    """State how a lens differs from the scene's (a camera's: from that of its device)."""
+    """Differences of a lens from the scene's (a camera's: from that of its device)."""
 
     focal_ratio: NearOne = Field(default=1.0, description="true focal length over the scene's")
     centre_offset_px: Pair = (0.0, 0.0)
@@ -53,7 +53,7 @@ class LensTruth(Part):
 
 
 class CameraTruth(Part):
-    """State how the stereo camera differs from the scene's."""
+    """Differences of the stereo camera from the scene's."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -80,7 +80,7 @@ class CameraTruth(Part):
 
 
 class ArmTruth(Part):
-    """State how one arm differs from the scene's, and how its controller behaves."""
+    """Differences of one arm from the scene's, and how its controller behaves."""
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3
@@ -117,7 +117,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """State how the sheet differs from the scene's, and what the scene does not describe."""
+    """Differences of the sheet from the scene's, and properties that the scene does not describe."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
@@ -191,7 +191,7 @@ class EyesTruth(Part):
 
 
 class ProjectorTruth(Part):
-    """State how the projector differs from the scene's."""
+    """Differences of the projector from the scene's."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -202,7 +202,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """Hold the device parts of the scene from which the differences are counted."""
+    """Device parts of the scene from which the differences are counted."""
 
     camera: StereoCamera
     arms: Arms
@@ -219,7 +219,7 @@ class Apparatus(Message):
     scene_id: str | None = Field(
         default=None, description="identity of its object and devices; null: only the name counts"
     )
-    origin: str = Field(default="file", description="where it comes from, for people")
+    origin: str = Field(default="file", description="origin, as text for users")
     nominal: Devices | None = Field(
         default=None,
         description="devices from which the differences are counted; null: those of the scene",

@@ -747,7 +747,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
         )
     if transport not in ("tcp", "ipc"):
         raise BusError(
-            f'topic "{topic.name}": {endpoint} is neither ipc:///path nor tcp://host:port'
+            f'topic "{topic.name}": {endpoint} is invalid; expected ipc:///path or tcp://host:port'
         )
 
 

@@ -136,7 +136,7 @@ _SHOWN_UNITS = {"m": ("mm", 1e3), "s": ("ms", 1e3), "px": ("px", 1.0), "rad": ("
 
 
 def describe_self_check(check: SelfCheck) -> str:
-    """Return a suspicion with its numbers, for people."""
+    """Format a suspected cause with its numbers."""
     unit, scale = _SHOWN_UNITS[check.unit]
     subject = f"{check.subject}: " if check.subject else ""
     return (

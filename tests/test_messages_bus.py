@@ -415,7 +415,7 @@ async def test_stale_ipc_file_of_a_killed_writer_is_replaced(connections: Connec
         ("ipc:///no/such/folder/a", "cannot be bound"),
         ("tcp://127.0.0.1:99999", "the port must be in 1..65535"),
         ("tcp://192.0.2.1:7777", "beyond loopback"),
-        ("nonsense", "neither ipc"),
+        ("nonsense", "expected ipc"),
     ],
 )
 async def test_impossible_endpoints(connections: Connections, endpoint: str, words: str) -> None:

@@ -127,7 +127,7 @@ def stroke(
         typer.Option(
             min=1,
             max=1000,
-            help="Number of strokes, each with another seed in a graph of its own; gives the 95 % "
+            help="Number of strokes, each with another seed in a separate graph; gives the 95 % "
             "interval of the mean.",
         ),
     ] = 1,

@@ -87,7 +87,7 @@ def robustness(
 ) -> None:
     """Evaluate drawn apparatuses: sheet, fingertip, image and force over many laboratories.
 
-    Each draw is a process of its own with a graph and a stroke. Image and force are evaluated at
+    Each draw is a separate process with a graph and a stroke. Image and force are evaluated at
     rest, without the graph. The same --output continues an interrupted sweep.
     """
     from flexsheet.launch.experiments import robustness as experiment

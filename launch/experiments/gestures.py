@@ -80,7 +80,7 @@ def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
     file = Path(name_or_file)
     if not file.suffix and not file.exists():
         raise ExperimentError(
-            f'"{name_or_file}" is neither a gesture nor a file; '
+            f'"{name_or_file}" is not a gesture or a file; '
             f"{did_you_mean(name_or_file, list(GESTURES))} Or give a CSV file of a recorded finger"
         )
     try:

@@ -1,4 +1,4 @@
-"""Measure what each tolerance of the apparatus does alone: what must be calibrated how well."""
+"""Measure the effect of each tolerance of the apparatus alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 
 
 class EvaluationKind(StrEnum):
-    """Name how a row was evaluated.
+    """Method by which a row was evaluated.
 
     offline: at rest, without a graph. graph: in motion. not_measured: only motion shows it, and no
     graph ran. not_simulated: no simulator node uses it.

@@ -32,7 +32,7 @@ PROFILES = tuple(one.value for one in Profile)
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Hold the parts of `seed:N[,modern|paper][,calibrated]`."""
+    """Parts of `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile

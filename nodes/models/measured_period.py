@@ -15,7 +15,7 @@ TOLERANCE_RATIO = 0.2
 
 
 class MeasuredPeriod:
-    """Hold the scene's period until the messages show another one."""
+    """Estimate of a message period, initially the scene's."""
 
     def __init__(self, scene_period_s: float) -> None:
         self._scene_period_s = scene_period_s

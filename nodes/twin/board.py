@@ -53,7 +53,7 @@ class BoardError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Hold the uneven light on a board: its gradient across the image, and the room's texture."""
+    """Uneven light on a board: its gradient across the image, and the room's texture."""
 
     gain: float
     slope_x: float
@@ -62,7 +62,7 @@ class Light:
 
 
 class TwinBoard:
-    """Show a board to a rig with the true lenses; noise and light come from `seed`."""
+    """Board in front of a rig with the true lenses; `seed` determines noise and light."""
 
     def __init__(
         self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None

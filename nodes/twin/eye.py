@@ -54,7 +54,7 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised when an image does not show what is to be measured; the message says what is
+    """Raised when an image does not show what is to be measured; the message states what is
     missing."""
 
     code = "not-measurable"
@@ -63,7 +63,7 @@ class NotMeasurableError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Hold a fan of rays: from `origin` (3,) along first + column * right + row * down, each
+    """Fan of rays: from `origin` (3,) along first + column * right + row * down, each
     (3,)."""
 
     origin: Floats
@@ -81,7 +81,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Hold the first hits of a fan of rays.
+    """First hits of a fan of rays.
 
     triangle: (height, width), -1 where nothing is hit.
     inverse_range: (height, width), one over the ray parameter of the hit, 0 without a hit.
@@ -134,7 +134,7 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """Map between projector pixels and points of the true sheet."""
+    """Projector that maps between its pixels and points of the true sheet."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """vertices: (vertices, 3) of the sheet, world.  triangles: (triangles, 3)."""
@@ -355,7 +355,7 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """Find the largest bright blob of an image, and where lines through it begin and end."""
+    """Largest bright blob of an image, and the ends of lines through it."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -464,7 +464,7 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
-    """Hold the true state at which a frame was shown.
+    """True state at which a frame was shown.
 
     world_from_flange_left, world_from_flange_right: (4, 4).
     finger_tip: (3,) or None.

@@ -78,7 +78,7 @@ class TrueRubber:
 
 @dataclass(frozen=True, slots=True)
 class DeformedSheet:
-    """Hold the equilibrium of the sheet.
+    """Equilibrium of the sheet.
 
     rest_m: (rows, columns, 2) from the left bottom corner.
     positions: (rows, columns, 3) world.
@@ -312,7 +312,7 @@ def relaxed_stress(
 
 
 class _Finger:
-    """Keep nodes out of a rigid sphere by a penalty; nodes that it has touched stick to it.
+    """Rigid sphere that nodes cannot enter (penalty); touched nodes stick to it.
 
     stuck: (nodes,) nodes that stick, each at its position in `anchor` (nodes, 3).
     friction_coefficient: Coulomb's, or None for nodes that never slip.

@@ -60,7 +60,7 @@ def touchable(scene: Scene) -> tuple[float, float]:
 
 
 class Ground:
-    """Map surface positions of a scene's object to points, from its front.
+    """Map from surface positions of a scene's object to points, from its front.
 
     Positions are measured along geodesics: first along the object's x axis, then at right angles to
     that. They are computed on a grid, interpolated by bicubic splines and projected onto the

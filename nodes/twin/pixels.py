@@ -78,7 +78,7 @@ GRAIN = 1 << 21
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Describe the sensor; levels are digital numbers (0..255), linear.
+    """Image sensor; levels are digital numbers (0..255), linear.
 
     photons_per_level: full-well photons over 255; the variance of a level L is L over it.
     blur_px: standard deviation of the lens's point spread in focus.
@@ -166,7 +166,7 @@ class CameraView:
 
 
 class TwinCamera:
-    """Draw stereo pairs of a true rig; `seed` determines the noise."""
+    """Stereo camera that renders pairs with a true rig; `seed` determines the noise."""
 
     def __init__(
         self,

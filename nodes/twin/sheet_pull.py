@@ -42,7 +42,7 @@ def true_friction(apparatus: Apparatus | None) -> float | None:
 
 @dataclass(slots=True)
 class SheetPull:
-    """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
+    """Pull of the sheet over the distance of its edges, and both arms' compliances, m/N.
 
     A finger's push on the sheet is not part of the pull: it is small beside the tension.
     weight_n: (3,) of the sheet, of which each flange carries half.

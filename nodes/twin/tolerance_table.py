@@ -26,7 +26,7 @@ MAX_DEVIATION_SIGMAS = 3.0
 
 
 class Profile(StrEnum):
-    """Name the equipment of a laboratory.
+    """Equipment of a laboratory.
 
     modern: a 60 Hz camera with a short read-out, a controller with a short period.
     paper: a camera of 15 to 48 Hz that reads out for most of a frame, a controller period of
@@ -38,7 +38,7 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """Draw a value; `spread` gives the value at a number of standard deviations."""
+    """Interface of a distribution that draws values."""
 
     def draw(self, random: np.random.Generator) -> Any: ...
 
@@ -47,7 +47,7 @@ class Distribution(Protocol):
         ...
 
     def text(self, scale: float) -> str:
-        """Describe the distribution for people, its numbers multiplied by `scale`."""
+        """Format the distribution, its numbers multiplied by `scale`."""
         ...
 
 
@@ -377,7 +377,7 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Return an apparatus that is nominal but for one row of the table, at `sigmas`.
+    """Return an apparatus that is nominal except for one row of the table, at `sigmas`.
 
     All components of a vector, and both arms or lenses, are at the same quantile.  Raises KeyError
     for a key that is not in the table.

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 class SimulatorParameters(NodeParameters):
-    """Hold the parameters of a simulator node; only these contain the apparatus."""
+    """Parameters of a simulator node; only these contain the apparatus."""
 
     apparatus: Apparatus | None = Field(
         default=None, description="true parameters; null: those of the scene. `--apparatus` sets it"
