@@ -31,7 +31,6 @@ from flexsheet.messages.scene import (
 
 Pair = tuple[Finite, Finite]
 Triple = tuple[Finite, Finite, Finite]
-Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
 """A relative deviation or a small angle; what is beyond it is a mistake in the file."""
@@ -117,7 +116,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """Differences of the sheet from the scene's, and properties that the scene does not describe."""
+    """Differences of the sheet from the scene's, and properties that the scene lacks."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
@@ -144,7 +143,7 @@ class SheetTruth(Part):
 
 
 class FingerTruth(Part):
-    """State how the finger, its marker and its motion differ from what the nodes assume.
+    """Differences of the finger, its marker and its motion from the nodes' assumptions.
 
     The finger's frame has its origin at the pad's contact point (the fingertip of all messages), x
     along the finger towards the hand, z from the pad to the nail, y = z x x.
@@ -180,7 +179,7 @@ class FingerTruth(Part):
 
 
 class EyesTruth(Part):
-    """State where the eyes really are, relative to the tracked eyes or to the scene's."""
+    """Offsets of the true eyes from the tracked eyes, or from the scene's."""
 
     centre_offset_m: SmallTriple = ZERO_3
     interocular_offset_m: Small = 0.0

@@ -86,7 +86,6 @@ class ExportResult:
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
     unreadable: tuple[str, ...] = ()
-    wall_clock: bool = False
 
 
 def export(
@@ -116,7 +115,6 @@ def export(
     readable = {one.name for one in summary.topics if one.readable} & wanted
     offset_ns = _wall_clock_offset_ns(reader)
     result = ExportResult(output, unreadable=tuple(sorted(wanted - readable)))
-    result.wall_clock = offset_ns is not None
     context = foxglove.Context()
     channels: dict[str, Any] = {}
     draft = output.with_name(f"{output.name}.part")

@@ -80,10 +80,6 @@ class ContactSample:
     twists_world: Floats
 
 
-FindContacts = Callable[[Scene], Sequence[ContactSample]]
-"""Function that samples the contacts of a scene's object."""
-
-
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
     """Sheet poses that the arms must reach, with tilt (n,), depth (n,) and contact (n, 3)."""
@@ -286,15 +282,10 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
     )
 
 
-def check_layout(
-    scene: Scene,
-    *,
-    progress: Progress = lambda text: None,
-    find_contacts: FindContacts = sample_contacts,
-) -> Layout:
+def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Layout:
     """Check both arms over the scene's working range, and find remedies if one fails."""
     progress("finding the contacts on the object")
-    samples = make_samples(scene, find_contacts(scene))
+    samples = make_samples(scene, sample_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
     left_reach = find_best_reach(left, right, samples.poses)

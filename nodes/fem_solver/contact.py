@@ -191,12 +191,10 @@ class SphereContact:
         *,
         young_modulus_pa: float,
         finger_radius_m: float,
-        penalty_ratio: float = PENALTY_RATIO,
     ) -> None:
         """Sample the contact points of the skin.
 
         shape: the smooth surface that the response's triangles approximate, in the mesh frame.
-        penalty_ratio: see `PENALTY_RATIO`.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -211,7 +209,7 @@ class SphereContact:
         self._normals = found.normal.reshape(len(corners), -1, 3)
         sides = corners[:, 1:3] - corners[:, :1]
         areas = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-        penalty = penalty_ratio * young_modulus_pa / finger_radius_m
+        penalty = PENALTY_RATIO * young_modulus_pa / finger_radius_m
         self._penalty = penalty * areas / len(self._shape)
         self._centres = corners.mean(axis=1)
         self._size = np.linalg.norm(corners - self._centres[:, None], axis=2).max(axis=1)

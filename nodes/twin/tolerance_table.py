@@ -20,7 +20,6 @@ import numpy as np
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
-MAX_DEVELOPMENT_SEED = 99
 MAX_DEVIATION_SIGMAS = 3.0
 """Normal draws are limited to this: beyond it a laboratory notices the fault."""
 
