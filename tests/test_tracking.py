@@ -15,10 +15,10 @@ from ruamel.yaml import YAML
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]

@@ -515,17 +515,13 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index of the limit that excludes each sample (n,); -1 where the arm reaches
-    it.
-    """
+    """Return the index of each sample's limiting limit (n,); -1 within reach."""
     return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """Cells over tilt and depth. rows, columns: cell of each sample (n,). frame: plot
-    options.
-    """
+    """Cells over tilt and depth. rows, columns: of each sample (n,). frame: plot options."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]

@@ -161,8 +161,7 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 
 
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
-    """Return the depths (m) of a force curve: dense up to `linear_m`, then geometric up to the
-    maximum push."""
+    """Return the depths (m) of a force curve, dense up to `linear_m`, then geometric."""
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
         linear_m, max_push_m, max(2, round(4 * np.log2(max_push_m / linear_m)) // 2 + 1)
@@ -484,8 +483,7 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
-        """Return the skin displacement (3 s,) under forces (k,), N, for some rows (k,) of a
-        table."""
+        """Return the skin displacement (3 s,) under forces (k,), N, for k rows of a table."""
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
         # Slices of consecutive rows avoid the copy that fancy indexing would make.

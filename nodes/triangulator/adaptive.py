@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.triangulator.filters import Estimate
+from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuro, Unfiltered
 
 Floats = NDArray[np.float64]
 Model = tuple[float, float, float, float]
@@ -488,3 +489,11 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         velocity_variance=mix @ estimate.velocity_variance,
     )
     return rotated, variances
+
+
+TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
+    "none": Unfiltered,
+    "one_euro": OneEuro,
+    "adaptive": AdaptiveBank,
+}
+"""Filters by name, made for a finger's maximum speed (m/s)."""

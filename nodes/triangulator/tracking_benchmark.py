@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 
 Floats = NDArray[np.float64]

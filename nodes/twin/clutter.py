@@ -28,8 +28,7 @@ class Trajectory(Protocol):
     """Interface of a position over simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the world position (3,), or that relative to the fingertip for a carried
-        object."""
+        """Return the position (3,), world; of a carried object relative to the fingertip."""
         ...
 
 

@@ -195,8 +195,7 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return world points (n, 3) of the sheet that pixels (n, 2) light first, and which
-        exist."""
+        """Return the sheet's points (n, 3) that pixels (n, 2) light, and which exist."""
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
         limit = np.array([self._rays.width - 1, self._rays.height - 1])
@@ -378,8 +377,7 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return where the object begins and ends (rows) on a column, interpolated between
-        columns."""
+        """Return the object's first and last row on a column, interpolated over columns."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:

@@ -101,8 +101,7 @@ class RoundedLines:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> RoundedLines:
-        """Make the path through points (n, 3) at increasing times (n,), the first taken as time
-        0."""
+        """Make the path through points (n, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
         areas = 0.5 * (points[1:] + points[:-1]) * np.diff(times)[:, None]
         integral = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
@@ -159,8 +158,7 @@ class SmoothPath:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> SmoothPath:
-        """Make the path through points (n >= 2, 3) at increasing times (n,), the first as time
-        0."""
+        """Make the path through points (n >= 2, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
         spline = CubicSpline(times, points, bc_type="clamped")
         return SmoothPath(times, points, spline, spline.derivative())
@@ -313,8 +311,7 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position and velocity without unsteadiness, and the (wander, tremor)
-        amplitudes."""
+        """Return the steady position and velocity, and the wander and tremor amplitudes."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -350,8 +347,7 @@ class FingerMotion:
 
 
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
-    """Return the minimum-jerk rise from 0 to 1 over s = 0..1 and its slope (Flash and Hogan
-    1985)."""
+    """Return the minimum-jerk rise from 0 to 1 and its slope (Flash and Hogan 1985)."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 
 

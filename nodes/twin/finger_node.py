@@ -118,8 +118,7 @@ class TwinFingerNode(Node):
             self._follow(path)
 
     def _follow(self, path: FingerPath) -> None:
-        """Switch to a path now; a path that cannot be followed raises an error and changes
-        nothing."""
+        """Switch to a path now; an infeasible path raises an error and changes nothing."""
         now_ns = self.clock.now_ns()
         self.motion = self.motion.followed_by(
             (now_ns - self.motion_from_ns) * 1e-9,

@@ -108,9 +108,7 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """Return (cells + 1,) coordinates from 0 to `length_m`, finest at `focus_m`, or uniform for
-    None.
-    """
+    """Return (cells + 1,) coordinates up to `length_m`, finest at `focus_m`; None: uniform."""
     if focus_m is None:
         return np.linspace(0.0, length_m, cells + 1)
     samples = np.linspace(0.0, length_m, 4001)
@@ -236,9 +234,7 @@ class _Mesh:
         return total - self.load_n.ravel(), blocks.reshape(elements, 27, 27)
 
     def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
-        """Return the sparse stiffness of the free coordinates; contact: (nodes, 3, 3) diagonal
-        blocks.
-        """
+        """Return the sparse free stiffness; contact: (nodes, 3, 3) diagonal blocks."""
         free = stiffness.ravel()[self._is_free]
         values = np.bincount(self._slot, free, minlength=len(self._unique))
         for node in np.nonzero(contact.any(axis=(1, 2)))[0]:

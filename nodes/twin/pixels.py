@@ -141,9 +141,7 @@ class CameraView:
     noisy: list[Image]
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
-        """Return pixel (2,) and depth (m) of a world point; the pixel is invalid when the depth is
-        <= 0.
-        """
+        """Return pixel (2,) and depth (m) of a world point; depths <= 0 are invalid."""
         x, y, z = (
             self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
         ).tolist()

@@ -58,9 +58,7 @@ class SheetPull:
 
     @classmethod
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
-        """Compute the pull of the true sheet with the simulator's membrane; None if both arms are
-        rigid.
-        """
+        """Compute the pull of the true sheet by the membrane; None if both arms are rigid."""
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
         if not any(compliances):
