@@ -25,7 +25,7 @@ from typing import Any
 
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
-from tests.lab_bags import Arm, Floats, Gap, Times, gaps, held, read_arm, wanted
+from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm, wanted
 
 
 class Span:
@@ -231,7 +231,7 @@ def rows(
     """Return the results of each fault with those of the bags, as table values; lengths in mm."""
     found = []
     for one, gap in zip(results, worst_gaps(lost, results), strict=True):
-        sheet = held(arms, targets, one.during_ns)
+        sheet = measure_hold(arms, targets, one.during_ns)
         found.append(
             {
                 **asdict(one),

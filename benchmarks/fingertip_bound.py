@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
-from flexsheet.nodes.twin.pixels import Eye, Position, Sensor, TwinCamera, Window
+from flexsheet.nodes.twin.pixels import CameraView, Position, Sensor, TwinCamera, Window
 from flexsheet.nodes.twin.rig import pixels_per_slope
 
 Floats = NDArray[np.float64]
@@ -140,7 +140,7 @@ def pixel_information(sensor: Sensor, levels: Floats) -> Floats:
 
 
 def _about_the_mark(
-    camera: TwinCamera, eye: Eye, position: Position, exposure_s: float, margin_px: float
+    camera: TwinCamera, eye: CameraView, position: Position, exposure_s: float, margin_px: float
 ) -> Window:
     """Return the part of an image that the marker lights during the exposure, with the margin."""
     pixels, reach_px = [], 0.0
@@ -160,7 +160,7 @@ def _about_the_mark(
     return window
 
 
-def _pixel_from_world(eye: Eye, point: Floats) -> Floats:
+def _pixel_from_world(eye: CameraView, point: Floats) -> Floats:
     """Return d(pixel)/d(world) (2, 3) at a world point."""
     step_m = 1e-6
     columns = [

@@ -63,7 +63,7 @@ from flexsheet.nodes.twin.clutter import (
     together,
 )
 from flexsheet.nodes.twin.gestures import GESTURES
-from flexsheet.nodes.twin.pixels import Eye, TwinCamera
+from flexsheet.nodes.twin.pixels import CameraView, TwinCamera
 
 Floats = NDArray[np.float64]
 
@@ -174,7 +174,7 @@ def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
     )
 
 
-def _gap_px(eye: Eye, tip: Floats, start: Floats, end: Floats, radius_m: float) -> float:
+def _gap_px(eye: CameraView, tip: Floats, start: Floats, end: Floats, radius_m: float) -> float:
     """Return the undistorted image distance between the edges of marker and object, px."""
     in_camera = apply(eye.camera_from_world, np.stack([tip, start, end]))
     slopes = in_camera[:, :2] / in_camera[:, 2:]

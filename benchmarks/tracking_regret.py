@@ -39,12 +39,12 @@ from benchmarks.tracking_bench import ROOT, bench_scene
 from flexsheet.launch.methods.charts import git_commit
 from flexsheet.launch.methods.results import describe_load, machine_name
 from flexsheet.nodes.triangulator.adaptive import (
+    TRACKING_METHODS,
     AdaptiveBank,
     BankEstimate,
     predict_by_model,
 )
 from flexsheet.nodes.triangulator.filters import Estimate
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 
 Floats = NDArray[np.float64]

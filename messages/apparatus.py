@@ -1,4 +1,4 @@
-"""Define the apparatus: what is true in the simulator, as differences from the scene.
+"""Define the apparatus: the true parameters of the simulation, as differences from the scene.
 
 The scene is what the nodes believe. The apparatus is what is true, and only the simulator and the
 evaluation of experiments read it. All differences are zero, and all ratios one, in a nominal
@@ -31,7 +31,6 @@ from flexsheet.messages.scene import (
 
 Pair = tuple[Finite, Finite]
 Triple = tuple[Finite, Finite, Finite]
-Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
 """A relative deviation or a small angle; what is beyond it is a mistake in the file."""
@@ -45,7 +44,7 @@ ZERO_6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class LensTruth(Part):
-    """State how a lens differs from the scene's (a camera's: from that of its device)."""
+    """Differences of a lens from the scene's (a camera's: from that of its device)."""
 
     focal_ratio: NearOne = Field(default=1.0, description="true focal length over the scene's")
     centre_offset_px: Pair = (0.0, 0.0)
@@ -53,7 +52,7 @@ class LensTruth(Part):
 
 
 class CameraTruth(Part):
-    """State how the stereo camera differs from the scene's."""
+    """Differences of the stereo camera from the scene's."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -80,7 +79,7 @@ class CameraTruth(Part):
 
 
 class ArmTruth(Part):
-    """State how one arm differs from the scene's, and how its controller behaves."""
+    """Differences of one arm from the scene's, and how its controller behaves."""
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3
@@ -117,7 +116,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """State how the sheet differs from the scene's, and what the scene does not describe."""
+    """Differences of the sheet from the scene's, and properties that the scene lacks."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
@@ -136,7 +135,7 @@ class SheetTruth(Part):
         default=None, description="between finger and sheet; null: touched rubber sticks"
     )
     hysteresis_ratio: Share = Field(
-        default=0.0, description="share of the stored energy that a cycle loses"
+        default=0.0, description="fraction of the stored energy that a cycle loses"
     )
     creep_ratio_per_decade: Share = Field(
         default=0.0, description="relative loss of tension per decade of time"
@@ -144,7 +143,7 @@ class SheetTruth(Part):
 
 
 class FingerTruth(Part):
-    """State how the finger, its marker and its motion differ from what the nodes assume.
+    """Differences of the finger, its marker and its motion from the nodes' assumptions.
 
     The finger's frame has its origin at the pad's contact point (the fingertip of all messages), x
     along the finger towards the hand, z from the pad to the nail, y = z x x.
@@ -180,7 +179,7 @@ class FingerTruth(Part):
 
 
 class EyesTruth(Part):
-    """State where the eyes really are, relative to the tracked eyes or to the scene's."""
+    """Offsets of the true eyes from the tracked eyes, or from the scene's."""
 
     centre_offset_m: SmallTriple = ZERO_3
     interocular_offset_m: Small = 0.0
@@ -191,7 +190,7 @@ class EyesTruth(Part):
 
 
 class ProjectorTruth(Part):
-    """State how the projector differs from the scene's."""
+    """Differences of the projector from the scene's."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -202,7 +201,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """Hold the device parts of the scene from which the differences are counted."""
+    """Device parts of the scene from which the differences are counted."""
 
     camera: StereoCamera
     arms: Arms
@@ -219,7 +218,7 @@ class Apparatus(Message):
     scene_id: str | None = Field(
         default=None, description="identity of its object and devices; null: only the name counts"
     )
-    origin: str = Field(default="file", description="where it comes from, for people")
+    origin: str = Field(default="file", description="origin, as text for users")
     nominal: Devices | None = Field(
         default=None,
         description="devices from which the differences are counted; null: those of the scene",

@@ -23,7 +23,7 @@ class ArmPoseFit(Part):
     shift_m: NonNegative = Field(
         description="distance of the measured board from that by the joints"
     )
-    turn_rad: NonNegative
+    rotation_rad: NonNegative
     rms_px: NonNegative = Field(description="reprojection error of the corners by the joints")
 
 
@@ -46,10 +46,10 @@ class ArmBase(Part):
         description="scatter of fits without one pose, over that by the covariance; above 1 the "
         "covariance was multiplied by its square"
     )
-    largest_change_m: NonNegative = Field(
+    max_change_m: NonNegative = Field(
         description="largest change of the base's position when one pose is left out"
     )
-    largest_change_rad: NonNegative
+    max_change_rad: NonNegative
     corner_sigma_px: NonNegative = Field(
         description="standard deviation of one coordinate of a corner"
     )
@@ -57,7 +57,7 @@ class ArmBase(Part):
         description="error of the flange's position by the joints, per axis"
     )
     arm_sigma_rad: NonNegative
-    places: tuple[ArmPoseFit, ...]
+    poses: tuple[ArmPoseFit, ...]
 
 
 class ArmsCalibration(Part):

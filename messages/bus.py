@@ -36,6 +36,7 @@ from zmq.utils.monitor import parse_monitor_message
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyChange, KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
@@ -92,9 +93,9 @@ libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "rejects the key of this host; check its launch file",
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not accept keys; its launch file may have none",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "did not prove that it has its key",
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: NodeNote.KEY_REFUSED.phrase,
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: NodeNote.NO_KEYS_THERE.phrase,
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: NodeNote.KEY_NOT_PROVED.phrase,
 }
 RECONNECTED = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
 MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAILED)
@@ -442,7 +443,7 @@ class Subscriber:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
                 f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
-                f"{self.counts.gaps} in total; a subscriber or the network is too slow"
+                f"{self.counts.gaps} in total; {NodeNote.READER_TOO_SLOW.phrase}"
             )
 
 
@@ -746,7 +747,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
         )
     if transport not in ("tcp", "ipc"):
         raise BusError(
-            f'topic "{topic.name}": {endpoint} is neither ipc:///path nor tcp://host:port'
+            f'topic "{topic.name}": {endpoint} is invalid; expected ipc:///path or tcp://host:port'
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
@@ -26,7 +27,7 @@ def describe_busy(host: HostStatus) -> str:
         why = f"{host.load_ratio:.1f} runnable processes per core"
     else:
         why = describe_pressure(host.cpu)
-    return f"the computer {host.host} is busy: {why}"
+    return f"the computer {host.host} {NodeNote.COMPUTER_BUSY.phrase} {why}"
 
 
 def describe_pressure(cpu: CpuPressure) -> str:

@@ -13,6 +13,7 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
+from flexsheet.messages.migrations import rename_fields
 from flexsheet.messages.scene import Part
 
 Calibration = TypeVar("Calibration", bound=Part)
@@ -100,7 +101,7 @@ def read_calibration(
             f"calibrate again with `{command}`"
         )
     try:
-        return kind.model_validate(content)
+        return kind.model_validate(rename_fields(kind, content))
     except ValidationError as error:
         problems = "; ".join(
             f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"

@@ -31,7 +31,7 @@ class MarkerCalibration(Part):
     standard_deviations_m: tuple[NonNegative, NonNegative, NonNegative]
     point_offset_m: FingerLengths = Field(description="common error of the touched points, world")
     residual_rms_m: NonNegative
-    residual_worst_m: NonNegative
+    max_residual_m: NonNegative
     touches: Annotated[int, Field(ge=1)]
     orientations: Annotated[int, Field(ge=1)]
 

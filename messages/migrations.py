@@ -36,14 +36,28 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
         "ahead_world_m": "predicted_path_world_m",
         "ahead_step_s": "prediction_step_s",
     },
+    "ArmBase": {
+        "largest_change_m": "max_change_m",
+        "largest_change_rad": "max_change_rad",
+        "places": "poses",
+    },
+    "ArmPoseFit": {"turn_rad": "rotation_rad"},
     "Frame": {"lost_share": "occluded_fraction"},
+    "MarkerCalibration": {"residual_worst_m": "max_residual_m"},
     "Methods": {"mark": "marker"},
+    "SheetCalibration": {
+        "deepest_m": "max_depth_m",
+        "largest_stretch_ratio": "max_stretch_ratio",
+        "least_stretch_ratio": "min_stretch_ratio",
+        "mooney_share": "mooney_ratio",
+        "residual_worst_ratio": "max_residual_ratio",
+    },
     "SheetTarget": {"retreat_m": "normal_offset_m"},
     "Status": {"taken": "execution_log"},
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""Former and current field names, by message or message part."""
+"""Former and current field names, by message, message part or calibration."""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -133,7 +147,7 @@ def find_migration(
     renamed_schema = _rename_in_schema(message_type, recorded_schema)
     if not is_compatible(_literal_schema(message_type.__name__, renamed_schema, current), current):
         return None
-    return lambda fields: _rename_in_fields(message_type, fields)
+    return lambda fields: rename_fields(message_type, fields)
 
 
 def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
@@ -192,8 +206,11 @@ def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
     return renamed
 
 
-def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
-    """Return the recorded fields of a model and of its nested models with current names."""
+def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
+    """Return the recorded fields of a model and of its nested models with current names.
+
+    A calibration file contains the fields of a calibration.
+    """
     names = RENAMED_FIELDS.get(model.__name__, {})
     renamed: Fields = {}
     for name, value in fields.items():
@@ -217,7 +234,7 @@ def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
 def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
     """Return the recorded fields of a part, or of each part of a list, with current names."""
     if model is not None and isinstance(value, dict):
-        return _rename_in_fields(model, value)
+        return rename_fields(model, value)
     if model is not None and isinstance(value, list):
         return [_rename_in_parts(model, part) for part in value]
     return value

@@ -10,7 +10,10 @@ BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row 
 
 
 class NodeNote(Enum):
-    """Notes, reasons and warnings of nodes that need an action, by the constant text in them."""
+    """Notes, reasons and warnings of nodes that need an action.
+
+    phrase: constant part of the text, which the writers of the note use. remedy: what to do.
+    """
 
     COMPUTER_BUSY = (
         "is busy:",
@@ -46,12 +49,12 @@ class NodeNote(Enum):
         "`liveness_s` of the launch file sets the time-out.",
     )
     KEY_REFUSED = (
-        "rejects the key of this host",
+        "rejects the key of this host; check its launch file",
         "The launch file of that host has no key or another key for this host. Copy the newest "
         "launch file to all hosts; `flexsheet doctor hosts` lists the differences.",
     )
     NO_KEYS_THERE = (
-        "does not accept keys",
+        "does not accept keys; its launch file may have none",
         "Start that host with a launch file that has keys, the same on all hosts.",
     )
     KEY_NOT_PROVED = (
@@ -133,7 +136,7 @@ _SHOWN_UNITS = {"m": ("mm", 1e3), "s": ("ms", 1e3), "px": ("px", 1.0), "rad": ("
 
 
 def describe_self_check(check: SelfCheck) -> str:
-    """Return a suspicion with its numbers, for people."""
+    """Format a suspected cause with its numbers."""
     unit, scale = _SHOWN_UNITS[check.unit]
     subject = f"{check.subject}: " if check.subject else ""
     return (

@@ -244,8 +244,8 @@ class SheetSpec(Part):
     )
     hysteresis_ratio: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.0,
-        description="share of the loading's energy that the rubber loses in a cycle; corrects the "
-        "rendered force, a sheet calibration replaces it",
+        description="fraction of the loading's energy that the rubber loses in a cycle; corrects "
+        "the rendered force, a sheet calibration replaces it",
     )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0

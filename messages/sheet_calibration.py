@@ -68,18 +68,18 @@ class SheetCalibration(Part):
     cubic_ratio: Fitted = Field(
         description="cubic term of the slack sheet's force, over that of ideal rubber"
     )
-    mooney_share: Fitted | None = Field(default=None, description="C2/(C1+C2); null: not fitted")
+    mooney_ratio: Fitted | None = Field(default=None, description="C2/(C1+C2); null: not fitted")
     hysteresis_ratio: Fitted | None = Field(
         default=None,
-        description="share of the loading's energy that a cycle loses; null: not measured",
+        description="fraction of the loading's energy that a cycle loses; null: not measured",
     )
     rows: Annotated[int, Field(ge=1)]
     left_out: tuple[LeftOutRow, ...]
     residual_rms_ratio: NonNegative
-    residual_worst_ratio: NonNegative
-    least_stretch_ratio: Positive
-    largest_stretch_ratio: Positive
-    deepest_m: Positive
+    max_residual_ratio: NonNegative
+    min_stretch_ratio: Positive
+    max_stretch_ratio: Positive
+    max_depth_m: Positive
     table: SheetTable | None = None
 
 

@@ -102,7 +102,7 @@ _ROWS = (
     Topic("twin/arms_right", types.TwinArms, _EVERY, (50, 1000), True,
           "true poses of the arms, from the right arm's computer"),
     Topic("twin/apparatus", apparatus.Apparatus, _LATCHED, None, True,
-          "what is true in the simulator; only the simulator and experiments read it"),
+          "true parameters of the simulated apparatus; only the simulator and experiments read it"),
     Topic("twin/eye", types.TwinEye, _EVERY, None, True, "image as the user's eye would see it",
           max_bytes=64 << 20),
 )  # fmt: skip

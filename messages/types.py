@@ -566,7 +566,9 @@ class TwinEye(Message):
 
     label: str
     correction: Correction
-    viewpoint: Viewpoint = Field(default="centre", description="midway between the eyes, or one")
+    viewpoint: Viewpoint = Field(
+        default="centre", description="midpoint between the eyes, or one eye"
+    )
     metres_per_px: Positive = Field(description="size of a pixel on the imaginary screen")
     seen: ColorImage
     expected: ColorImage

@@ -244,7 +244,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if code not in (_INLINE, _FRAME):
             raise WireError("malformed", f"unknown extension type {code} in the header")
         if len(data) < 8:
-            raise WireError("malformed", "an array has neither dtype nor shape")
+            raise WireError("malformed", "an array does not contain dtype and shape")
         dtype, shape, offset, size = _read_dtype_and_shape(data[: (4 * data[1] + 11) & ~7])
         if code == _INLINE:
             if len(data) - offset != size:

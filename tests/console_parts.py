@@ -20,7 +20,7 @@ def cylinder() -> Scene:
     return Scene.model_validate(YAML(typ="safe").load(text))
 
 
-class Shelf:
+class FixedMessages:
     """Source whose messages the test sets."""
 
     def __init__(self, **messages: Message) -> None:

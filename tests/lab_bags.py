@@ -175,7 +175,7 @@ def wanted(folder: Path) -> tuple[Times, Floats]:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class SheetHold:
     """Positioning of the sheet in a time span.
 
     errors_m (k,): distance of the true sheet centre from each target. followed: fraction of the
@@ -189,7 +189,7 @@ class Held:
         return 1e3 * float(np.quantile(self.errors_m, share)) if len(self.errors_m) else None
 
 
-def held(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> Held:
+def measure_hold(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> SheetHold:
     """Compute the positioning of the sheet in a time span."""
     left, right = arms
     times, centres = targets
@@ -197,7 +197,7 @@ def held(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> He
     middle = 0.5 * (left.edge_at(times[keep]) + right.edge_at(times[keep]))
     moments = np.arange(span[0], span[1], MOMENT_NS, dtype=np.int64)
     followed = left.follows(moments) & right.follows(moments)
-    return Held(
+    return SheetHold(
         np.asarray(np.linalg.norm(middle - centres[keep], axis=1)),
         float(followed.mean()) if len(followed) else 0.0,
     )

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 
-class Cut:
+class TcpRelay:
     """TCP relay to a port; `half_open` discards data in both directions."""
 
     def __init__(self, target_port: int) -> None:
@@ -21,7 +21,7 @@ class Cut:
         self._writers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def __aenter__(self) -> Cut:
+    async def __aenter__(self) -> TcpRelay:
         self._server = await asyncio.start_server(self._relay, "127.0.0.1", 0)
         self.port = int(self._server.sockets[0].getsockname()[1])
         return self

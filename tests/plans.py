@@ -40,7 +40,7 @@ def scene_with(
     return Scene.model_validate(values)
 
 
-class Desk:
+class PlannerHarness:
     """Planner for a scene's object; fingers and results are in the object's frame."""
 
     def __init__(self, scene: Scene, **parameters: float) -> None:

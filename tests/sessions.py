@@ -93,7 +93,7 @@ def finger_at(angle_rad: float) -> Floats:
     return np.asarray(centre + radius_m * np.array([0.0, np.sin(angle_rad), np.cos(angle_rad)]))
 
 
-class Desk:
+class MessageWriter:
     """Writer of messages with their headers."""
 
     def __init__(self, writer: BagWriter, leave_out: Collection[str]) -> None:
@@ -125,7 +125,7 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
                  "started_ns": str(START_NS)}  # fmt: skip
     with BagWriter(path, {"recording": recording}) as writer:
         writer.add_attachment("git.json", b'{"commit": "abc", "changed": true}', "application/json")
-        desk = Desk(writer, leave_out)
+        desk = MessageWriter(writer, leave_out)
         desk.write("scene", SCENE, 0.0)
         for i in range(round(ENDS_S * RATE_HZ)):
             seconds = i / RATE_HZ
@@ -141,7 +141,9 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
     return path
 
 
-def _write_step(desk: Desk, i: int, seconds: float, begin_s: float, finish_s: float) -> None:
+def _write_step(
+    desk: MessageWriter, i: int, seconds: float, begin_s: float, finish_s: float
+) -> None:
     share = np.clip((seconds - begin_s) / (finish_s - begin_s), 0.0, 1.0)
     angle_rad = float(np.radians(60.0) * share)
     tip, pose = finger_at(angle_rad), sheet_at(angle_rad)

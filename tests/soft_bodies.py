@@ -36,7 +36,7 @@ def cylinder_spec(
     return SoftBodySpec(mesh, poisson_ratio, sticking)
 
 
-class Here(Executor):
+class InlineExecutor(Executor):
     """Run submitted functions at once, in this process."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:

@@ -27,7 +27,7 @@ from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.head import HeadSway
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import TrueRubber, solve
 from flexsheet.nodes.twin.mxt_controller import MxtController
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
@@ -328,7 +328,7 @@ def test_the_makers_controller_has_latency_and_another_cycle() -> None:
 def test_a_thickness_gradient_shifts_the_middle_and_keeps_the_balance() -> None:
     edges = [transform(np.eye(3), [0.126 * side, 0.0, 0.0]) for side in (-1.0, 1.0)]
     plain, uneven = (
-        solve(Rubber(0.24, 0.24, 0.001, 1e6, thickness_gradient=gradient), *edges, cells=8)
+        solve(TrueRubber(0.24, 0.24, 0.001, 1e6, thickness_gradient=gradient), *edges, cells=8)
         for gradient in ((0.0, 0.0), (0.2, 0.0))
     )
     middle = uneven.positions[4, 4] - plain.positions[4, 4]
@@ -404,7 +404,7 @@ def test_the_presented_force_is_that_of_the_true_sheet() -> None:
         apparatus=given,
     )
     felt = ForceReference(stiff).evaluate(0, press)
-    assert felt.presented_n == pytest.approx(1.2 * plain.presented_n, rel=1e-3)
+    assert felt.rendered_n == pytest.approx(1.2 * plain.rendered_n, rel=1e-3)
     assert felt.wanted_n == plain.wanted_n
 
 

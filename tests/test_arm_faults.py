@@ -22,7 +22,7 @@ from flexsheet.nodes.arm_bridge.link_drivers import make_link
 from flexsheet.nodes.arm_bridge.modbus import MAGIC
 from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
-from tests.network import Cut
+from tests.network import TcpRelay
 from tests.test_arm_loop import (
     AT_FRONT,
     Path3,
@@ -48,7 +48,7 @@ class Stroke:
 
     rig: Rig
     nodes: dict[str, Any]
-    cut: Cut
+    cut: TcpRelay
 
     def mode(self, side: str) -> str:
         return self.rig.newest(side).mode
@@ -94,7 +94,7 @@ def to_and_fro(radius: float, seconds: float) -> Path3:
     return path
 
 
-class FalseStatus(Cut):
+class FalseStatus(TcpRelay):
     """Proxy that repeats a part of the arm's status with a valid CRC and echo."""
 
     REPLY_BYTES, BLOCK_AT = 61, 9
@@ -124,7 +124,7 @@ class FalseStatus(Cut):
 
 @asynccontextmanager
 async def mid_stroke(
-    seconds: float = 6.0, proxy: type[Cut] = Cut, **bridge: Any
+    seconds: float = 6.0, proxy: type[TcpRelay] = TcpRelay, **bridge: Any
 ) -> AsyncIterator[Stroke]:
     """Run both arms with a stroking finger; the left bridge reaches its arm by a proxy."""
     async with (

@@ -15,7 +15,7 @@ from flexsheet.messages.types import CpuPressure, HostStatus, ProgramCpu
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
-class Kernel:
+class ProcFiles:
     """Counters of processes in a folder, in the kernel's format, and a clock."""
 
     def __init__(self, folder: Path) -> None:
@@ -38,14 +38,14 @@ class Kernel:
 
 
 @pytest.fixture
-def kernel(tmp_path: Path) -> Kernel:
-    return Kernel(tmp_path)
+def kernel(tmp_path: Path) -> ProcFiles:
+    return ProcFiles(tmp_path)
 
 
 ARMS = {"left": 11, "right": 12}
 
 
-def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
+def run(kernel: ProcFiles, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
     """Let both arms' nodes wait for some time in each second."""
     found = None
     for _ in range(seconds):
@@ -57,18 +57,18 @@ def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPr
     return found
 
 
-def test_the_first_sample_reports_nothing(kernel: Kernel) -> None:
+def test_the_first_sample_reports_nothing(kernel: ProcFiles) -> None:
     assert run(kernel, 1, left_s=0.9, right_s=0.9) is None
 
 
-def test_a_quiet_computer_is_not_busy(kernel: Kernel) -> None:
+def test_a_quiet_computer_is_not_busy(kernel: ProcFiles) -> None:
     found = run(kernel, 10, left_s=0.02, right_s=0.05)
     assert found is not None
     assert found.wait_ratio == pytest.approx(0.05)
     assert (found.busy, found.node, found.programs) == (False, "right", ())
 
 
-def test_a_busy_computer_names_who_waits_and_who_runs(kernel: Kernel) -> None:
+def test_a_busy_computer_names_who_waits_and_who_runs(kernel: ProcFiles) -> None:
     found = run(kernel, 10, left_s=0.6, right_s=0.3)
     assert found is not None
     assert found.wait_ratio == pytest.approx(0.6)
@@ -77,7 +77,7 @@ def test_a_busy_computer_names_who_waits_and_who_runs(kernel: Kernel) -> None:
     assert [one.cores for one in found.programs] == pytest.approx([1.5, 0.3, 0.2])
 
 
-def test_what_is_long_past_does_not_count(kernel: Kernel) -> None:
+def test_what_is_long_past_does_not_count(kernel: ProcFiles) -> None:
     run(kernel, 10, left_s=0.9, right_s=0.9)
     found = run(kernel, int(WINDOW_S) + 1, left_s=0.0, right_s=0.0)
     assert found is not None
@@ -85,7 +85,7 @@ def test_what_is_long_past_does_not_count(kernel: Kernel) -> None:
     assert not found.busy
 
 
-def test_a_restarted_process_starts_from_zero(kernel: Kernel) -> None:
+def test_a_restarted_process_starts_from_zero(kernel: ProcFiles) -> None:
     run(kernel, 5, left_s=0.01, right_s=0.01)
     kernel.now_s += 1.0
     found = kernel.watch.update({"left": 11, "right": 99})

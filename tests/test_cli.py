@@ -40,7 +40,7 @@ LISTENING: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class CommandResult:
     """Result of a command: exit code, stdout, stderr."""
 
     code: int
@@ -57,13 +57,13 @@ class Command:
     def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         self._capsys, self._monkeypatch = capsys, monkeypatch
 
-    def __call__(self, *arguments: object) -> Said:
+    def __call__(self, *arguments: object) -> CommandResult:
         self._monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
         self._capsys.readouterr()
         with pytest.raises(SystemExit) as end:
             cli.main()
         out, err = self._capsys.readouterr()
-        return Said(int(end.value.code or 0), out, err)
+        return CommandResult(int(end.value.code or 0), out, err)
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     assert launched.stop() == 0
 
 
-def told_of_its_stop(bag: Path) -> bool:
+def contains_stop(bag: Path) -> bool:
     """Return whether the bag contains the listener's stop and its report."""
     stopped = False
     for topic, message, header, _ in BagReader(
@@ -150,7 +150,7 @@ def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=5.0"
     )
     # The listener hears the tenth beat a fifth of a second after the start, and says so by and by.
-    wait_until(lambda: told_of_its_stop(folder / "a.mcap"), "the listener's stop in the bag")
+    wait_until(lambda: contains_stop(folder / "a.mcap"), "the listener's stop in the bag")
     assert launched.stop() == 0
     return folder / "a.mcap"
 

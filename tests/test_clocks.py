@@ -32,7 +32,7 @@ S = 1_000_000_000
 MS = 1_000_000
 
 
-class Other:
+class DriftingClock:
     """Clock with a drift against the true one, of a bounded varying rate."""
 
     def __init__(self, offset_ns: int, drift: float, sway: float = 0.0) -> None:
@@ -44,7 +44,12 @@ class Other:
 
 
 def measured(
-    ours: Other, theirs: Other, delays: list[tuple[int, int]], *, max_drift: float, every_ns: int
+    ours: DriftingClock,
+    theirs: DriftingClock,
+    delays: list[tuple[int, int]],
+    *,
+    max_drift: float,
+    every_ns: int,
 ) -> tuple[OtherClock, int]:
     """Return the estimate after pings with (there, back) delays in ns, and the true time of the
     last one."""
@@ -68,15 +73,19 @@ delays = st.lists(
 @settings(max_examples=150)
 @given(
     delays=delays,
-    ours=st.builds(Other, st.just(0), st.floats(-1e-4, 1e-4)),
+    ours=st.builds(DriftingClock, st.just(0), st.floats(-1e-4, 1e-4)),
     theirs=st.builds(
-        Other, st.integers(-(10**14), 10**14), st.floats(-1e-4, 1e-4), st.floats(0, 2e-4)
+        DriftingClock, st.integers(-(10**14), 10**14), st.floats(-1e-4, 1e-4), st.floats(0, 2e-4)
     ),
     every=st.integers(10 * MS, 2 * S),
     later=st.integers(0, 10 * S),
 )
 def test_the_true_offset_is_always_within_the_bounds(
-    delays: list[tuple[int, int]], ours: Other, theirs: Other, every: int, later: int
+    delays: list[tuple[int, int]],
+    ours: DriftingClock,
+    theirs: DriftingClock,
+    every: int,
+    later: int,
 ) -> None:
     """The offset is within its bounds for any delays, asymmetry, age and varying rates."""
     clock, now = measured(ours, theirs, delays, max_drift=5e-4, every_ns=every)
@@ -97,8 +106,8 @@ def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
         return base + asymmetry + round(chance.expovariate(1.0) * 5 * MS)
 
     ways = [(delay(3 * MS if asymmetric else 0), delay(0)) for _ in range(480)]
-    theirs = Other(-5 * 3600 * S, 8e-5)
-    clock, now = measured(Other(0, 0.0), theirs, ways, max_drift=5e-4, every_ns=S // 16)
+    theirs = DriftingClock(-5 * 3600 * S, 8e-5)
+    clock, now = measured(DriftingClock(0, 0.0), theirs, ways, max_drift=5e-4, every_ns=S // 16)
     found = clock.estimate(now)
     assert found is not None
     error = abs(theirs.at(now) - now - found.offset_ns)
@@ -268,7 +277,7 @@ async def test_a_clock_that_falls_silent_is_known_less_and_less_and_then_not_at_
     assert last.offsets == ()
 
 
-class Passing(Node):
+class ForwardingNode(Node):
     """Node that forwards a fingertip's stamp, as all nodes do that process the finger."""
 
     parameters: NodeParameters
@@ -282,7 +291,7 @@ class Passing(Node):
 async def test_a_stamp_that_is_passed_on_is_of_the_clock_that_the_header_names() -> None:
     sent: list[Header] = []
     clock = VirtualClock(100 * S, clock_id="here")
-    node = Passing(
+    node = ForwardingNode(
         NodeParameters(), name="n", clock=clock, send=lambda _, __, header: sent.append(header)
     )
     node.clock_table.update(clocks(a=offset(drift_ratio=0.0)))

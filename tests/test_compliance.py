@@ -318,7 +318,7 @@ def test_every_law_is_charted_within_the_scenes_range() -> None:
     trials = list(family.trials(SCENE))
     assert {trial.method for trial in trials} == set(family.methods)
     assert family.tolerance(SCENE) == pytest.approx(10.0)
-    assert {trial.case["place"] for trial in trials} == {
+    assert {trial.case["position"] for trial in trials} == {
         "centre",
         "off-centre",
         "near the clamp",

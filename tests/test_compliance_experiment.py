@@ -77,7 +77,7 @@ def test_the_simulated_sheet_gives_the_rendered_force(
     alone = simulate_force(
         SCENE.sheet, STRETCH, depth_m - normal_offset_m, (float(press.surface[0]), 0.0), 0.007
     )
-    assert felt.presented_n == pytest.approx(alone, rel=0.02)
+    assert felt.rendered_n == pytest.approx(alone, rel=0.02)
 
 
 def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
@@ -124,13 +124,13 @@ def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
 
 def test_the_image_shows_each_position(tmp_path: Path) -> None:
     rows = [
-        {"place": place, "depth_mm": depth, "wanted_n": 0.05 * depth, "presented_n": 0.052 * depth}
+        {"place": place, "depth_mm": depth, "wanted_n": 0.05 * depth, "rendered_n": 0.052 * depth}
         for place in ("at 0, 0 mm", "at 25, 0 mm")
         for depth in (5.0, 20.0)
     ]
     moving = {
         "speed_mm_per_s": 50.0,
-        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "presented_n": 0.2}],
+        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "rendered_n": 0.2}],
     }
     picture = tmp_path / "compliance.png"
     draw_compliance({"rows": rows, "moving": moving, "noticed_percent": [15, 22]}, picture)

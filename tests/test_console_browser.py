@@ -25,7 +25,7 @@ from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.console_parts import Shelf, cylinder
+from tests.console_parts import FixedMessages, cylinder
 from tests.fingertips import fingertip
 from tests.test_console_words import port, status
 from tests.waiting import DEADLINE_S
@@ -47,7 +47,7 @@ INKED_POINTS = """() => {
 
 
 @dataclass
-class Findings:
+class PageVisit:
     """Results of one visit to the page."""
 
     ran: list[Any] = field(default_factory=list)
@@ -72,7 +72,7 @@ async def browser_tab() -> AsyncIterator[BrowserTab]:
         await browser.close()
 
 
-async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -> None:
+async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) -> None:
     """Put markup into every name and text that others define."""
     scene = cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
@@ -105,7 +105,7 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
     await expect(tab.locator(".fs-problem")).to_have_count(0)
 
 
-async def measure_layout(page: Page, tab: BrowserTab, found: Findings) -> None:
+async def measure_layout(page: Page, tab: BrowserTab, found: PageVisit) -> None:
     """Record the positions of a slider and the e-stop while texts change."""
     await tab.get_by_role("tab", name="Touch").click()
     slider = tab.get_by_role("textbox", name="Stiffness, kPa")
@@ -139,9 +139,9 @@ async def measure_layout(page: Page, tab: BrowserTab, found: Findings) -> None:
         found.stop_boxes[name] = await stop.bounding_box()
 
 
-async def draw_a_single_sample(page: Page, tab: BrowserTab, found: Findings) -> None:
+async def draw_a_single_sample(page: Page, tab: BrowserTab, found: PageVisit) -> None:
     history = History()
-    history.add(0.0, Shelf(fingertip=fingertip(np.zeros(3))))
+    history.add(0.0, FixedMessages(fingertip=fingertip(np.zeros(3))))
     page.graph.show("<p id=single>single</p>", history.columns())
     await tab.get_by_role("tab", name="Graph").click()
     await expect(tab.locator("#single")).to_be_visible()
@@ -150,7 +150,7 @@ async def draw_a_single_sample(page: Page, tab: BrowserTab, found: Findings) -> 
     found.single_sample_ink = await tab.evaluate(INKED_POINTS)
 
 
-class Framing(BaseHTTPRequestHandler):
+class FramingPage(BaseHTTPRequestHandler):
     """Page of another site that shows the console in a frame."""
 
     def __init__(self, inner: str, *arguments: Any) -> None:
@@ -170,9 +170,9 @@ class Framing(BaseHTTPRequestHandler):
         """Write nothing."""
 
 
-async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
+async def open_in_frames(url: str, tab: BrowserTab, found: PageVisit) -> None:
     """Open the console in pages of another origin, and record its answers."""
-    site = ThreadingHTTPServer(("127.0.0.1", 0), partial(Framing, url))
+    site = ThreadingHTTPServer(("127.0.0.1", 0), partial(FramingPage, url))
     Thread(target=site.serve_forever, daemon=True).start()
     try:
         for tag in ("iframe", "object", "embed"):
@@ -184,8 +184,8 @@ async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
         site.server_close()
 
 
-async def visit() -> Findings:
-    found = Findings()
+async def visit() -> PageVisit:
+    found = PageVisit()
     server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "flexsheet")
     page = Page(server, lambda *_: None, with_finger=True, others_may=(MARKUP,))
     url = f"http://127.0.0.1:{server.get_port()}/"
@@ -203,11 +203,11 @@ async def visit() -> Findings:
 
 
 @pytest.fixture(scope="module")
-def found() -> Findings:
+def found() -> PageVisit:
     return asyncio.run(visit())
 
 
-def test_markup_in_names_is_shown_as_text_and_not_run(found: Findings) -> None:
+def test_markup_in_names_is_shown_as_text_and_not_run(found: PageVisit) -> None:
     assert found.ran == [None] * (len(TABS) + 1)
     assert found.options == [MARKUP, f"{MARKUP}.mcap"]
     assert found.texts["banner"].count(MARKUP) >= 5
@@ -217,7 +217,7 @@ def test_markup_in_names_is_shown_as_text_and_not_run(found: Findings) -> None:
     assert f"Reset the fault: on {MARKUP}" in found.texts["Touch"]
 
 
-def test_nothing_moves_while_texts_change(found: Findings) -> None:
+def test_nothing_moves_while_texts_change(found: PageVisit) -> None:
     """ "unconfirmed" is shorter than a position, which moved the sliders below while a user dragged
     one."""
     assert len(found.slider_boxes) > 3
@@ -226,9 +226,9 @@ def test_nothing_moves_while_texts_change(found: Findings) -> None:
     assert len({str(box) for box in found.stop_boxes.values()}) == 1, found.stop_boxes
 
 
-def test_a_single_sample_is_a_point_of_the_chart(found: Findings) -> None:
+def test_a_single_sample_is_a_point_of_the_chart(found: PageVisit) -> None:
     assert found.single_sample_ink > 4
 
 
-def test_the_console_is_not_shown_in_a_frame(found: Findings) -> None:
+def test_the_console_is_not_shown_in_a_frame(found: PageVisit) -> None:
     assert found.framed == {"iframe": 403, "object": 403, "embed": 403}

@@ -32,7 +32,7 @@ from flexsheet.nodes.console.sheet import (
 from flexsheet.nodes.console.snapshot import compute_snapshot, rays, select_ray_vertices
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
-from tests.console_parts import Shelf, cylinder
+from tests.console_parts import FixedMessages, cylinder
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]
@@ -162,12 +162,12 @@ def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
 
 
 def test_the_drawing_shows_the_received_messages(scene: Scene) -> None:
-    nothing = compute_snapshot(scene, Shelf())
+    nothing = compute_snapshot(scene, FixedMessages())
     assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
     left, right = edges()
     both = compute_snapshot(
         scene,
-        Shelf(
+        FixedMessages(
             arm_left=arm_state("left", world_from_flange=left),
             arm_right=arm_state("right", world_from_flange=right),
             fingertip=fingertip(np.array([0.0, 0.0, -0.01])),

@@ -44,7 +44,7 @@ pytestmark = BROWSER_MARKS
 
 
 @dataclass
-class Heard:
+class ReceivedMessages:
     """Messages of the graph by topic, in order."""
 
     messages: dict[str, list[Any]] = field(default_factory=dict)
@@ -69,8 +69,8 @@ class Heard:
 
 
 @contextlib.asynccontextmanager
-async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[Heard]:
-    heard, subscribers = Heard(), []
+async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[ReceivedMessages]:
+    heard, subscribers = ReceivedMessages(), []
     for name in names:
         subscriber = Subscriber(
             find_topic(name),
@@ -94,10 +94,10 @@ def free_port() -> int:
 
 
 @dataclass
-class Session:
+class PageVisit:
     """Results of one visit to the page."""
 
-    heard: Heard
+    heard: ReceivedMessages
     bag: Path
     exit_codes: dict[str, int]
     restarts: dict[str, int]
@@ -122,7 +122,7 @@ async def slide(page: Page, label: str, value: str) -> None:
     await box.press("Enter")
 
 
-async def visit(page: Page, session: Session, port: int) -> None:
+async def visit(page: Page, session: PageVisit, port: int) -> None:
     """Use the page as a user does."""
     await page.goto(f"http://127.0.0.1:{port}/")
     await expect(page.get_by_role("button", name="E-STOP")).to_be_visible()
@@ -143,7 +143,7 @@ async def visit(page: Page, session: Session, port: int) -> None:
     await end_recording(page, session.heard)
 
 
-async def begin_recording(page: Page, heard: Heard) -> None:
+async def begin_recording(page: Page, heard: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("textbox", name="Name").fill("before anything")
     await expect(page.get_by_role("button", name="Add a bookmark")).to_be_visible()
@@ -157,7 +157,7 @@ async def begin_recording(page: Page, heard: Heard) -> None:
     await heard.until(lambda: heard.last("bookmark") is not None, "the moment")
 
 
-async def touch(page: Page, heard: Heard) -> None:
+async def touch(page: Page, heard: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Touch").click()
     assert "twin/finger_path" not in heard.messages
     x, y = OBJECT_PX
@@ -181,7 +181,7 @@ async def touch(page: Page, heard: Heard) -> None:
     assert across_m(heard.last("twin/finger")) == pytest.approx(0.03, abs=2e-3)
 
 
-async def push(page: Page, heard: Heard, depth_mm: float) -> None:
+async def push(page: Page, heard: ReceivedMessages, depth_mm: float) -> None:
     """Push by slider, and wait until the finger has that depth."""
     await slide(page, "Push, mm", f"{depth_mm:g}")
     await heard.until(
@@ -189,7 +189,7 @@ async def push(page: Page, heard: Heard, depth_mm: float) -> None:
     )
 
 
-async def change_the_scene(page: Page, heard: Heard) -> None:
+async def change_the_scene(page: Page, heard: ReceivedMessages) -> None:
     scenes = len(heard.messages["scene"])
     await slide(page, "Stiffness, kPa", "9")
     await heard.until(lambda: len(heard.messages["scene"]) > scenes, "a stiffer object")
@@ -208,7 +208,7 @@ async def change_the_scene(page: Page, heard: Heard) -> None:
     await heard.until(lambda: heard.last("scene").name == "sphere", "another scene")
 
 
-async def stop_and_release(page: Page, heard: Heard) -> None:
+async def stop_and_release(page: Page, heard: ReceivedMessages) -> None:
     await page.get_by_role("button", name="E-STOP").click()
     await heard.until(lambda: engaged(heard) == "pressed at the console", "an e-stop")
     await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
@@ -224,7 +224,7 @@ async def stop_and_release(page: Page, heard: Heard) -> None:
     await heard.until(lambda: engaged(heard) == "Escape at the console", "an e-stop by its key")
 
 
-async def end_recording(page: Page, heard: Heard) -> None:
+async def end_recording(page: Page, heard: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("button", name="Stop recording").click()
     await heard.until(lambda: heard.last("recording") == Recording(running=False), "its end")
@@ -235,7 +235,7 @@ async def end_recording(page: Page, heard: Heard) -> None:
     )
 
 
-def height_m(heard: Heard) -> float:
+def height_m(heard: ReceivedMessages) -> float:
     """Return the height of the fingertip over the side of the first scene's cylinder, m."""
     finger, solid = heard.last("twin/finger"), heard.messages["scene"][0].object
     across = finger.position_world_m[1:] - solid.world_from_object.position_m[1:]
@@ -246,7 +246,7 @@ def across_m(finger: TwinFinger) -> float:
     return float(finger.position_world_m[0])
 
 
-def engaged(heard: Heard) -> str | None:
+def engaged(heard: ReceivedMessages) -> str | None:
     estop = heard.last("estop")
     return estop.reason if isinstance(estop, EStop) and estop.engaged else None
 
@@ -261,7 +261,7 @@ def session() -> Any:
     shutil.rmtree(folder)
 
 
-async def run_session(folder: Path) -> Session:
+async def run_session(folder: Path) -> PageVisit:
     file = folder / "graph.yaml"
     scenes = folder / "scenes"
     scenes.mkdir()
@@ -287,7 +287,7 @@ async def run_session(folder: Path) -> Session:
         async with RunningGraph(plan) as graph:
             await graph.wait_ready(DEADLINE_S)
             async with hearing(graph, *names) as heard:
-                session = Session(heard, folder / "bags" / "a.mcap", {}, {})
+                session = PageVisit(heard, folder / "bags" / "a.mcap", {}, {})
                 session.notes["foreign"] = await refused(port, Origin="http://evil.example")
                 browser = await play.chromium.launch(
                     executable_path=str(CHROMIUM),
@@ -310,25 +310,25 @@ def scenes_left_out(run: Run) -> str:
     return (run.logs / "launch.log").read_text()
 
 
-def test_nothing_crashed_and_all_ended_well(session: Session) -> None:
+def test_nothing_crashed_and_all_ended_well(session: PageVisit) -> None:
     assert set(session.exit_codes.values()) == {0}
     assert not any(session.restarts.values())
     assert "error" not in session.notes["nodes"], session.notes["nodes"]
 
 
-def test_every_control_has_a_name(session: Session) -> None:
+def test_every_control_has_a_name(session: PageVisit) -> None:
     assert session.notes["unnamed"] == ""
 
 
-def test_a_page_of_another_site_gets_no_socket(session: Session) -> None:
+def test_a_page_of_another_site_gets_no_socket(session: PageVisit) -> None:
     assert session.notes["foreign"] == "403"
 
 
-def test_a_scene_that_is_no_scene_is_left_out_with_the_reason(session: Session) -> None:
+def test_a_scene_that_is_no_scene_is_left_out_with_the_reason(session: PageVisit) -> None:
     assert "scene broken.yaml is skipped" in session.notes["log"]
 
 
-def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:
+def test_the_bag_holds_what_was_done_to_the_page(session: PageVisit) -> None:
     entries = list(BagReader(session.bag))
     by_topic: dict[str, list[Any]] = {}
     for topic, message, header, _ in entries:
@@ -351,7 +351,7 @@ def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:
     assert scenes[-1].name == "sphere"
 
 
-def test_the_finger_was_led_over_the_object_and_no_faster_than_it_may(session: Session) -> None:
+def test_the_finger_was_led_over_the_object_and_no_faster_than_it_may(session: PageVisit) -> None:
     paths = [
         one for one in session.heard.messages["twin/finger_path"] if isinstance(one, FingerPath)
     ]

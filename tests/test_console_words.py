@@ -18,7 +18,7 @@ from flexsheet.nodes.console.page import STOP_COLOR
 from flexsheet.nodes.console.record_tab import RECORDING_COLOR
 from tests.arm_states import arm_state
 from tests.colours import luminance
-from tests.console_parts import Shelf
+from tests.console_parts import FixedMessages
 from tests.fingertips import fingertip
 
 PAGE_STYLE = (html_head.HERE / "page.css").read_text()
@@ -240,7 +240,7 @@ def test_white_has_contrast_on_every_banner() -> None:
 def test_latencies_are_from_the_exposure_on() -> None:
     history = History()
     assert np.isnan(history.columns()[1]).all()
-    shelf = Shelf(
+    shelf = FixedMessages(
         fingertip=fingertip(np.zeros(3)),
         arm_left=arm_state("left", target_source_ns=1_000_000, command_sent_ns=9_000_000),
         arm_right=arm_state("right"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.data_association import (
     CLUTTER_RELEASE_TIME_S,
     SOLE_CANDIDATE_TIME_S,
@@ -15,7 +16,6 @@ from flexsheet.nodes.triangulator.data_association import (
 )
 from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]

@@ -79,7 +79,7 @@ def port(topic: str, rate_hz: float, *, rejected: int = 0) -> PortStatus:
     )
 
 
-def said(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> Status:
+def make_status(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> Status:
     return Status(
         node=node, state="running", pid=1, uptime_s=9.0, cpu_ratio=0.1, resident_bytes=1,
         inputs=tuple(inputs), outputs=outputs, errors=0, last_error="", note=note, plan_hash="",
@@ -119,7 +119,7 @@ def good(plan: ResolvedGraph) -> dict[str, HostProbe]:
                 for one in node.outputs
                 if TOPICS[one.topic].rate_hz is not None and one.endpoints
             ]
-            found[name].nodes[node.name] = said(node.name, *ports, note="well")
+            found[name].nodes[node.name] = make_status(node.name, *ports, note="well")
         if name != MAIN:
             found[name].arms[name] = arm(name)
     return found
@@ -141,7 +141,7 @@ def test_where_all_is_well_nothing_is_found(three: ResolvedGraph) -> None:
     checks = {one.check for one in found}
     assert checks >= {
         "reachable", "launcher", "plan", "keys", "software", "clocks", "nodes", "rates", "camera",
-        "picture", "arm left", "arm right", "disk", "load", "memory",
+        "image", "arm left", "arm right", "disk", "load", "memory",
     }  # fmt: skip
     assert {one.host for one in found} == set(NAMES)
 
@@ -150,7 +150,7 @@ def test_a_host_with_other_code_may_report_topics_unknown_here(
     three: ResolvedGraph,
 ) -> None:
     probes = good(three)
-    probes["left"].nodes["arm_left_bridge"] = said(
+    probes["left"].nodes["arm_left_bridge"] = make_status(
         "arm_left_bridge", port("a_topic_of_tomorrow", 50.0), note="well"
     )
     assert "failed" not in {one.state for one in evaluate_probes(three, "main", probes)}
@@ -200,20 +200,20 @@ FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     "no clock": (lambda v: setattr(v["left"], "clocks", None), ("left", "clocks", "failed"), "log"),
     "rate": (
         lambda v: v["main"].nodes.update(
-            triangulator=said("triangulator", port("fingertip", 12.0))),
+            triangulator=make_status("triangulator", port("fingertip", 12.0))),
         ("main", "rates", "warning"), "upstream",
     ),
     "refused": (
         lambda v: v["left"].nodes.update(
-            arm_left_bridge=said("arm_left_bridge", port("arm_left", 140.0, rejected=3))),
+            arm_left_bridge=make_status("arm_left_bridge", port("arm_left", 140.0, rejected=3))),
         ("left", "rates", "warning"), "log",
     ),
     "camera": (
-        lambda v: v["main"].nodes.update(camera=said("camera", note="no pictures: gone")),
+        lambda v: v["main"].nodes.update(camera=make_status("camera", note="no pictures: gone")),
         ("main", "camera", "failed"), "program",
     ),
-    "picture": (
-        lambda v: v["main"].nodes.pop("renderer"), ("main", "picture", "failed"), "log"
+    "image": (
+        lambda v: v["main"].nodes.pop("renderer"), ("main", "image", "failed"), "log"
     ),
     "arm": (
         lambda v: v["right"].arms.update(right=arm("right", mode="disconnected", reason="away")),

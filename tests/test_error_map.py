@@ -16,7 +16,7 @@ from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.twin.error_map import PERIOD_M, RANGE_M, RIM_PX, error_map
 from flexsheet.nodes.twin.eye import seen
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import TrueRubber, solve
 
 Image = NDArray[np.uint8]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
@@ -65,7 +65,7 @@ def test_the_renderer_paints_what_the_twin_reads() -> None:
     unnoticed."""
     stage = SceneRenderer(SCENE, headless_context(), spacing_m=0.005)
     sheet = SCENE.sheet
-    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    rubber = TrueRubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     eye = SCENE.eyes.centre_world_m
 
     def mean_error_mm(back_m: float) -> tuple[float, float]:

@@ -334,7 +334,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert by_parameter["arms.*.servo_lag_s"]["sheet_mm"] is None
     assert by_parameter["sheet.creep_ratio_per_decade"]["evaluation"] == "not_measured"
     assert by_parameter["finger.hand_mass_kg"]["evaluation"] == "not_simulated"
-    assert Path(result["picture"]).stat().st_size > 1000
+    assert Path(result["figure"]).stat().st_size > 1000
 
 
 def test_an_unknown_parameter_is_refused() -> None:

@@ -17,22 +17,22 @@ from flexsheet.messages.bus import compute_queue_length
 from flexsheet.messages.topics import TOPICS, Delivery
 from flexsheet.messages.types import StereoPair
 from flexsheet.messages.wire import decode, encode
-from tests.test_messages_bus import Room, connected, finger, header, room
+from tests.test_messages_bus import Connections, connected, connections, finger, header
 from tests.waiting import until
 
-__all__ = ["room"]
+__all__ = ["connections"]
 
 
-async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(room: Room) -> None:
+async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(connections: Connections) -> None:
     """The reader never reads; the publisher does not block, and another reader loses nothing."""
     topic = TOPICS["twin/stereo"]
-    publisher, ear = room.mouth(topic), room.ear(topic)
+    publisher, ear = connections.mouth(topic), connections.ear(topic)
     ear.extra = lambda _: ear.heard.append((None, ear.heard.pop()[1]))  # pictures are not kept
     stuck: Any = zmq.Context.instance().socket(zmq.SUB)
     stuck.setsockopt(zmq.SUBSCRIBE, b"")
     stuck.setsockopt(zmq.RCVHWM, compute_queue_length(topic))
-    stuck.connect(room.endpoint())
-    room.closers.append(lambda: stuck.close(linger=0))
+    stuck.connect(connections.endpoint())
+    connections.closers.append(lambda: stuck.close(linger=0))
     last = await connected(publisher, ear, large_pictures)
     process = psutil.Process()
     before = process.memory_info().rss
@@ -54,11 +54,11 @@ def large_pictures(number: int) -> StereoPair:
 
 @pytest.mark.parametrize("name", ["sheet_target", "twin/finger"])
 async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
-    room: Room, name: str
+    connections: Connections, name: str
 ) -> None:
     """The storm has a hundred times the topic's rate, more than can be handled."""
     topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
-    publisher, ear = room.mouth(topic), room.ear(topic)
+    publisher, ear = connections.mouth(topic), connections.ear(topic)
     start = await connected(publisher, ear, finger) + 1
     count = 15_000
     for number in range(start, start + count):
@@ -76,12 +76,14 @@ async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
     assert told == (topic.delivery is Delivery.EVERY and ear.counts.gaps > 0)
 
 
-async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(room: Room) -> None:
+async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
+    connections: Connections,
+) -> None:
     """They are malformed, of another type, from an earlier start, or repeated; they are counted."""
     topic = TOPICS["fingertip"]
-    endpoint = room.endpoint("forger")
-    forger = room.raw(zmq.PUB, endpoint)
-    ear = room.ear(topic, endpoint)
+    endpoint = connections.endpoint("forger")
+    forger = connections.raw(zmq.PUB, endpoint)
+    ear = connections.ear(topic, endpoint)
     seeds = [seed for seed in wire_seeds() if wire_frames(seed)[0] == "fingertip"]
     message = wire_message(seeds[0])
 

@@ -21,10 +21,18 @@ from flexsheet.messages.types import TwinFinger
 from flexsheet.nodes.node import PortCounts
 from tests.hosts import hosts
 from tests.network import Computers
-from tests.test_messages_bus import Room, connected, finger, header, pictures, room, stop
+from tests.test_messages_bus import (
+    Connections,
+    connected,
+    connections,
+    finger,
+    header,
+    pictures,
+    stop,
+)
 from tests.waiting import until
 
-__all__ = ["room"]
+__all__ = ["connections"]
 
 FINGER = TOPICS["twin/finger"]
 PORT = 7100
@@ -102,12 +110,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("quick")
 async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_nothing(
-    room: Room,
+    connections: Connections,
 ) -> None:
     topic = TOPICS["twin/stereo"]
-    publisher = room.mouth(topic, room.endpoint(), "tcp://127.0.0.1:*")
+    publisher = connections.mouth(topic, connections.endpoint(), "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
-        present, vanished = room.ear(topic), room.ear(topic, endpoint)
+        present, vanished = connections.ear(topic), connections.ear(topic, endpoint)
         await connected(publisher, vanished, pictures)
         await until(lambda: present.heard)
         await relay.vanish()
@@ -137,20 +145,20 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
 
 @pytest.mark.usefixtures("quick")
 async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next_one(
-    room: Room,
+    connections: Connections,
 ) -> None:
     """Heartbeats cover rare messages; the latched message of the new process is received."""
     topic = TOPICS["estop"]
-    publisher = room.mouth(topic, "tcp://127.0.0.1:*")
+    publisher = connections.mouth(topic, "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
-        ear = room.ear(topic, endpoint)
+        ear = connections.ear(topic, endpoint)
         await connected(publisher, ear, lambda number: stop(str(number)))
         before = relay.passed_bytes
         await until(lambda: relay.passed_bytes > before, "a heartbeat")
         await relay.vanish()
         publisher.send(stop("said into the void"), header(1000))
         publisher.close()
-        again = room.mouth(topic, f"tcp://127.0.0.1:{relay.port}")
+        again = connections.mouth(topic, f"tcp://127.0.0.1:{relay.port}")
         again.send(stop("said by the next"), header(1, epoch=2))
         await until(lambda: ear.heard)
         relay.wake()

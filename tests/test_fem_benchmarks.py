@@ -26,7 +26,7 @@ from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
-from tests.soft_bodies import Here
+from tests.soft_bodies import InlineExecutor
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 
@@ -47,7 +47,7 @@ def test_every_method_is_compared_with_a_finer_newton(
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     # pushes are solved here: other processes would not know of the few sites
-    monkeypatch.setattr(reference, "local_processes", lambda count: nullcontext(Here()))
+    monkeypatch.setattr(reference, "local_processes", lambda count: nullcontext(InlineExecutor()))
     chart = SoftBodyBenchmark(
         small_scene(),
         tmp_path,

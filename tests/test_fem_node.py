@@ -27,7 +27,7 @@ from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
-from tests.soft_bodies import Here
+from tests.soft_bodies import InlineExecutor
 from tests.waiting import DEADLINE_S
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"
@@ -323,7 +323,9 @@ def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
     # Processes in the background take minutes to start beside other tests.
-    monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))
+    monkeypatch.setattr(
+        precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
+    )
 
 
 async def test_the_table_is_made_while_the_linear_method_answers(

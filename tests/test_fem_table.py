@@ -36,7 +36,7 @@ from flexsheet.nodes.fem_solver.table import (
     TableSoftBody,
     count_valid_levels,
 )
-from tests.soft_bodies import Here, cylinder_spec
+from tests.soft_bodies import InlineExecutor, cylinder_spec
 from tests.waiting import wait_until
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ def model() -> SoftBodyModel:
 @pytest.fixture(scope="module")
 def table(model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory) -> Table:
     folder = tmp_path_factory.mktemp("table")
-    made = compute_table(SPEC, model, folder, Here(), lambda done, total, need: None)
+    made = compute_table(SPEC, model, folder, InlineExecutor(), lambda done, total, need: None)
     assert [path.name for path in folder.iterdir()] == [make_table_cache(SPEC).path(folder).name]
     return made
 
@@ -266,12 +266,12 @@ def test_an_interrupted_table_resumes(model: SoftBodyModel, table: Table, tmp_pa
             raise Interrupted
 
     with pytest.raises(Interrupted):
-        compute_table(SPEC, model, tmp_path, Here(), stop)
+        compute_table(SPEC, model, tmp_path, InlineExecutor(), stop)
     assert load_cached(make_table_cache(SPEC), tmp_path) is None
     kept = len(list(make_table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
     assert kept >= 2
     seen: list[int] = []
-    compute_table(SPEC, model, tmp_path, Here(), lambda done, *_: seen.append(done))
+    compute_table(SPEC, model, tmp_path, InlineExecutor(), lambda done, *_: seen.append(done))
     assert seen[1] == precompute_table.SNAPSHOT_STEPS * kept
     again = load_cached(make_table_cache(SPEC), tmp_path)
     assert again is not None
@@ -286,7 +286,7 @@ def test_too_little_memory_is_reported_before_allocation(
 
     monkeypatch.setattr("psutil.virtual_memory", Little)
     with pytest.raises(MemoryError, match="skin_spacing_m"):
-        compute_table(SPEC, model, tmp_path, Here(), lambda *_: None)
+        compute_table(SPEC, model, tmp_path, InlineExecutor(), lambda *_: None)
 
 
 def test_pushes_are_solved_in_other_processes(tmp_path: Path) -> None:

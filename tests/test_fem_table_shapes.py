@@ -15,7 +15,7 @@ from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import Response
 from flexsheet.nodes.fem_solver.precompute_table import compute_table
 from flexsheet.nodes.fem_solver.table import END_SPAN_M
-from tests.soft_bodies import Here
+from tests.soft_bodies import InlineExecutor
 
 DEPTHS = (0.0015, 0.002, 0.003, 0.004)
 BASE = {"kind": "base", "height_m": 0.01}
@@ -41,7 +41,7 @@ def both(
         patch.setattr(snapshots, "APART_RATIO", 6.0)
         spec = make_table_spec(scene, linear.soft.spec)
         folder: Path = tmp_path_factory.mktemp("table")
-        table = compute_table(spec, linear.model, folder, Here(), lambda *_: None)
+        table = compute_table(spec, linear.model, folder, InlineExecutor(), lambda *_: None)
     return linear, attach_table(linear.soft, scene, linear.model, table)
 
 

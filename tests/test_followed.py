@@ -139,7 +139,7 @@ def test_the_report_agrees(tmp_path: Path) -> None:
     session = read_session(bag)
     numbers = make_result(session)
     (row,) = numbers["sheet"]["followed"]
-    assert row.pop("begins_s") == pytest.approx(0.2, abs=0.01)
+    assert row.pop("start_s") == pytest.approx(0.2, abs=0.01)
     assert [row] == read_followed(bag)
     page = render_page(session)
     assert "The true finger along each path" in page

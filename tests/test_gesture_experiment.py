@@ -155,7 +155,7 @@ def test_errors_and_jumps_come_out_as_large_as_they_are(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["stroke-10", "reach", "tap-fast"])
 def test_a_late_tracker_is_found_late_at_every_lead(tmp_path: Path, name: str) -> None:
     result = result_of(write(tmp_path / "a.mcap", Tracked(name, late_s=0.03)), name)
-    assert [each["lead_ms"] for each in result["prediction"]] == [0.0, 20.0, 50.0]
+    assert [each["horizon_ms"] for each in result["prediction"]] == [0.0, 20.0, 50.0]
     for each in result["prediction"]:
         assert each["lag_ms"] == pytest.approx(30.0, abs=1.0)
         assert each["rms"] > 0.1

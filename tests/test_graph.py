@@ -68,7 +68,7 @@ def free_ports() -> tuple[int, int]:
 
 
 @dataclass
-class Session:
+class GraphResults:
     """Results of a run of the graph."""
 
     bag: Path
@@ -80,7 +80,7 @@ class Session:
     ports: tuple[int, int]
 
 
-async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
+async def run_session(bag: Path, ports: tuple[int, int]) -> GraphResults:
     """Stroke for a few seconds; then kill the triangulator in the middle of another stroke."""
     threads_before = {thread.name for thread in threading.enumerate()}
     plan = load_graph(DEMO_FILE, settings=on_ports(ports), record=bag)
@@ -117,7 +117,7 @@ async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
         frames.close()
         restarts = dict(graph.restarts)
         run_id = graph.run.id
-    return Session(
+    return GraphResults(
         bag,
         graph.exit_codes,
         run_id,
@@ -150,7 +150,7 @@ def both_follow(driver: Driver) -> bool:
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+def session(tmp_path_factory: pytest.TempPathFactory) -> GraphResults:
     bag = tmp_path_factory.mktemp("graph") / "session.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driving, "WAIT_S", DEADLINE_S)
@@ -158,11 +158,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 @pytest.fixture(scope="module")
-def recording(session: Session) -> stroke.StrokeRecording:
+def recording(session: GraphResults) -> stroke.StrokeRecording:
     return stroke.read_recording(session.bag)
 
 
-def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> None:
+def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: GraphResults) -> None:
     """Rates are computed over the first stroke, before the kill, from the publishers' stamps."""
     stamps: dict[str, list[int]] = {}
     windows = stroke.read_recording(session.bag).windows_ns
@@ -183,7 +183,7 @@ def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> N
         assert len(stamps.get(name, ())) / duration_s >= 0.5 * rate[0], name
 
 
-def test_nothing_was_lost_or_rejected(session: Session) -> None:
+def test_nothing_was_lost_or_rejected(session: GraphResults) -> None:
     problems = Counter()
     writers = set()
     for _, message, _, _ in BagReader(session.bag, topics=["status"]):
@@ -197,7 +197,7 @@ def test_nothing_was_lost_or_rejected(session: Session) -> None:
     assert not +problems
 
 
-def test_sequences_in_the_bag_have_no_gaps(session: Session) -> None:
+def test_sequences_in_the_bag_have_no_gaps(session: GraphResults) -> None:
     newest: dict[tuple[str, str, int], int] = {}
     for topic, _, header, _ in BagReader(session.bag):
         key = (topic, header.writer, header.epoch)
@@ -206,7 +206,7 @@ def test_sequences_in_the_bag_have_no_gaps(session: Session) -> None:
         newest[key] = header.sequence
 
 
-def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
+def test_no_queue_builds_up_where_data_is_used(session: GraphResults) -> None:
     """Used data are nearly the newest that had been published, on any machine."""
     published: dict[str, list[tuple[int, int]]] = {"fingertip": [], "sheet_target": []}
     used: dict[str, list[tuple[int, int]]] = {"planner": [], "arms": [], "renderer": []}
@@ -241,7 +241,7 @@ def test_the_sheet_follows_the_finger(recording: stroke.StrokeRecording) -> None
 
 
 def test_the_arms_rest_safely_without_the_triangulator_and_follow_again(
-    session: Session,
+    session: GraphResults,
 ) -> None:
     modes: dict[str, list[str]] = {"left": [], "right": []}
     for _, message, _, _ in BagReader(session.bag, topics=["arm_left", "arm_right"]):
@@ -254,7 +254,7 @@ def test_the_arms_rest_safely_without_the_triangulator_and_follow_again(
         assert any(first < i < last for i in halted), side
 
 
-def test_frames_show_what_the_finger_did(session: Session) -> None:
+def test_frames_show_what_the_finger_did(session: GraphResults) -> None:
     numbers = [
         message.number
         for _, message, _, _ in BagReader(session.bag, topics=["frame"])
@@ -264,7 +264,7 @@ def test_frames_show_what_the_finger_did(session: Session) -> None:
     assert numbers == sorted(set(numbers))
 
 
-def test_every_node_ended_well_and_nothing_is_left(session: Session) -> None:
+def test_every_node_ended_well_and_nothing_is_left(session: GraphResults) -> None:
     assert {name: code for name, code in session.exit_codes.items() if code != 0} == {}
     assert processes_of_run(session.run_id) == []
     assert session.threads_after <= session.threads_before

@@ -93,10 +93,10 @@ class Workplace:
         board = transform(facing, self.held - facing @ middle)
         self.flange_from_board = inverse(flange) @ board
 
-    def joints(self, turn_rad: Floats, shift_m: Floats) -> Floats:
+    def joints(self, rotation_rad: Floats, shift_m: Floats) -> Floats:
         """Return joints that rotate the board (rotation vector, in the camera's axes) and shift
         it."""
-        rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(turn_rad)
+        rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(rotation_rad)
         board = transform(rotation, self.held + shift_m - rotation @ CORNERS.mean(axis=0))
         return solve_inverse_kinematics(
             inverse(self.base) @ board @ inverse(self.flange_from_board), READY
@@ -118,13 +118,13 @@ class Workplace:
         *,
         noise_px: float = 0.0,
         joint_noise_rad: float = 0.0,
-        turn_rad: Any = 0.3,
+        rotation_rad: Any = 0.3,
     ) -> list[BoardDetection]:
-        """Simulate detections; turn_rad: standard deviation of the rotations, for all axes or for
-        each."""
+        """Simulate detections; rotation_rad: standard deviation of the rotations, for all
+        axes or for each."""
         found: list[BoardDetection] = []
         while len(found) < count:
-            turn = self.random.normal(0.0, 1.0, 3) * turn_rad
+            turn = self.random.normal(0.0, 1.0, 3) * rotation_rad
             try:
                 joints = self.joints(turn, self.random.uniform(-0.06, 0.06, 3))
             except ValueError:
@@ -236,7 +236,7 @@ def test_inconsistent_poses_are_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("turn_rad", "words"),
+    ("rotation_rad", "words"),
     [
         (0.0, "rotates by only 0.0 degrees rms"),
         (0.02, "rotates by only"),
@@ -245,8 +245,8 @@ def test_inconsistent_poses_are_an_error() -> None:
         ([0.4, 0.03, 0.03], "rotates about one axis only"),
     ],
 )
-def test_motions_that_leave_it_open_are_rejected(turn_rad: Any, words: str) -> None:
-    detections = Workplace(8).detections(12, noise_px=0.1, turn_rad=turn_rad)
+def test_motions_that_leave_it_open_are_rejected(rotation_rad: Any, words: str) -> None:
+    detections = Workplace(8).detections(12, noise_px=0.1, rotation_rad=rotation_rad)
     with pytest.raises(HandEyeError, match=words):
         calibrate_base(detections, RIG)
 
@@ -350,7 +350,7 @@ def test_a_board_behind_the_camera_is_rejected(tmp_path: Path) -> None:
         read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
 
 
-class Live:
+class LiveCapture:
     """PoseRecorder with images of the simulated camera and a separate clock."""
 
     def __init__(self, folder: Path) -> None:
@@ -372,7 +372,7 @@ class Live:
 
 
 def test_a_pose_is_recorded_when_the_arm_rests_at_a_new_one(tmp_path: Path) -> None:
-    live = Live(tmp_path)
+    live = LiveCapture(tmp_path)
     dark = np.zeros((480, 640), np.uint8)
     assert live.taker.update_images(dark, dark, 0.0) == "no message from the arm yet"
     here = live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3))
@@ -415,7 +415,7 @@ def test_the_twins_arms_are_calibrated_from_images(
     result = json.loads(out)
     for side in ("left", "right"):
         one = result["arms"][side]
-        assert one["places_used"] == 10
+        assert one["poses_used"] == 10
         assert one["true_error_m"] < 4.0 * one["position_std_m"] < 0.002
         assert one["true_error_rad"] < 4.0 * one["rotation_std_rad"]
         assert one["moved_from_scene_m"] > 0.001
@@ -459,7 +459,7 @@ def test_bad_input_to_the_command_is_named(
     place = Workplace(14)
     poor = tmp_path / "poor"
     poor.mkdir()
-    write_poses(poor, place.detections(8, turn_rad=[0.0, 0.0, 0.4]), place, "rad")
+    write_poses(poor, place.detections(8, rotation_rad=[0.0, 0.0, 0.4]), place, "rad")
     output = tmp_path / "arms.yaml"
     for arguments, words in (
         ([*COMMON, "-o", output], "give --left-arm, --right-arm or both, or else --twin"),
@@ -482,7 +482,7 @@ def test_bad_input_to_the_command_is_named(
 
 
 def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
-    live = Live(tmp_path)
+    live = LiveCapture(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
     with pytest.raises(ArmPosesError, match="images of 640x480 px"):
         read_detections(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)

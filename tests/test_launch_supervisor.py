@@ -368,7 +368,7 @@ async def test_a_port_in_use_is_named_before_anything_starts(
     assert_nothing_left(runs_root)
 
 
-def heard_estop(bag: Path) -> bool:
+def contains_estop(bag: Path) -> bool:
     """Return whether the listener received ten messages of the beacon, which it reports by an
     e-stop."""
     return "estop" in BagReader(bag).topics
@@ -383,7 +383,7 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
             await left.wait_ready(DEADLINE_S)
             assert main.pids.keys() == {"listener", "recorder", "clock_main"}
             assert left.pids.keys() == {"beacon", "clock_left"}
-            heard = partial(heard_estop, tmp_path / "a.mcap")
+            heard = partial(contains_estop, tmp_path / "a.mcap")
             await asyncio.to_thread(wait_until, heard, "the listener to hear the beacon")
 
 

@@ -199,7 +199,7 @@ def test_a_marker_of_another_scene_is_refused(tmp_path: Path) -> None:
     found = {"version": 1, "date": "2026-01-01", "code_version": "0", "source": "t.csv",
              "scene": "box", "marker_from_pad_m": list(OFFSET_M),
              "standard_deviations_m": [1e-4] * 3, "point_offset_m": [0.0] * 3,
-             "residual_rms_m": 1e-4, "residual_worst_m": 2e-4, "touches": 9,
+             "residual_rms_m": 1e-4, "max_residual_m": 2e-4, "touches": 9,
              "orientations": 9}  # fmt: skip
     file.write_text(json.dumps(found))
     setting = f"triangulator.marker_calibration={file}"

@@ -14,9 +14,15 @@ from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber as ModelRubber
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.twin import membrane
-from flexsheet.nodes.twin.membrane import Rubber, graded_axis, relaxed_energy, relaxed_stress, solve
+from flexsheet.nodes.twin.membrane import (
+    TrueRubber,
+    graded_axis,
+    relaxed_energy,
+    relaxed_stress,
+    solve,
+)
 
-RUBBER = Rubber(width_m=0.24, height_m=0.24, thickness_m=0.001, young_modulus_pa=1e6)
+RUBBER = TrueRubber(width_m=0.24, height_m=0.24, thickness_m=0.001, young_modulus_pa=1e6)
 
 
 def edges(stretch: float, pose: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

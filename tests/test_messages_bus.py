@@ -55,7 +55,7 @@ def pictures(value: int) -> StereoPair:
     return StereoPair(device="test", exposure_s=0.001, dropped_frames=0, left=image, right=image)
 
 
-class Ear:
+class RecordingSubscriber:
     """Subscriber that records its messages."""
 
     def __init__(self, topic: Topic, endpoints: list[str]) -> None:
@@ -91,7 +91,7 @@ class ForeignPublisher:
         self._socket.close(linger=0)
 
 
-class Room:
+class Connections:
     """Factory of publishers and subscribers that closes them."""
 
     def __init__(self, folder: Path) -> None:
@@ -106,8 +106,8 @@ class Room:
         self.closers.append(publisher.close)
         return publisher
 
-    def ear(self, topic: Topic, *endpoints: str) -> Ear:
-        ear = Ear(topic, list(endpoints or (self.endpoint(),)))
+    def ear(self, topic: Topic, *endpoints: str) -> RecordingSubscriber:
+        ear = RecordingSubscriber(topic, list(endpoints or (self.endpoint(),)))
         self.closers.append(ear.subscriber.close)
         return ear
 
@@ -121,14 +121,16 @@ class Room:
 
 
 @pytest_asyncio.fixture
-async def room(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Room]:
-    room = Room(tmp_path_factory.mktemp("s"))
-    yield room
-    for close in reversed(room.closers):
+async def connections(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Connections]:
+    connections = Connections(tmp_path_factory.mktemp("s"))
+    yield connections
+    for close in reversed(connections.closers):
         close()
 
 
-async def connected(publisher: Publisher, ear: Ear, make: Callable[[int], Message]) -> int:
+async def connected(
+    publisher: Publisher, ear: RecordingSubscriber, make: Callable[[int], Message]
+) -> int:
     """Send numbered messages until the first is received; return the number of the last one."""
     number = 0
     while not ear.heard:
@@ -142,11 +144,11 @@ async def connected(publisher: Publisher, ear: Ear, make: Callable[[int], Messag
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
-async def test_every_delivers_all_in_order(room: Room, transport: str) -> None:
+async def test_every_delivers_all_in_order(connections: Connections, transport: str) -> None:
     topic = TOPICS["twin/finger"]
-    where = room.endpoint() if transport == "ipc" else "tcp://127.0.0.1:*"
-    publisher = room.mouth(topic, where)
-    ear = room.ear(topic, *publisher.endpoints)
+    where = connections.endpoint() if transport == "ipc" else "tcp://127.0.0.1:*"
+    publisher = connections.mouth(topic, where)
+    ear = connections.ear(topic, *publisher.endpoints)
     start = await connected(publisher, ear, finger) + 1
     for number in range(start, start + 700):
         publisher.send(finger(number), header(number))
@@ -157,11 +159,11 @@ async def test_every_delivers_all_in_order(room: Room, transport: str) -> None:
     assert ear.problems == []
 
 
-async def test_every_counts_and_reports_an_overflow(room: Room) -> None:
+async def test_every_counts_and_reports_an_overflow(connections: Connections) -> None:
     topic = replace(TOPICS["twin/finger"], max_bytes=1 << 28)  # a queue of 16
     assert compute_queue_length(topic) == 16
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     start = await connected(publisher, ear, finger) + 1
     total = 20_000
     for number in range(start, start + total):  # the loop is not run meanwhile: nobody reads
@@ -180,11 +182,11 @@ async def test_every_counts_and_reports_an_overflow(room: Room) -> None:
 
 
 async def test_what_has_just_left_its_writer_waits_for_no_newer(
-    room: Room, monkeypatch: pytest.MonkeyPatch
+    connections: Connections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     topic = TOPICS["stereo"]
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     start = await connected(publisher, ear, pictures) + 1
     now = SimpleNamespace(monotonic_ns=lambda: header(start).publish_ns)
     monkeypatch.setattr("flexsheet.messages.bus.time", now)
@@ -196,10 +198,10 @@ async def test_what_has_just_left_its_writer_waits_for_no_newer(
     assert len(ear.heard) + ear.counts.dropped == 40
 
 
-async def test_latest_hands_over_the_newest_and_counts_the_rest(room: Room) -> None:
+async def test_latest_hands_over_the_newest_and_counts_the_rest(connections: Connections) -> None:
     topic = TOPICS["stereo"]
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     start = await connected(publisher, ear, pictures) + 1
     for number in range(start, start + 40):
         publisher.send(pictures(number % 250), header(number))
@@ -212,10 +214,13 @@ async def test_latest_hands_over_the_newest_and_counts_the_rest(room: Room) -> N
     assert not message.left.flags.writeable
 
 
-async def test_latest_keeps_the_newest_of_each_writer(room: Room) -> None:
+async def test_latest_keeps_the_newest_of_each_writer(connections: Connections) -> None:
     topic = replace(TOPICS["estop"], delivery=Delivery.LATEST)
-    one, two = room.mouth(topic, room.endpoint("1")), room.mouth(topic, room.endpoint("2"))
-    ear = room.ear(topic, room.endpoint("1"), room.endpoint("2"))
+    one, two = (
+        connections.mouth(topic, connections.endpoint("1")),
+        connections.mouth(topic, connections.endpoint("2")),
+    )
+    ear = connections.ear(topic, connections.endpoint("1"), connections.endpoint("2"))
     number = 0
     while {h.writer for _, h in ear.heard} != {"one", "two"}:
         number += 1
@@ -232,14 +237,14 @@ async def test_latest_keeps_the_newest_of_each_writer(room: Room) -> None:
     )
 
 
-async def test_latched_reaches_late_subscribers_once(room: Room) -> None:
+async def test_latched_reaches_late_subscribers_once(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = room.mouth(topic)
+    publisher = connections.mouth(topic)
     publisher.send(stop("first"), header(1))
     publisher.send(stop("second"), header(2))
-    early = room.ear(topic)
+    early = connections.ear(topic)
     await until(lambda: early.heard)
-    late = room.ear(topic)
+    late = connections.ear(topic)
     await until(lambda: late.heard)
     publisher.send(stop("third"), header(3))
     await until(lambda: early.sequences[-1] == 3 and late.sequences[-1] == 3)
@@ -248,51 +253,51 @@ async def test_latched_reaches_late_subscribers_once(room: Room) -> None:
     assert early.problems == late.problems == []
 
 
-async def test_latched_over_many_late_subscribers(room: Room) -> None:
+async def test_latched_over_many_late_subscribers(connections: Connections) -> None:
     topic = TOPICS["scene"]
     topic = replace(topic, message=EStop)
-    publisher = room.mouth(topic)
+    publisher = connections.mouth(topic)
     publisher.send(stop("x"), header(1))
-    ears = [room.ear(topic) for _ in range(20)]
+    ears = [connections.ear(topic) for _ in range(20)]
     await until(lambda: all(ear.heard for ear in ears))
     assert [ear.sequences for ear in ears] == [[1]] * 20
 
 
-async def test_subscriber_before_publisher_and_restart_is_no_gap(room: Room) -> None:
+async def test_subscriber_before_publisher_and_restart_is_no_gap(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    ear = room.ear(topic)
-    first = room.mouth(topic)
+    ear = connections.ear(topic)
+    first = connections.mouth(topic)
     first.send(stop("a"), header(7, epoch=1))
     await until(lambda: len(ear.heard) == 1)
     first.close()
-    second = room.mouth(topic)
+    second = connections.mouth(topic)
     second.send(stop("b"), header(1, epoch=2))
     await until(lambda: len(ear.heard) == 2)
     assert [message.reason for message, _ in ear.heard] == ["a", "b"]
     assert ear.counts == Counts()
 
 
-async def test_many_restarts_in_a_row(room: Room) -> None:
+async def test_many_restarts_in_a_row(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    ear = room.ear(topic)
+    ear = connections.ear(topic)
     for epoch in range(1, 16):
-        publisher = room.mouth(topic)
+        publisher = connections.mouth(topic)
         publisher.send(stop("a"), header(1, epoch=epoch))
-        await until(partial(heard_epoch, ear, epoch), f"start {epoch}")
+        await until(partial(has_epoch, ear, epoch), f"start {epoch}")
         publisher.close()
     assert len(ear.heard) == 15
     assert ear.counts == Counts()
 
 
-def heard_epoch(ear: Ear, epoch: int) -> bool:
+def has_epoch(ear: RecordingSubscriber, epoch: int) -> bool:
     return bool(ear.heard) and ear.heard[-1][1].epoch == epoch
 
 
-async def test_gap_is_counted(room: Room) -> None:
+async def test_gap_is_counted(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = room.mouth(topic)
+    publisher = connections.mouth(topic)
     publisher.send(stop("a"), header(1))
-    ear = room.ear(topic)
+    ear = connections.ear(topic)
     await until(lambda: ear.heard)
     publisher.send(stop("b"), header(5))
     await until(lambda: len(ear.heard) == 2)
@@ -301,11 +306,11 @@ async def test_gap_is_counted(room: Room) -> None:
     assert '"estop"' in ear.problems[0]
 
 
-async def test_failing_handler_does_not_stop_the_reader(room: Room) -> None:
+async def test_failing_handler_does_not_stop_the_reader(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = room.mouth(topic)
+    publisher = connections.mouth(topic)
     publisher.send(stop("a"), header(1))
-    ear = room.ear(topic)
+    ear = connections.ear(topic)
 
     def fail(message: Message) -> None:
         raise ZeroDivisionError("handler's own fault")
@@ -317,10 +322,10 @@ async def test_failing_handler_does_not_stop_the_reader(room: Room) -> None:
     assert "handler's own fault" in ear.problems[0]
 
 
-async def test_close_within_the_handler(room: Room) -> None:
+async def test_close_within_the_handler(connections: Connections) -> None:
     topic = TOPICS["twin/finger"]
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     start = await connected(publisher, ear, finger) + 1
     ear.extra = lambda message: ear.subscriber.close()
     for number in range(start, start + 20):
@@ -332,10 +337,10 @@ async def test_close_within_the_handler(room: Room) -> None:
     ear.subscriber.close()
 
 
-async def test_bad_messages_are_rejected_and_good_ones_pass(room: Room) -> None:
+async def test_bad_messages_are_rejected_and_good_ones_pass(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    foreign = room.raw(zmq.PUB, room.endpoint())
-    ear = room.ear(topic)
+    foreign = connections.raw(zmq.PUB, connections.endpoint())
+    ear = connections.ear(topic)
     good = encode(stop("fine"), header(1))
     number = 1
     while not ear.heard:
@@ -360,10 +365,12 @@ async def test_bad_messages_are_rejected_and_good_ones_pass(room: Room) -> None:
     assert all('topic "estop": message refused' in problem for problem in ear.problems)
 
 
-async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Room) -> None:
+async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(
+    connections: Connections,
+) -> None:
     topic = TOPICS["estop"]
-    foreign = room.raw(zmq.PUB, room.endpoint())
-    ear = room.ear(topic)
+    foreign = connections.raw(zmq.PUB, connections.endpoint())
+    ear = connections.ear(topic)
     number = 0
     while not ear.heard:
         number += 1
@@ -376,29 +383,29 @@ async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Ro
     assert "at most" in ear.problems[0]
 
 
-async def test_too_large_a_message_is_rejected_at_the_sender(room: Room) -> None:
-    publisher = room.mouth(replace(TOPICS["stereo"], max_bytes=5000))
+async def test_too_large_a_message_is_rejected_at_the_sender(connections: Connections) -> None:
+    publisher = connections.mouth(replace(TOPICS["stereo"], max_bytes=5000))
     with pytest.raises(WireError, match=r"StereoPair.*at most 5000"):
         publisher.send(pictures(1), header(1))
 
 
-async def test_endpoint_in_use(room: Room) -> None:
+async def test_endpoint_in_use(connections: Connections) -> None:
     topic = TOPICS["twin/arms"]
-    room.mouth(topic)
+    connections.mouth(topic)
     with pytest.raises(BusError, match=r'topic "twin/arms": ipc://.* is in use'):
-        room.mouth(topic)
+        connections.mouth(topic)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(BusError, match=r'topic "twin/arms": tcp://.* is in use'):
-            room.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
+            connections.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
 
 
-async def test_stale_ipc_file_of_a_killed_writer_is_replaced(room: Room) -> None:
+async def test_stale_ipc_file_of_a_killed_writer_is_replaced(connections: Connections) -> None:
     dead = socket.socket(socket.AF_UNIX)
-    dead.bind(room.endpoint().removeprefix("ipc://"))
+    dead.bind(connections.endpoint().removeprefix("ipc://"))
     dead.close()
-    room.mouth(TOPICS["estop"])
+    connections.mouth(TOPICS["estop"])
 
 
 @pytest.mark.parametrize(
@@ -408,25 +415,25 @@ async def test_stale_ipc_file_of_a_killed_writer_is_replaced(room: Room) -> None
         ("ipc:///no/such/folder/a", "cannot be bound"),
         ("tcp://127.0.0.1:99999", "the port must be in 1..65535"),
         ("tcp://192.0.2.1:7777", "beyond loopback"),
-        ("nonsense", "neither ipc"),
+        ("nonsense", "expected ipc"),
     ],
 )
-async def test_impossible_endpoints(room: Room, endpoint: str, words: str) -> None:
+async def test_impossible_endpoints(connections: Connections, endpoint: str, words: str) -> None:
     with pytest.raises(BusError, match=words) as caught:
-        room.mouth(TOPICS["estop"], endpoint)
+        connections.mouth(TOPICS["estop"], endpoint)
     assert '"estop"' in str(caught.value)
 
 
-async def test_impossible_connections(room: Room) -> None:
+async def test_impossible_connections(connections: Connections) -> None:
     for endpoint in ("ipc:///" + "x" * 200, "nonsense", "tcp://127.0.0.1:x"):
         with pytest.raises(BusError, match=r'topic "estop"'):
-            room.ear(TOPICS["estop"], endpoint)
+            connections.ear(TOPICS["estop"], endpoint)
 
 
-async def test_zero_copy_frames_outlive_the_socket(room: Room) -> None:
+async def test_zero_copy_frames_outlive_the_socket(connections: Connections) -> None:
     topic = TOPICS["stereo"]
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     number = await connected(publisher, ear, pictures)
     image = np.random.default_rng(1).integers(0, 255, (480, 640), np.uint8)
     pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=image, right=image)
@@ -447,13 +454,13 @@ def test_queue_lengths_are_bounded_for_every_topic() -> None:
         assert 16 <= compute_queue_length(topic) <= 1000
 
 
-async def test_twice_started(room: Room) -> None:
-    ear = room.ear(TOPICS["estop"])
+async def test_twice_started(connections: Connections) -> None:
+    ear = connections.ear(TOPICS["estop"])
     with pytest.raises(BusError, match="is started already"):
         ear.subscriber.start()
 
 
-def last_heard(ear: Ear, number: int) -> bool:
+def has_received(ear: RecordingSubscriber, number: int) -> bool:
     return bool(ear.heard) and ear.sequences[-1] == number
 
 
@@ -467,11 +474,13 @@ def arms() -> TwinArms:
 
 
 @pytest.mark.parametrize("delivery", [Delivery.EVERY, Delivery.LATEST, Delivery.LATCHED])
-async def test_bursts_never_leave_a_message_lying(room: Room, delivery: Delivery) -> None:
+async def test_bursts_never_leave_a_message_lying(
+    connections: Connections, delivery: Delivery
+) -> None:
     """With edge-triggered wake-ups no message waits for the next one at any rate."""
     topic = replace(TOPICS["twin/arms"], delivery=delivery)
-    publisher = room.mouth(topic)
-    ear = room.ear(topic)
+    publisher = connections.mouth(topic)
+    ear = connections.ear(topic)
     number = await connected(publisher, ear, lambda _: arms())
     first = number + 1
     random = np.random.default_rng(3)
@@ -481,19 +490,19 @@ async def test_bursts_never_leave_a_message_lying(room: Room, delivery: Delivery
             publisher.send(arms(), header(number))
             if random.random() < 0.5:
                 await asyncio.sleep(0)
-        await until(partial(last_heard, ear, number), "delivery")
+        await until(partial(has_received, ear, number), "delivery")
     assert ear.counts.gaps == ear.counts.rejected == 0
     assert len(ear.heard) + ear.counts.dropped == number - first + 1
     assert ear.counts.dropped == 0 or delivery is Delivery.LATEST
 
 
 async def test_unopened_frames_of_every_message_for_the_recorder(
-    room: Room, tmp_path: Path
+    connections: Connections, tmp_path: Path
 ) -> None:
     topic = TOPICS["stereo"]
-    publisher = room.mouth(topic)
+    publisher = connections.mouth(topic)
     bag = BagWriter(tmp_path / "a.mcap")
-    room.closers.append(bag.close)
+    connections.closers.append(bag.close)
     heard: list[int] = []
 
     def record(frames: list[Any], header: Header) -> None:
@@ -502,10 +511,10 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 
     problems: list[str] = []
     ear = Subscriber(
-        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, raw=True
+        topic, [connections.endpoint()], record, Counts(), on_problem=problems.append, raw=True
     )
     ear.start()
-    room.closers.append(ear.close)
+    connections.closers.append(ear.close)
     number = 0
     while not heard:
         number += 1

@@ -13,15 +13,19 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from flexsheet.messages import migrations
+from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
 from flexsheet.messages.bag import BagError, BagReader, BagWriter, info
 from flexsheet.messages.base import Header, Message, compute_fingerprint
-from flexsheet.messages.migrations import find_migration, is_compatible
+from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
+from flexsheet.messages.migrations import find_migration, is_compatible, rename_fields
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Fingertip, Frame, TwinFinger
 from tests.examples import examples
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
+CALIBRATIONS = (ArmsCalibration, MarkerCalibration, SheetCalibration)
 HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")
 
 
@@ -87,7 +91,8 @@ def test_every_renaming_leads_to_a_name_of_today(
     model: str | tuple[str, str], renamed: dict[str, str]
 ) -> None:
     name, field = (model, None) if isinstance(model, str) else model
-    schemas = [topic.message.model_json_schema() for topic in TOPICS.values()]
+    kinds = [*(topic.message for topic in TOPICS.values()), *CALIBRATIONS]
+    schemas = [kind.model_json_schema() for kind in kinds]
     parts = [part for schema in schemas for part in (schema, *schema.get("$defs", {}).values())]
     models = [part["properties"] for part in parts if part.get("title") == name]
     assert models
@@ -103,7 +108,7 @@ class Before(Message):
     note: str | None = None
 
 
-class More(Message):
+class WithDefaults(Message):
     """Type that Before can become without a migration."""
 
     mode: Literal["on", "off", "auto"]
@@ -118,7 +123,7 @@ class Renamed(Message):
     note: str | None = None
 
 
-class Demanding(Before):
+class WithRequiredField(Before):
     rate_hz: float
 
 
@@ -128,7 +133,7 @@ class Narrower(Message):
     note: str | None = None
 
 
-class Poorer(Message):
+class WithoutField(Message):
     mode: Literal["on", "off"]
     note: str | None = None
 
@@ -139,13 +144,13 @@ class Retyped(Message):
     note: str | None = None
 
 
-@pytest.mark.parametrize("today", [Before, More])
+@pytest.mark.parametrize("today", [Before, WithDefaults])
 def test_gains_need_nothing(today: type[Message]) -> None:
     assert is_compatible(Before.model_json_schema(), today.model_json_schema())
     today.model_validate(Before(mode="on", size_mm=1.0).model_dump())
 
 
-@pytest.mark.parametrize("today", [Renamed, Demanding, Narrower, Poorer, Retyped])
+@pytest.mark.parametrize("today", [Renamed, WithRequiredField, Narrower, WithoutField, Retyped])
 def test_anything_else_does(today: type[Message]) -> None:
     assert not is_compatible(Before.model_json_schema(), today.model_json_schema())
     fingerprint = compute_fingerprint(Before).hex()
@@ -217,3 +222,16 @@ def test_a_migration_that_gives_a_wrong_field_is_an_error(
 def test_a_damaged_schema_fits_nothing_and_breaks_nothing(schema: Any) -> None:
     if schema != {}:
         assert not is_compatible(schema, Before.model_json_schema())
+
+
+def test_a_calibration_file_with_former_keys_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "marker.yaml"
+    file.write_text(
+        "{version: 1, date: '2026-01-01', code_version: '', source: rows.csv, scene: cylinder, "
+        "marker_from_pad_m: [0.01, 0.0, 0.0], standard_deviations_m: [1e-4, 1e-4, 1e-4], "
+        "point_offset_m: [0.0, 0.0, 0.0], residual_rms_m: 1e-4, residual_worst_m: 3e-4, "
+        "touches: 12, orientations: 4}"
+    )
+    assert load_marker_calibration(file).max_residual_m == 3e-4
+    arm = {"places": [{"turn_rad": 0.1}], "largest_change_m": 0.2}
+    assert rename_fields(ArmBase, arm) == {"poses": [{"rotation_rad": 0.1}], "max_change_m": 0.2}

@@ -34,7 +34,7 @@ from flexsheet.nodes.arm_bridge.modbus import (
 )
 from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
-from tests.network import Cut
+from tests.network import TcpRelay
 from tests.waiting import DEADLINE_S
 from website import registers_page
 
@@ -369,7 +369,7 @@ async def test_a_repeated_answer_is_not_believed() -> None:
 
 async def test_an_arm_that_is_cut_off_is_reconnected() -> None:
     """A closed and a half-open connection each give one error, and the next exchange reopens it."""
-    async with linked() as (link, _), Cut(link.port) as cut:
+    async with linked() as (link, _), TcpRelay(link.port) as cut:
         through = ModbusLink("127.0.0.1", cut.port)
 
         async def answered() -> int:

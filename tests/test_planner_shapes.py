@@ -38,7 +38,7 @@ from flexsheet.nodes.planner.contact_state import (
 )
 from flexsheet.nodes.planner.trajectory import PlannedStep
 from tests.examples import examples
-from tests.plans import STEP_S, STILL, Desk, scene_with
+from tests.plans import STEP_S, STILL, PlannerHarness, scene_with
 from tests.shared import compute_once
 
 Floats = NDArray[np.float64]
@@ -140,16 +140,16 @@ DOME_UP = (0.5 * math.pi, 0.0, 0.0)
 
 
 @lru_cache
-def desk_about(name: str) -> tuple[Desk, Shape]:
+def desk_about(name: str) -> tuple[PlannerHarness, Shape]:
     geometry = SOLIDS[name] if name in SOLIDS else MESHES[name]()
     rpy_rad = DOME_UP if name == "liver" else (0.0, 0.0, 0.0)
     shape = compute_once(f"shape-{name}", lambda: make_shape(geometry))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trajectory, "make_shape", lambda _: shape)
-        return Desk(scene_with(geometry, rpy_rad=rpy_rad)), shape
+        return PlannerHarness(scene_with(geometry, rpy_rad=rpy_rad)), shape
 
 
-def fresh(name: str) -> tuple[Desk, Shape]:
+def fresh(name: str) -> tuple[PlannerHarness, Shape]:
     """Return a new planner and the shape; a mesh's planner, which takes 1 s, is shared."""
     desk, shape = desk_about(name)
     new = copy.copy(desk)
@@ -175,7 +175,9 @@ def walk(
     return points, normals, bends
 
 
-def touch(desk: Desk, point: Floats, normal: Floats, depth_m: float = 0.001) -> PlannedStep:
+def touch(
+    desk: PlannerHarness, point: Floats, normal: Floats, depth_m: float = 0.001
+) -> PlannedStep:
     """Approach from above, touch, and rest."""
     desk.rest(point + 0.03 * normal)
     desk.follow(point + np.linspace(0.03, -depth_m, 60)[:, None] * normal)
@@ -258,7 +260,7 @@ TURNED_PER_S = 0.8
 
 
 def normal_errors_deg(
-    desk: Desk, judge: Shape, start: Floats, heading: Floats, length_m: float
+    desk: PlannerHarness, judge: Shape, start: Floats, heading: Floats, length_m: float
 ) -> Floats:
     """Return the errors of the sheet's normal along a stroke at a speed for its tightest bend,
     degrees."""
@@ -593,10 +595,10 @@ def test_an_inverted_mesh_is_rejected() -> None:
         SmoothMeshShape(vertices, triangles[:, ::-1], 0.01)
 
 
-@pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
-def test_an_object_that_turns_no_side_to_the_user_is_rejected(turn_rad: float) -> None:
+@pytest.mark.parametrize("rotation_rad", [math.pi, 1.5])
+def test_an_object_that_turns_no_side_to_the_user_is_rejected(rotation_rad: float) -> None:
     with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
-        Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
+        PlannerHarness(scene_with(SOLIDS["plane"], rpy_rad=(rotation_rad, 0.0, 0.0)))
 
 
 def test_a_tilt_beyond_a_right_angle_is_cut() -> None:

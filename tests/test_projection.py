@@ -25,7 +25,7 @@ from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 from flexsheet.nodes.renderer.sheet_mesh import deflected_mesh, flat_mesh, pyramid_mesh
 from flexsheet.nodes.renderer.sheet_shape_benchmark import sheet_shape_family
 from flexsheet.nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen
-from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.true_object import TrueBody
 from tests.indentation_bases import few_dents
 from tests.scenes import make_weightless
@@ -66,7 +66,7 @@ def sheet_at(pose: Floats, tip: Floats | None = None, *, twist_rad: float = 0.0)
 
 def true_sheet(tip: Floats) -> DeformedSheet:
     spec = SCENE.sheet
-    rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
+    rubber = TrueRubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
     edges = edge_poses(np.eye(4), STRETCH * spec.width_m)
     return solve(rubber, *edges, finger_tip=tip, finger_radius_m=SCENE.finger.radius_m)
 
@@ -136,7 +136,7 @@ def test_the_weight_of_the_sheet_deflects_the_mesh(depth_m: float | None) -> Non
     left, right = edge_poses(pose, sheet.edge_distance_m)
     spec = SCENE.sheet
     truth = solve(
-        Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa, density),
+        TrueRubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa, density),
         left,
         right,
         finger_tip=tip,
@@ -256,7 +256,7 @@ def test_the_family_of_shapes_distinguishes_them(monkeypatch: pytest.MonkeyPatch
     scene = SCENE.model_copy(update={"working_range": shallow, "sheet": spec})
     errors: dict[str, float] = {}
     for trial in sheet_shape_family(simulate_points).trials(scene):
-        if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "place": "centre"}:
+        if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "position": "centre"}:
             errors[trial.method] = trial.error(trial.run())
             assert trial.in_range == (trial.method in ("reduced_order", "membrane"))
         elif errors:

@@ -290,8 +290,8 @@ def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.remedies == ()
     assert demo.blocked_paths == ()
     result = make_layout_result(demo)
-    assert result["share"] == 1.0
-    assert result["share_at_working_speed"] == 1.0
+    assert result["fraction"] == 1.0
+    assert result["fraction_at_working_speed"] == 1.0
     # Its edges are 0.12 m long each way: quick strokes round so small an object turn them too fast.
     assert SCENE.working_range.speed_m_per_s < result["speed_everywhere_m_per_s"] < 0.06
     json.dumps(result, allow_nan=False)

@@ -20,7 +20,7 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, occluded_fraction, pyramid_mesh
 from flexsheet.nodes.twin.eye import render_expected, seen
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import TrueRubber, solve
 from flexsheet.nodes.twin.true_object import TrueBody
 from tests.drawing import body_of, dent, follow, sheet_at
 
@@ -74,7 +74,7 @@ def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRende
     """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
-    rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
+    rubber = TrueRubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
     edges = edge_poses(pose, 1.05 * spec.width_m)
     truth = solve(rubber, *edges, finger_tip=None, finger_radius_m=SCENE.finger.radius_m)
     wanted = (

@@ -22,7 +22,7 @@ from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 from flexsheet.nodes.twin.gestures import GESTURES
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from tests import test_arm_loop as arm_loop
-from tests.plans import STEP_S, Desk, scene_with
+from tests.plans import STEP_S, PlannerHarness, scene_with
 from tests.waiting import until
 
 Floats = NDArray[np.float64]
@@ -147,7 +147,7 @@ def test_the_planner_follows_gestures_on_every_scene(name: str, gesture: str) ->
     fastest = float(SmoothPath.through(path.times_s, path.positions_world_m).speeds().max())
     motion = SmoothPath.through(path.times_s * (fastest / 0.025), path.positions_world_m)
     times = np.arange(0.0, motion.duration_s, STEP_S)
-    desk, object_from_world = Desk(here), inverse(object_pose(here))
+    desk, object_from_world = PlannerHarness(here), inverse(object_pose(here))
     shape = make_shape(dict(here.object.geometry))
     desk.rest(apply(object_from_world, motion.at(0.0)[0]), 120)
     sent = []

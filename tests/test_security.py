@@ -29,7 +29,7 @@ from flexsheet.messages.wire import encode
 from flexsheet.nodes.node import PortCounts
 from flexsheet.nodes.runner import NodeConfig, NodeTransport
 from tests.hosts import Hosts, hosts
-from tests.network import Cut
+from tests.network import TcpRelay
 from tests.test_messages_bus import ForeignPublisher, finger, pictures, stop
 
 PLAN = "0123456789abcdef"
@@ -43,14 +43,14 @@ def free_port() -> int:
 
 
 @dataclass
-class Ear:
+class RecordingSubscriber:
     """Record of a subscriber."""
 
     heard: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     counts: PortCounts = field(default_factory=PortCounts)
 
-    def hear(self, message: Any, header: Header) -> None:
+    def record(self, message: Any, header: Header) -> None:
         self.heard.append((message, header))
 
     @property
@@ -58,7 +58,7 @@ class Ear:
         return [header.sequence for _, header in self.heard]
 
 
-class Street:
+class SecuredPublisher:
     """Publisher of main at a tcp endpoint; other processes try to subscribe or to replace it."""
 
     def __init__(self, known: Hosts) -> None:
@@ -81,11 +81,11 @@ class Street:
 
     def ear(
         self, ring: KeyRing | None, topic: Topic = ESTOP, *, port: int = 0, host: str = "main"
-    ) -> Ear:
-        ear = Ear()
+    ) -> RecordingSubscriber:
+        ear = RecordingSubscriber()
         source = Source(f"tcp://127.0.0.1:{port or self.port}", "planner", host)
         subscriber = Subscriber(
-            topic, [source], ear.hear, ear.counts, keys=ring, plan=PLAN,
+            topic, [source], ear.record, ear.counts, keys=ring, plan=PLAN,
             on_problem=ear.problems.append,
         )  # fmt: skip
         subscriber.start()
@@ -103,103 +103,109 @@ class Street:
 
 
 @pytest_asyncio.fixture
-async def street() -> AsyncIterator[Street]:
+async def secured() -> AsyncIterator[SecuredPublisher]:
     with hosts("main", "left") as known:
-        street = Street(known)
-        yield street
-        for close in reversed(street.closers):
+        secured = SecuredPublisher(known)
+        yield secured
+        for close in reversed(secured.closers):
             close()
 
 
-async def test_an_unknown_key_receives_nothing_and_is_reported(street: Street) -> None:
-    mouth = street.mouth()
-    friend, stranger = street.ear(street.rings["left"]), street.ear(street.rings["stranger"])
-    without = street.ear(None)
-    await street.speak(mouth, lambda: friend.heard and stranger.problems and street.refused)
-    await street.speak(mouth, lambda: len(friend.heard) > 100)
+async def test_an_unknown_key_receives_nothing_and_is_reported(secured: SecuredPublisher) -> None:
+    mouth = secured.mouth()
+    friend, stranger = secured.ear(secured.rings["left"]), secured.ear(secured.rings["stranger"])
+    without = secured.ear(None)
+    await secured.speak(mouth, lambda: friend.heard and stranger.problems and secured.refused)
+    await secured.speak(mouth, lambda: len(friend.heard) > 100)
     assert (stranger.heard, without.heard) == ([], [])
     assert "rejects the key of this host" in stranger.problems[0]
-    assert street.known.derive_public_key("stranger") in street.refused[0]
+    assert secured.known.derive_public_key("stranger") in secured.refused[0]
 
 
 @pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
-async def test_only_the_host_of_the_plan_is_accepted(street: Street, impostor: str) -> None:
+async def test_only_the_host_of_the_plan_is_accepted(
+    secured: SecuredPublisher, impostor: str
+) -> None:
     """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
     if impostor == "without":
-        mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{street.port}"])
-        street.closers.append(mouth.close)
+        mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{secured.port}"])
+        secured.closers.append(mouth.close)
     else:
-        mouth = street.mouth(host=impostor)
-    ear = street.ear(street.rings["left"])
-    await street.speak(mouth, lambda: ear.problems)
-    await street.speak(mouth, partial(next, iter([False] * 50 + [True])))
+        mouth = secured.mouth(host=impostor)
+    ear = secured.ear(secured.rings["left"])
+    await secured.speak(mouth, lambda: ear.problems)
+    await secured.speak(mouth, partial(next, iter([False] * 50 + [True])))
     assert ear.heard == []
     mouth.close()
-    right = street.mouth()
-    await street.speak(right, lambda: ear.heard)
+    right = secured.mouth()
+    await secured.speak(right, lambda: ear.heard)
 
 
-async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(street: Street) -> None:
-    mouth, ear = street.mouth(), street.ear(street.rings["left"])
-    subscriber: Subscriber = ear.subscriber  # type: ignore[attr-defined]  # see Street.ear
-    await street.speak(mouth, lambda: ear.heard)
-    street.known.public["left"] = street.known.make_key("left")
+async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(
+    secured: SecuredPublisher,
+) -> None:
+    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
+    subscriber: Subscriber = ear.subscriber  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    await secured.speak(mouth, lambda: ear.heard)
+    secured.known.public["left"] = secured.known.make_key("left")
     for name in ("main", "left"):
-        street.known.write_ring(name)
-    change = street.rings["main"].reload()
+        secured.known.write_ring(name)
+    change = secured.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset({"left"}))
     mouth.renew_keys(change)
     ear.heard.clear()
-    await street.speak(mouth, lambda: ear.problems)
+    await secured.speak(mouth, lambda: ear.problems)
     assert ear.heard == [], "the old key is refused, also on the connection that was there"
-    change = street.rings["left"].reload()
+    change = secured.rings["left"].reload()
     assert change == KeyChange(own=True, hosts=frozenset({"left"}))
     subscriber.renew_keys(change)
-    await street.speak(mouth, lambda: ear.heard)
-    street.known.public["main"] = street.known.make_key("main")
+    await secured.speak(mouth, lambda: ear.heard)
+    secured.known.public["main"] = secured.known.make_key("main")
     for name in ("main", "left"):
-        street.known.write_ring(name)
-        changed = street.rings[name].reload()
+        secured.known.write_ring(name)
+        changed = secured.rings[name].reload()
         assert changed is not None
         (mouth if name == "main" else subscriber).renew_keys(changed)
     ear.heard.clear()
-    await street.speak(mouth, lambda: ear.heard)
-    assert street.rings["main"].reload() is None
+    await secured.speak(mouth, lambda: ear.heard)
+    assert secured.rings["main"].reload() is None
 
 
-async def test_an_added_host_disturbs_no_connection(street: Street) -> None:
-    mouth, ear = street.mouth(), street.ear(street.rings["left"])
-    await street.speak(mouth, lambda: ear.heard)
-    street.known.public["right"] = street.known.derive_public_key("stranger")
-    street.known.write_ring("main")
-    change = street.rings["main"].reload()
+async def test_an_added_host_disturbs_no_connection(secured: SecuredPublisher) -> None:
+    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
+    await secured.speak(mouth, lambda: ear.heard)
+    secured.known.public["right"] = secured.known.derive_public_key("stranger")
+    secured.known.write_ring("main")
+    change = secured.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset())
     mouth.renew_keys(change)
-    late = street.ear(street.rings["stranger"])
-    await street.speak(mouth, lambda: late.heard)
+    late = secured.ear(secured.rings["stranger"])
+    await secured.speak(mouth, lambda: late.heard)
     assert ear.sequences == list(range(ear.sequences[0], ear.sequences[-1] + 1))
 
 
-async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(street: Street) -> None:
-    mouth, ear = street.mouth(), street.ear(street.rings["left"])
-    await street.speak(mouth, lambda: ear.heard)
+async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(
+    secured: SecuredPublisher,
+) -> None:
+    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
+    await secured.speak(mouth, lambda: ear.heard)
     chance = random.Random(1)
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01"
     openers = [b"", b"GET / HTTP/1.1\r\n\r\n", greeting, greeting + b"CURVE".ljust(20, b"\0")]
     openers.append(greeting + b"NULL".ljust(20, b"\0") + bytes(32))
     for number in range(400):
-        with socket.create_connection(("127.0.0.1", street.port)) as stranger:
+        with socket.create_connection(("127.0.0.1", secured.port)) as stranger:
             said = openers[number % len(openers)] + chance.randbytes(chance.randrange(2000))
             stranger.sendall(said)
         if number % 20 == 0:
-            await street.speak(mouth, partial(next, iter([False, True])))
+            await secured.speak(mouth, partial(next, iter([False, True])))
     ear.heard.clear()
-    await street.speak(mouth, lambda: len(ear.heard) > 20)
+    await secured.speak(mouth, lambda: len(ear.heard) > 20)
     assert ear.counts.rejected == 0
     assert {header.writer for _, header in ear.heard} == {"planner"}
 
 
-class Meddler(Cut):
+class TamperingProxy(TcpRelay):
     """Proxy between two hosts that stores data, and can change, repeat or replay them."""
 
     def __init__(self, target_port: int) -> None:
@@ -224,10 +230,10 @@ class Meddler(Cut):
 
 
 async def test_changed_repeated_or_replayed_data_are_rejected(
-    street: Street, monkeypatch: pytest.MonkeyPatch
+    secured: SecuredPublisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
-    mouth = street.mouth()
+    mouth = secured.mouth()
     chance = random.Random(2)
 
     def flip(data: bytes) -> bytes:
@@ -235,9 +241,9 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
         place = chance.randrange(len(data) // 2, len(data))
         return data[:place] + bytes([data[place] ^ 1 << chance.randrange(8)]) + data[place + 1 :]
 
-    async with Meddler(street.port) as meddler:
-        ear = street.ear(street.rings["left"], port=meddler.port)
-        await street.speak(mouth, lambda: len(ear.heard) > 20)
+    async with TamperingProxy(secured.port) as meddler:
+        ear = secured.ear(secured.rings["left"], port=meddler.port)
+        await secured.speak(mouth, lambda: len(ear.heard) > 20)
         earlier = list(meddler.kept)
         tricks: tuple[Callable[[bytes], bytes], ...] = (
             flip,
@@ -247,27 +253,27 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
         for trick in tricks:
             meddler.meddle = trick
             before = meddler.connections
-            await street.speak(mouth, lambda: meddler.connections >= before + 3)  # noqa: B023
+            await secured.speak(mouth, lambda: meddler.connections >= before + 3)  # noqa: B023
         meddler.meddle = lambda data: data
         done = len(ear.heard)
-        await street.speak(mouth, lambda: len(ear.heard) > done + 5)
+        await secured.speak(mouth, lambda: len(ear.heard) > done + 5)
     for message, header in ear.heard:
         assert message == stop(str(header.sequence))
     assert ear.sequences == sorted(set(ear.sequences)), "each at most once, in order"
     assert ear.counts.rejected == 0, "ZeroMQ's own seal catches it, before any message is made"
 
 
-async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
+async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublisher) -> None:
     """All bytes that a subscriber sent open no connection again: both ends create the session's
     keys."""
-    mouth = street.mouth()
+    mouth = secured.mouth()
     sent: list[bytes] = []
 
-    class Recorder(Cut):
+    class Recorder(TcpRelay):
         async def _pass_on(
             self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
         ) -> None:
-            to_publisher = writer.get_extra_info("peername")[1] == street.port
+            to_publisher = writer.get_extra_info("peername")[1] == secured.port
             with suppress(ConnectionError):
                 while data := await reader.read(1 << 16):
                     if to_publisher:
@@ -275,10 +281,10 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
                     writer.write(data)
             writer.transport.abort()
 
-    async with Recorder(street.port) as wire:
-        ear = street.ear(street.rings["left"], port=wire.port)
-        await street.speak(mouth, lambda: len(ear.heard) > 5)
-    reader, writer = await asyncio.open_connection("127.0.0.1", street.port)
+    async with Recorder(secured.port) as wire:
+        ear = secured.ear(secured.rings["left"], port=wire.port)
+        await secured.speak(mouth, lambda: len(ear.heard) > 5)
+    reader, writer = await asyncio.open_connection("127.0.0.1", secured.port)
     writer.write(b"".join(sent))
     answer = bytearray()
 
@@ -289,25 +295,25 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
 
     # ZeroMQ hangs up; until then the publisher goes on.
     listening = asyncio.create_task(listen())
-    await street.speak(mouth, listening.done)
+    await secured.speak(mouth, listening.done)
     writer.close()
     # Greeting (64 bytes) and WELCOME (170 bytes in a frame) at most: no message.
     assert len(answer) < 300
 
 
 async def test_messages_of_250_mib_are_counted_and_others_continue(
-    street: Street,
+    secured: SecuredPublisher,
 ) -> None:
     """Each topic has its limit; longer messages are rejected, and their memory is freed."""
-    foreign = ForeignPublisher(f"tcp://127.0.0.1:{street.port}")
-    street.closers.append(foreign.close)
-    ear = Ear()
+    foreign = ForeignPublisher(f"tcp://127.0.0.1:{secured.port}")
+    secured.closers.append(foreign.close)
+    ear = RecordingSubscriber()
     subscriber = Subscriber(
-        ESTOP, [f"tcp://127.0.0.1:{street.port}"], ear.hear, ear.counts,
+        ESTOP, [f"tcp://127.0.0.1:{secured.port}"], ear.record, ear.counts,
         on_problem=ear.problems.append,
     )  # fmt: skip
     subscriber.start()
-    street.closers.append(subscriber.close)
+    secured.closers.append(subscriber.close)
     number = 0
 
     async def speak(until_: Callable[[], object]) -> None:
@@ -338,9 +344,11 @@ async def test_nothing_is_sent_beyond_loopback_without_keys() -> None:
             subscriber.start()
 
 
-async def test_a_host_without_a_key_in_the_plan_is_not_connected_to(street: Street) -> None:
+async def test_a_host_without_a_key_in_the_plan_is_not_connected_to(
+    secured: SecuredPublisher,
+) -> None:
     with pytest.raises(SecurityError, match='host "right" has no key'):
-        street.ear(street.rings["left"], host="right")
+        secured.ear(secured.rings["left"], host="right")
 
 
 # In bulk, where sockets would only take time: all that a host with a good key could try.
@@ -413,9 +421,9 @@ def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, li
 @pytest.mark.parametrize("topic", ["estop", "sheet_target", "stereo"])
 def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
     message = {"estop": stop("good"), "sheet_target": target(), "stereo": pictures(3)}[topic]
-    ear = Ear()
+    ear = RecordingSubscriber()
     subscriber = Subscriber(
-        TOPICS[topic], [], ear.hear, ear.counts, plan=PLAN, on_problem=ear.problems.append
+        TOPICS[topic], [], ear.record, ear.counts, plan=PLAN, on_problem=ear.problems.append
     )
     writers = frozenset({"planner"})
 
@@ -444,8 +452,8 @@ def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
 
 def test_the_newest_again_is_silent_where_it_is_latched_and_a_replay_where_not() -> None:
     for topic, message, rejected in ((ESTOP, stop("a"), 0), (FINGER, finger(1.0), 1)):
-        ear = Ear()
-        subscriber = Subscriber(topic, [], ear.hear, ear.counts, on_problem=ear.problems.append)
+        ear = RecordingSubscriber()
+        subscriber = Subscriber(topic, [], ear.record, ear.counts, on_problem=ear.problems.append)
         frames = plain(encode(message, HEADER))
         assert subscriber.accept(frames, None) is not None
         assert subscriber.accept(frames, None) is None
@@ -453,8 +461,8 @@ def test_the_newest_again_is_silent_where_it_is_latched_and_a_replay_where_not()
 
 
 def test_a_restart_and_a_reboot_are_followed() -> None:
-    ear = Ear()
-    subscriber = Subscriber(FINGER, [], ear.hear, ear.counts, on_problem=ear.problems.append)
+    ear = RecordingSubscriber()
+    subscriber = Subscriber(FINGER, [], ear.record, ear.counts, on_problem=ear.problems.append)
 
     def takes(clock_id: str, epoch: int, sequence: int) -> bool:
         header = replace(HEADER, clock_id=clock_id, epoch=epoch, sequence=sequence)
@@ -490,9 +498,9 @@ def test_who_may_reset_an_estop() -> None:
 
 
 def test_a_forbidden_message_is_counted_and_not_handed_over() -> None:
-    ear = Ear()
+    ear = RecordingSubscriber()
     subscriber = Subscriber(
-        ESTOP, [], ear.hear, ear.counts, on_problem=ear.problems.append,
+        ESTOP, [], ear.record, ear.counts, on_problem=ear.problems.append,
         message_filter=lambda message, header: None if message.engaged else "not so",
     )  # fmt: skip
     for number, engaged in enumerate((True, False, True), start=8):

@@ -97,7 +97,7 @@ def lab(folder: Path, **left: Any) -> ResolvedGraph:
     return load_graph(path)
 
 
-class Street:
+class SecuredBridge:
     """The right arm's bridge with its runner's connections, and its peers."""
 
     def __init__(self, plan: ResolvedGraph) -> None:
@@ -117,7 +117,7 @@ class Street:
         self.heard: list[tuple[str, str]] = []
         self.sequence = 0
 
-    def hear(self, port: str, message: Message, header: Header) -> None:
+    def record(self, port: str, message: Message, header: Header) -> None:
         self.heard.append((header.writer, repr(message)))
 
     def rejected(self, port: str) -> int:
@@ -163,15 +163,15 @@ class Street:
 
 
 @contextmanager
-def street_of(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
+def make_secured(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[SecuredBridge]:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
-    street = Street(plan)
-    monkeypatch.setattr(street.bridge, "deliver", street.hear)
-    street.links.open_inputs(street.bridge)
+    secured = SecuredBridge(plan)
+    monkeypatch.setattr(secured.bridge, "deliver", secured.record)
+    secured.links.open_inputs(secured.bridge)
     try:
-        yield street
+        yield secured
     finally:
-        street.links.close()
+        secured.links.close()
 
 
 async def test_an_arm_s_computer_cannot_command_the_other_arm(
@@ -180,20 +180,20 @@ async def test_an_arm_s_computer_cannot_command_the_other_arm(
     """The compromised left host has its key, its address, and any free address."""
     mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
     left, forged = arm_state("left"), target()
-    with street_of(lab(folder), monkeypatch) as street:
-        with street.mouth("arm_left", at=mine, key="left") as mouth:
-            await street.is_taken(mouth, "arm_left_bridge", left)
+    with make_secured(lab(folder), monkeypatch) as secured:
+        with secured.mouth("arm_left", at=mine, key="left") as mouth:
+            await secured.is_taken(mouth, "arm_left_bridge", left)
             for other in ("planner", BRIDGE, "tools"):
-                await street.is_refused(mouth, other, left, "other_arm")
-        with street.mouth("sheet_target", at=mine, key="left") as mouth:
-            await street.is_refused(mouth, "planner", forged, "other_arm")
-        with street.mouth("sheet_target", at=main_s, key="left") as mouth:
-            street.bridge.last_error = ""
-            await street.say(mouth, "planner", forged, lambda: street.bridge.last_error)
-            assert 'topic "sheet_target": host main did not prove' in street.bridge.last_error
-            assert {writer for writer, _ in street.heard} <= {"arm_left_bridge"}
-        with street.mouth("sheet_target", at=main_s, key="main") as mouth:
-            await street.is_taken(mouth, "planner", forged)
+                await secured.is_refused(mouth, other, left, "other_arm")
+        with secured.mouth("sheet_target", at=mine, key="left") as mouth:
+            await secured.is_refused(mouth, "planner", forged, "other_arm")
+        with secured.mouth("sheet_target", at=main_s, key="left") as mouth:
+            secured.bridge.last_error = ""
+            await secured.say(mouth, "planner", forged, lambda: secured.bridge.last_error)
+            assert 'topic "sheet_target": host main did not prove' in secured.bridge.last_error
+            assert {writer for writer, _ in secured.heard} <= {"arm_left_bridge"}
+        with secured.mouth("sheet_target", at=main_s, key="main") as mouth:
+            await secured.is_taken(mouth, "planner", forged)
 
 
 @pytest.mark.parametrize("may", [None, False, True], ids=["as it comes", "may not", "may"])
@@ -201,23 +201,23 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
     folder: Path, monkeypatch: pytest.MonkeyPatch, may: bool | None
 ) -> None:
     """The console on left can always stop; other permissions depend on the launch file."""
-    with street_of(lab(folder, may_reset_estop=may), monkeypatch) as street:
+    with make_secured(lab(folder, may_reset_estop=may), monkeypatch) as secured:
         words: tuple[tuple[str, Message, Message], ...] = (
             ("estop", EStop(engaged=True, reason="a hand"), EStop(engaged=False, reason="gone")),
             ("arming", Arming(ready=False), Arming(ready=True)),
         )
         for topic, stops, lets in words:
-            with street.mouth(topic, at=(topic, "hand"), key="left") as mouth:
-                await street.is_taken(mouth, "hand", stops)
+            with secured.mouth(topic, at=(topic, "hand"), key="left") as mouth:
+                await secured.is_taken(mouth, "hand", stops)
                 if may:
-                    await street.is_taken(mouth, "hand", lets)
+                    await secured.is_taken(mouth, "hand", lets)
                 else:
-                    await street.is_refused(mouth, "hand", lets, topic)
-                    assert "hand may not reset an e-stop" in street.bridge.last_error
-                await street.is_taken(mouth, "hand", stops)
-            with street.mouth(topic, at=(topic, "tools"), key="main") as mouth:
-                await street.is_taken(mouth, "tools", lets)
-            assert (street.rejected(topic) == 0) == bool(may)
+                    await secured.is_refused(mouth, "hand", lets, topic)
+                    assert "hand may not reset an e-stop" in secured.bridge.last_error
+                await secured.is_taken(mouth, "hand", stops)
+            with secured.mouth(topic, at=(topic, "tools"), key="main") as mouth:
+                await secured.is_taken(mouth, "tools", lets)
+            assert (secured.rejected(topic) == 0) == bool(may)
 
 
 @pytest.mark.parametrize("may", [None, True], ids=["as it comes", "may"])

@@ -22,11 +22,11 @@ import zmq
 
 from flexsheet.messages import connection_guard
 from flexsheet.messages.connection_guard import THREAD_NAME
-from tests.test_messages_bus import Room, header, room, stop
-from tests.test_security import ESTOP, Street, street
+from tests.test_messages_bus import Connections, connections, header, stop
+from tests.test_security import ESTOP, SecuredPublisher, secured
 from tests.waiting import until
 
-__all__ = ["room", "street"]
+__all__ = ["connections", "secured"]
 
 ROOT = Path(__file__).resolve().parent.parent
 ATTACK_BYTES = 24_000_000
@@ -123,14 +123,16 @@ class AttackedPublisher:
 
 
 @contextmanager
-def subscribed(endpoint: str, street: Street | None = None) -> Iterator[zmq.Socket[bytes]]:
+def subscribed(
+    endpoint: str, secured: SecuredPublisher | None = None
+) -> Iterator[zmq.Socket[bytes]]:
     """Return a normal subscriber that has received a message."""
     with zmq.Context() as context, context.socket(zmq.SUB) as opened:
         opened.setsockopt(zmq.LINGER, 0)
         opened.setsockopt(zmq.SUBSCRIBE, b"")
         opened.setsockopt(zmq.RCVTIMEO, 1000 * DEADLINE_S)
-        if street is not None:
-            street.rings["left"].set_client_keys(opened, "main")
+        if secured is not None:
+            secured.rings["left"].set_client_keys(opened, "main")
         opened.connect(endpoint)
         opened.recv()
         yield opened
@@ -198,11 +200,11 @@ def test_what_subscribers_send_does_not_fill_the_memory(attack: str, topic: str)
     assert report["refused"] or attack == "long"
 
 
-def test_a_host_with_a_key_does_not_fill_the_memory(street: Street) -> None:
-    publisher = AttackedPublisher("twin/finger", str(street.known.write_ring("main")))
-    ring = str(street.known.write_ring("left"))
+def test_a_host_with_a_key_does_not_fill_the_memory(secured: SecuredPublisher) -> None:
+    publisher = AttackedPublisher("twin/finger", str(secured.known.write_ring("main")))
+    ring = str(secured.known.write_ring("left"))
     attacker = [sys.executable, "-c", ATTACKER_WITH_KEY, publisher.endpoint, ring]
-    with subscribed(publisher.endpoint, street) as honest:
+    with subscribed(publisher.endpoint, secured) as honest:
         attackers = [
             subprocess.Popen([*attacker, str(ATTACK_BYTES // ATTACKERS)], cwd=ROOT)
             for _ in range(ATTACKERS)
@@ -217,28 +219,28 @@ def test_a_host_with_a_key_does_not_fill_the_memory(street: Street) -> None:
 
 
 async def test_an_address_has_a_limited_number_of_connections(
-    street: Street, monkeypatch: pytest.MonkeyPatch
+    secured: SecuredPublisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection_guard, "MAX_CONNECTIONS_PER_ADDRESS", 3)
-    publisher = street.mouth()
-    ears = [street.ear(street.rings["left"]) for _ in range(3)]
-    await street.speak(publisher, lambda: all(ear.heard for ear in ears))
-    with socket.create_connection(("127.0.0.1", street.port), timeout=DEADLINE_S) as fourth:
-        await until(lambda: street.refused)
+    publisher = secured.mouth()
+    ears = [secured.ear(secured.rings["left"]) for _ in range(3)]
+    await secured.speak(publisher, lambda: all(ear.heard for ear in ears))
+    with socket.create_connection(("127.0.0.1", secured.port), timeout=DEADLINE_S) as fourth:
+        await until(lambda: secured.refused)
         # ZeroMQ may have sent its greeting before.
         while await asyncio.to_thread(fourth.recv, 100):
             pass
-    assert "has 3 connections already" in street.refused[0]
-    ears[0].subscriber.close()  # type: ignore[attr-defined]  # see Street.ear
-    successor = street.ear(street.rings["left"])
-    await street.speak(publisher, lambda: successor.heard)
+    assert "has 3 connections already" in secured.refused[0]
+    ears[0].subscriber.close()  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    successor = secured.ear(secured.rings["left"])
+    await secured.speak(publisher, lambda: successor.heard)
 
 
-async def test_the_guard_ends_with_the_last_publisher(room: Room) -> None:
-    publisher = room.mouth(ESTOP, "tcp://127.0.0.1:*")
-    successor = room.mouth(ESTOP, "tcp://127.0.0.1:*")
+async def test_the_guard_ends_with_the_last_publisher(connections: Connections) -> None:
+    publisher = connections.mouth(ESTOP, "tcp://127.0.0.1:*")
+    successor = connections.mouth(ESTOP, "tcp://127.0.0.1:*")
     publisher.close()
-    ear = room.ear(ESTOP, successor.endpoints[0])
+    ear = connections.ear(ESTOP, successor.endpoints[0])
     successor.send(stop("after"), header(1))
     await until(lambda: ear.heard)
     assert [one.name for one in threading.enumerate()].count(THREAD_NAME) == 1
@@ -246,10 +248,12 @@ async def test_the_guard_ends_with_the_last_publisher(room: Room) -> None:
     await until(lambda: THREAD_NAME not in [one.name for one in threading.enumerate()])
 
 
-async def test_latched_messages_reach_late_subscribers_by_tcp_and_ipc(room: Room) -> None:
-    publisher = room.mouth(ESTOP, room.endpoint(), "tcp://127.0.0.1:*")
+async def test_latched_messages_reach_late_subscribers_by_tcp_and_ipc(
+    connections: Connections,
+) -> None:
+    publisher = connections.mouth(ESTOP, connections.endpoint(), "tcp://127.0.0.1:*")
     publisher.send(stop("before"), header(1))
     for endpoint in publisher.endpoints:
-        ear = room.ear(ESTOP, endpoint)
+        ear = connections.ear(ESTOP, endpoint)
         await until(lambda ear=ear: ear.heard)
         assert ear.sequences == [1]

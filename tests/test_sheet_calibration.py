@@ -76,7 +76,7 @@ def test_sheet_parameters_are_recovered(modulus: float, width: float, cubic: flo
         modulus_thickness_n_per_m=modulus,
         slack_width_m=width,
         cubic_ratio=cubic,
-        mooney_share=0.0,
+        mooney_ratio=0.0,
     )
     fit = fit_sheet_model(pushes_of(law), NOMINAL)
     assert fit.values == pytest.approx((modulus, width, cubic), rel=1e-3)
@@ -90,7 +90,7 @@ def test_errors_are_within_stated_deviations_without_outliers() -> None:
         modulus_thickness_n_per_m=1500.0,
         slack_width_m=0.2385,
         cubic_ratio=1.3,
-        mooney_share=0.0,
+        mooney_ratio=0.0,
     )
     rows = pushes_of(law, noise_n=0.01)
     for number, factor in ((3, 3.0), (12, 0.2)):
@@ -113,11 +113,11 @@ def test_mooneys_fraction_is_found_at_large_stretch() -> None:
         modulus_thickness_n_per_m=900.0,
         slack_width_m=0.24,
         cubic_ratio=1.0,
-        mooney_share=0.4,
+        mooney_ratio=0.4,
     )
     rows = pushes_of(law, stretches=(1.02, 1.05, 1.12, 1.2, 1.3), edges=True)
     fit = fit_sheet_model(rows, NOMINAL, with_mooney=True)
-    assert fit.names[3] == "mooney_share"
+    assert fit.names[3] == "mooney_ratio"
     assert fit.values == pytest.approx((900.0, 0.24, 1.0, 0.4), rel=0.02)
     assert 0.0 < fit.standard_deviations[3] < 0.2
 

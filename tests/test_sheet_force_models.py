@@ -285,7 +285,7 @@ def test_edge_force_depends_on_the_sheets_form_and_mooneys_rubber() -> None:
     forces = [flat_edge_force_n(RUBBER, stretch) for stretch in (0.9, 1.0, 1.02, 1.05, 1.1)]
     assert forces[0] == forces[1] == 0.0
     assert forces[2:] == pytest.approx([5.07, 12.3, 23.4], rel=0.01)
-    mooney = Rubber(0.24, 0.24, 0.001, 1e6, mooney_share=0.3)
+    mooney = Rubber(0.24, 0.24, 0.001, 1e6, mooney_ratio=0.3)
     softening = flat_edge_force_n(mooney, 1.2) / flat_edge_force_n(RUBBER, 1.2)
     assert softening == pytest.approx(0.95, abs=0.01)
 
@@ -294,7 +294,7 @@ def test_edge_force_depends_on_the_sheets_form_and_mooneys_rubber() -> None:
     "numbers", [(0.0, 0.24, 0.001, 1e6, 0.0), (0.24, 0.24, np.nan, 1e6, 0.0), (0.24,) * 4 + (1.0,)]
 )
 def test_rubber_that_is_none_is_rejected(numbers: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match=r"above 0|mooney_share"):
+    with pytest.raises(ValueError, match=r"above 0|mooney_ratio"):
         Rubber(*numbers)
 
 

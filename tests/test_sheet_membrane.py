@@ -121,7 +121,7 @@ def test_near_the_free_edge_and_the_clamp_there_is_an_answer() -> None:
 def test_mooneys_rubber_softens_when_stretched() -> None:
     shares = [
         push_path(
-            Rubber(0.24, 0.24, 0.001, 1e6, mooney_share=share),
+            Rubber(0.24, 0.24, 0.001, 1e6, mooney_ratio=share),
             stretch_ratio=1.2,
             depths_m=[0.02],
             finger_radius_m=RADIUS,

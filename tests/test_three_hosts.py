@@ -18,7 +18,7 @@ import pytest
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, Lab
-from tests.lab_bags import Arm, Span, gaps, held, read_arm, wanted
+from tests.lab_bags import Arm, Span, gaps, measure_hold, read_arm, wanted
 from tests.waiting import DEADLINE_S
 
 SIDES = ("left", "right")
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 @dataclass
-class Troubles:
+class FaultSpans:
     """Time spans of faults until the recovery, ns."""
 
     spans: dict[str, Span] = field(default_factory=dict)
@@ -78,7 +78,7 @@ def judge_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
         assert all(arm.turned_rad(span) < STANDS_RAD for span in stood)
 
 
-def judge_bags(lab: Lab, troubles: Troubles) -> None:
+def judge_bags(lab: Lab, troubles: FaultSpans) -> None:
     """Assert the same for the arms' true joints, and that the strokes were followed."""
     scene = lab.plan().scene_message()
     assert scene is not None
@@ -86,7 +86,7 @@ def judge_bags(lab: Lab, troubles: Troubles) -> None:
     for arm in arms:
         judge_arm(arm, ("idle", "estop"))
     lossy = troubles.spans["loss and jitter"]
-    sheet = held(arms, wanted(lab.folder), lossy)
+    sheet = measure_hold(arms, wanted(lab.folder), lossy)
     assert sheet.followed > 0.5
     assert all(arm.turned_rad(lossy) > TURNED_RAD for arm in arms)
     assert len(sheet.errors_m) > 50
@@ -144,7 +144,7 @@ async def test_arms_that_stroke_stop_at_a_cut_cable_and_move_when_told_so() -> N
 
 @pytest.mark.long
 async def test_stroking_arms_stop_at_failures_and_move_when_enabled() -> None:
-    troubles = Troubles()
+    troubles = FaultSpans()
     async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
         await last_weeks_plan_is_refused(lab)
         lab.stroke()

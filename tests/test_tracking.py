@@ -15,10 +15,10 @@ from ruamel.yaml import YAML
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]
@@ -418,13 +418,13 @@ def test_methods_have_the_stated_accuracy_in_their_range() -> None:
     errors: dict[tuple[str, str, int], float] = {}
     for trial in family.trials(SCENE):
         point = measure_trial(trial, repeats=1)
-        errors[trial.method, str(trial.case["motion"]), int(trial.case["lead_ms"])] = point.error
+        errors[trial.method, str(trial.case["motion"]), int(trial.case["horizon_ms"])] = point.error
         known = trial.method != "none"
         assert trial.in_range >= known
-        if trial.in_range and trial.case["motion"] == "rest" and trial.case["lead_ms"] < 50:
+        if trial.in_range and trial.case["motion"] == "rest" and trial.case["horizon_ms"] < 50:
             assert point.error < family.tolerance(SCENE)
-    for motion, lead_ms in (("rest", 20), ("rest", 50), ("reach", 20), ("reach", 50)):
-        best = min(TRACKING_METHODS, key=lambda name: errors[name, motion, lead_ms])
+    for motion, horizon_ms in (("rest", 20), ("rest", 50), ("reach", 20), ("reach", 50)):
+        best = min(TRACKING_METHODS, key=lambda name: errors[name, motion, horizon_ms])
         assert best == "adaptive"
     assert errors["none", "reach", 50] > 5 * errors["adaptive", "reach", 50]
     assert errors["adaptive", "rest", 0] < errors["none", "rest", 0]

@@ -86,7 +86,7 @@ def test_the_presented_force_depends_on_the_history() -> None:
     elastic = ForceReference(replace(recorded, apparatus=apparatus()))
     half = (middle // 2, middle + middle // 2)
     ratios = [
-        rubber.evaluate(at, press).presented_n / elastic.evaluate(at, press).presented_n
+        rubber.evaluate(at, press).rendered_n / elastic.evaluate(at, press).rendered_n
         for at in half
     ]
     assert ratios == pytest.approx([1.136, 0.864], abs=0.01)

@@ -37,7 +37,7 @@ def plan_of(folder: Path) -> ResolvedGraph:
 
 
 @dataclass
-class Live:
+class SimulatedGraph:
     """Nodes of the demo on one clock, with random delays, and a recorder without."""
 
     plan: ResolvedGraph
@@ -79,7 +79,7 @@ class Live:
                 self.clock.move_to(self.clock.now_ns() + 300_000)
                 await self.nodes[name].step(topic.replace("/", "__"), *entry)
 
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         for node in self.nodes.values():
             node.status.publish(make_status(node, "running", psutil.Process()))
 
@@ -92,7 +92,7 @@ async def live(folder: Path) -> Path:
     eyes = TwinCamera(make_true_camera(scene.camera), finger_radius_m=scene.finger.radius_m, seed=4)
     with BagWriter(bag, {"recording": {"clock_id": "lab"}}) as writer:
         writer.add_attachment("plan.json", plan.model_dump_json().encode(), "application/json")
-        graph = Live(plan, writer)
+        graph = SimulatedGraph(plan, writer)
         for name in NODES:
             await graph.build(name).setup()
         graph.say("scene", scene, 1, "launch")
@@ -116,7 +116,7 @@ async def live(folder: Path) -> Path:
             for topic, name in order if i % 2 else order[::-1]:
                 if (i + len(topic)) % 5:
                     await graph.hand(topic, name)
-        graph.tell()
+        graph.publish_status()
         for node in graph.nodes.values():
             await node.close()
     return bag
@@ -140,7 +140,7 @@ def test_what_a_node_did_live_it_does_again_to_the_last_bit(bag: Path, name: str
     result = verify(bag, name)
     assert_as_live(result)
     # The camera, which could reach for devices, does not say what it took: it takes all.
-    assert result.as_taken == (name != "camera")
+    assert result.by_execution_log == (name != "camera")
     assert result.missing == 0
     output = {"camera": "stereo", "triangulator": "fingertip", "planner": "sheet_target",
               "fem_solver": "soft_body"}[name]  # fmt: skip
@@ -157,7 +157,7 @@ def test_without_the_execution_log_the_recorders_order_differs(bag: Path, tmp_pa
     old = rewritten(bag, tmp_path / "old.mcap", log=False)
     result = verify(old, "planner")
     assert result.same_bytes
-    assert not result.as_taken
+    assert not result.by_execution_log
     assert not result.as_live
 
 
@@ -214,7 +214,7 @@ async def test_a_clock_node_measures_the_same_again(tmp_path: Path) -> None:
     bag = tmp_path / "clocks.mcap"
     with BagWriter(bag, {"recording": {"clock_id": "lab"}}) as writer:
         writer.add_attachment("plan.json", plan.model_dump_json().encode(), "application/json")
-        graph = Live(plan, writer)
+        graph = SimulatedGraph(plan, writer)
         node = graph.build(name)
         await node.setup()
         for i in range(1, 9):
@@ -228,7 +228,7 @@ async def test_a_clock_node_measures_the_same_again(tmp_path: Path) -> None:
             graph.send(TOPICS["clock_ping"], ping, header)
             await node.step("clock_ping", ping, header)
             await node.call_timer(0, find_timers(type(node))[0])
-        graph.tell()
+        graph.publish_status()
     result = await asyncio.to_thread(verify, bag, name)
     assert_as_live(result)
     assert result.topics["clocks"].compared == 8

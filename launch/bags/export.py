@@ -3,7 +3,7 @@
 Each topic becomes a JSON channel of the same name with its numbers; arrays of more than `PLOTTED`
 values are left out. Images and 3D data become separate channels:
 
-    stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/expected     foxglove.RawImage
+    stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
     finger      the fingertip with its predicted path                     foxglove.SceneUpdate
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
@@ -86,7 +86,6 @@ class ExportResult:
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
     unreadable: tuple[str, ...] = ()
-    wall_clock: bool = False
 
 
 def export(
@@ -116,7 +115,6 @@ def export(
     readable = {one.name for one in summary.topics if one.readable} & wanted
     offset_ns = _wall_clock_offset_ns(reader)
     result = ExportResult(output, unreadable=tuple(sorted(wanted - readable)))
-    result.wall_clock = offset_ns is not None
     context = foxglove.Context()
     channels: dict[str, Any] = {}
     draft = output.with_name(f"{output.name}.part")
@@ -235,7 +233,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
             yield f"{topic}/right", message.right
         case Frame():
             for image in message.pixels:
-                yield f"{topic}/picture", image
+                yield f"{topic}/image", image
         case TwinEye():
             yield f"{topic}/seen", message.seen
             yield f"{topic}/expected", message.expected

@@ -58,14 +58,14 @@ class SentMessage:
 class ReplayResult:
     """Result of one replay of the bag.
 
-    as_taken: the replay followed the execution log of the node; else the order of the recorder.
-    missing: logged messages that the bag does not contain. logged_until_ns: end of the execution
-    log, in time of the node's host.
+    by_execution_log: the replay followed the execution log of the node; else the order of the
+    recorder. missing: logged messages that the bag does not contain. logged_until_ns: end of the
+    execution log, in time of the node's host.
     """
 
     messages_in: int = 0
     missing: int = 0
-    as_taken: bool = False
+    by_execution_log: bool = False
     logged_until_ns: int | None = None
     sent: list[SentMessage] = field(default_factory=list)
     errors: int = 0
@@ -98,11 +98,11 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Result of `bag verify`; as_taken, missing: see `ReplayResult`."""
+    """Result of `bag verify`; by_execution_log, missing: see `ReplayResult`."""
 
     node: str
     bag: str
-    as_taken: bool
+    by_execution_log: bool
     messages_in: int
     missing: int
     messages_out: int
@@ -164,7 +164,7 @@ def verify(
     return Verification(
         node=name,
         bag=str(bag),
-        as_taken=first.as_taken,
+        by_execution_log=first.by_execution_log,
         messages_in=first.messages_in,
         missing=first.missing,
         messages_out=len(first.sent),
@@ -201,7 +201,7 @@ async def replay(
     runs = read_runs(bag, planned.name)
     before, total = 0, sum(len(run.steps) for run in runs)
     for run in runs:
-        result.as_taken, result.logged_until_ns = True, int(run.steps[-1, 3])
+        result.by_execution_log, result.logged_until_ns = True, int(run.steps[-1, 3])
         report = partial(_report_progress, progress, before, total)
         await _replay_run(bag, planned, run, result, report)
         before += len(run.steps)

@@ -246,9 +246,7 @@ class PoseRecorder:
             self._joints, self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w) each, record it if it is new, and return a hint for the
-        operator.
-        """
+        """Add an image pair (h, w), record it if it is new, and return a hint."""
         joints = self._joints
         if joints is None:
             return "no message from the arm yet"

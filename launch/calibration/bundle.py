@@ -59,9 +59,7 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms distance (pairs, 2) between detected and projected corners, left and
-        right, px.
-        """
+        """Return the rms corner residuals (pairs, 2) of left and right views, px."""
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
@@ -159,9 +157,7 @@ class _Reduced:
 
 
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
-    """Make the Levenberg-Marquardt equations, with the diagonal increased by the fraction
-    `damping`.
-    """
+    """Make the Levenberg-Marquardt equations with the diagonal times 1 + `damping`."""
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
     for pair in pairs:

@@ -140,9 +140,7 @@ def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: F
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square, or None without values (a partly visible board has no
-    diagonals).
-    """
+    """Return the root mean square, or None without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 

@@ -43,9 +43,7 @@ class DecodeError(FlexsheetError, ValueError):
 
 
 def make_patterns(width_px: int, height_px: int) -> list[Image]:
-    """Return the projector's images in order: each pattern with its inverse, then white, then
-    black.
-    """
+    """Return the projector's images: each pattern and its inverse, then white, black."""
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:

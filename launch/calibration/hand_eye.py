@@ -144,14 +144,14 @@ class BoardDetection:
 class PoseResidual:
     """Residual of one pose.
 
-    shift_m, turn_rad: difference between the flange poses from the images and from the joints.
+    shift_m, rotation_rad: difference between the flange poses from the images and from the joints.
     rms_px: of the corners, projected with the pose from the joints. reason: for excluding the pose;
     empty for an inlier.
     """
 
     name: str
     shift_m: float
-    turn_rad: float
+    rotation_rad: float
     rms_px: float
     reason: str
 
@@ -222,17 +222,17 @@ class _LinearizedPose:
     rms_px: float
 
 
-def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig, *, seed: int = 0) -> BaseFit:
+def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig) -> BaseFit:
     """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
 
-    seed: of the random initial values. The stereo rig is assumed exact: its errors affect the
+    The stereo rig is assumed exact: its errors affect the
     result and the fingertip equally, since the same rig measures both.
     """
     _check_count(detections)
     flanges = [forward(one.joints_rad) for one in detections]
     _check_rotations(flanges)
     boards = [_fit_board_pose(one, rig) for one in detections]
-    unknowns = _find_initial(flanges, boards, rig, seed=seed)
+    unknowns = _find_initial(flanges, boards, rig)
     used = _find_rough_inliers(_compute_discrepancies(unknowns, flanges, boards, rig))
     for attempt in range(2 * MAX_READMISSIONS):
         _check_outliers(detections, used)
@@ -368,11 +368,9 @@ def _linearize_pixels(
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def _find_initial(
-    flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig, *, seed: int
-) -> _Unknowns:
+def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig) -> _Unknowns:
     """Return the closed-form solution of all poses, or of the subset that fits most poses best."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     every = np.arange(len(flanges))
     subsets = [
         every,
@@ -635,7 +633,7 @@ def _make_result(
             PoseResidual(
                 name=detection.name,
                 shift_m=float(np.linalg.norm(one.measured[3:])),
-                turn_rad=float(np.linalg.norm(one.measured[:3])),
+                rotation_rad=float(np.linalg.norm(one.measured[:3])),
                 rms_px=one.rms_px,
                 reason="" if good else "inconsistent with the other poses",
             )

@@ -62,7 +62,7 @@ class Touch:
 class MarkerFit:
     """Fitted offset (3,) in the finger's frame, m, and its uncertainty.
 
-    residuals_m: (touches,) sizes. orientations: number of different ones.
+    residuals_m: distances (touches,). orientations: number of different orientations.
     """
 
     marker_from_pad_m: Floats

@@ -101,9 +101,7 @@ def make_svg(board: Board) -> str:
 
 
 def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as an image (h, w); pixels whose centre is in a black part are 0, others
-    255.
-    """
+    """Return the board as an image (h, w): 0 where a pixel's centre is black, else 255."""
     border = BORDER_SQUARES * board.square_m
     across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
     width, height = np.ceil(across * dots_per_m).astype(int)

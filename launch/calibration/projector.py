@@ -117,9 +117,7 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """Return the midpoints (n, 3) between the rays of pixels (n, 2), m, and the rays' distances
-    (n,).
-    """
+    """Return midpoints (n, 3) between the rays of pixels (n, 2), m, and their distances."""
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(

@@ -128,7 +128,7 @@ def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) ->
     ]
 
 
-NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_share")
+NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ratio")
 
 
 def fit_sheet_model(
@@ -155,7 +155,7 @@ def fit_sheet_model(
             modulus_thickness_n_per_m=float(np.exp(numbers[0])),
             slack_width_m=nominal.width_m * (1.0 + float(numbers[1])),
             cubic_ratio=float(np.exp(numbers[2])),
-            mooney_share=float(numbers[3]) if with_mooney else nominal.mooney_share,
+            mooney_ratio=float(numbers[3]) if with_mooney else nominal.mooney_ratio,
         )
 
     def residuals(numbers: Floats, used: Bools) -> Floats:
@@ -195,7 +195,7 @@ def fit_sheet_model(
         law.rubber.young_modulus_pa * law.rubber.thickness_m,
         law.rubber.width_m,
         law.cubic_ratio,
-        law.rubber.mooney_share,
+        law.rubber.mooney_ratio,
     )[:size]
     scale = (values[0], nominal.width_m, values[2], 1.0)[:size]
     scaled = tuple(float(d) * one for d, one in zip(deviations, scale, strict=True))

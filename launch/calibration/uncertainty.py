@@ -32,17 +32,15 @@ GROUPS = 20
 """Maximum number of jackknife refits; with more pairs, several are left out at a time."""
 
 
-def sample_working_plane(
-    rig: Floats, size: tuple[int, int], distance_m: float, *, across: int = 5
-) -> Floats:
+def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) -> Floats:
     """Sample points (n, 3), m, at depth `distance_m` in the left camera's frame.
 
-    They are a grid over the middle half of the left image's width and height, without points
-    outside the right image.
+    They are a grid of 5 x 5 over the middle half of the left image's width and height, without
+    points outside the right image.
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
-    fractions = np.linspace(0.25, 0.75, across)
+    fractions = np.linspace(0.25, 0.75, 5)
     pixels = np.stack(np.meshgrid(fractions * (width - 1), fractions * (height - 1)), axis=-1)
     slopes = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion)[:, 0]
     points = distance_m * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)

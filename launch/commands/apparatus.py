@@ -1,4 +1,4 @@
-"""`flexsheet apparatus`: draw what is true in the simulator, and show how it differs."""
+"""`flexsheet apparatus`: draw, show and compare true parameters of the simulation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flexsheet.launch.commands.output import (
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="What is true in the simulator, as differences from the scene.",
+    help="Draw and show true parameters of the simulation, as differences from the scene.",
 )
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"

@@ -314,7 +314,7 @@ def _print_verification(result: Verification) -> None:
     print_fields(
         [
             ("node", result.node),
-            ("input order", "as the node read it" if result.as_taken else "as recorded"),
+            ("input order", "as the node read it" if result.by_execution_log else "as recorded"),
             ("input messages", f"{result.messages_in}, missing {result.missing}"),
             ("output messages", result.messages_out),
             ("equal in both runs", "yes" if result.same_bytes else "NO"),

@@ -238,7 +238,7 @@ def capture(
     size = (scene.camera.width_px, scene.camera.height_px)
     run_interruptible(_record_poses(f"arm_{side}", recorder, size, places, run))
     if as_json:
-        print_json({"folder": str(output), "places": recorder.count})
+        print_json({"folder": str(output), "poses": recorder.count})
     else:
         words.print(f"{recorder.count} poses in {output}", markup=False)
 
@@ -367,18 +367,18 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
         rotation_std_rad=rotation_std_rad,
         covariance=fit.covariance,
         jackknife_ratio=fit.jackknife_ratio,
-        largest_change_m=float(np.linalg.norm(fit.leave_one_out[:, 3:], axis=1).max()),
-        largest_change_rad=float(np.linalg.norm(fit.leave_one_out[:, :3], axis=1).max()),
+        max_change_m=float(np.linalg.norm(fit.leave_one_out[:, 3:], axis=1).max()),
+        max_change_rad=float(np.linalg.norm(fit.leave_one_out[:, :3], axis=1).max()),
         corner_sigma_px=fit.corner_sigma_px,
         arm_sigma_m=fit.arm_sigma_m,
         arm_sigma_rad=fit.arm_sigma_rad,
-        places=tuple(
+        poses=tuple(
             ArmPoseFit(
                 name=one.name,
                 used=not one.reason,
                 reason=one.reason,
                 shift_m=one.shift_m,
-                turn_rad=one.turn_rad,
+                rotation_rad=one.rotation_rad,
                 rms_px=one.rms_px,
             )
             for one in fit.residuals
@@ -433,7 +433,7 @@ def _print_result(
         if base is None:
             continue
         lines += [f"  {side}:", f"    world_from_base: {_format_pose(base)}"]
-        outliers = [(one.name, one.reason) for one in base.places if not one.used]
+        outliers = [(one.name, one.reason) for one in base.poses if not one.used]
         for name, reason in [*blind[side], *outliers]:
             words.print(f"{side} arm, excluded {name}: {reason}", markup=False)
         moved_m, turned_rad = _compute_shift(base, scene, side)
@@ -442,13 +442,13 @@ def _print_result(
             "position_std_m": base.position_std_m,
             "rotation_std_rad": base.rotation_std_rad,
             "moved_from_scene_m": moved_m,
-            "turned_from_scene_rad": turned_rad,
-            "places_used": sum(one.used for one in base.places),
-            "places": len(base.places) + len(blind[side]),
+            "rotation_from_scene_rad": turned_rad,
+            "poses_used": sum(one.used for one in base.poses),
+            "poses": len(base.poses) + len(blind[side]),
             "left_out": dict([*blind[side], *outliers]),
             "jackknife_ratio": base.jackknife_ratio,
-            "largest_change_m": base.largest_change_m,
-            "largest_change_rad": base.largest_change_rad,
+            "max_change_m": base.max_change_m,
+            "max_change_rad": base.max_change_rad,
             "corner_sigma_px": base.corner_sigma_px,
             "arm_sigma_m": base.arm_sigma_m,
             "arm_sigma_rad": base.arm_sigma_rad,
@@ -467,7 +467,7 @@ def _print_result(
 
 def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
-        (f"{side} arm", f"{one['places_used']} of {one['places']} poses used"),
+        (f"{side} arm", f"{one['poses_used']} of {one['poses']} poses used"),
         (
             "uncertainty",
             f"{1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
@@ -476,12 +476,12 @@ def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "shift from scene",
             f"{1e3 * one['moved_from_scene_m']:.1f} mm, "
-            f"{math.degrees(one['turned_from_scene_rad']):.2f} degrees",
+            f"{math.degrees(one['rotation_from_scene_rad']):.2f} degrees",
         ),
         (
             "leave-one-out",
-            f"changes the base by up to {1e3 * one['largest_change_m']:.2f} mm, "
-            f"{math.degrees(one['largest_change_rad']):.3f} degrees; "
+            f"changes the base by up to {1e3 * one['max_change_m']:.2f} mm, "
+            f"{math.degrees(one['max_change_rad']):.3f} degrees; "
             f"jackknife ratio {one['jackknife_ratio']:.2f}",
         ),
         ("corners", f"{one['corner_sigma_px']:.3f} px"),

@@ -56,7 +56,7 @@ def marker(
     ] = None,
     apparatus: Annotated[
         str | None,
-        typer.Option(metavar="FILE|seed:N", help="What is true in the simulation, for --twin."),
+        typer.Option(metavar="FILE|seed:N", help="Apparatus of the simulation, for --twin."),
     ] = None,
     calibration_file: Annotated[
         Path | None,
@@ -114,7 +114,7 @@ def marker(
         standard_deviations_m=tuple(fit.standard_deviations_m.tolist()),
         point_offset_m=tuple(fit.point_offset_m.tolist()),
         residual_rms_m=fit.residual_rms_m,
-        residual_worst_m=float(fit.residuals_m.max()),
+        max_residual_m=float(fit.residuals_m.max()),
         touches=len(touches),
         orientations=fit.orientations,
     )
@@ -139,7 +139,7 @@ def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -
             (
                 "residuals",
                 f"{1e3 * calibration.residual_rms_m:.2f} mm rms, "
-                f"{1e3 * calibration.residual_worst_m:.2f} mm max",
+                f"{1e3 * calibration.max_residual_m:.2f} mm max",
             ),
         ]
     )

@@ -183,7 +183,7 @@ def make_calibration(
         modulus_thickness_n_per_m=numbers["modulus_thickness_n_per_m"],
         slack_width_m=numbers["slack_width_m"],
         cubic_ratio=numbers["cubic_ratio"],
-        mooney_share=numbers.get("mooney_share"),
+        mooney_ratio=numbers.get("mooney_ratio"),
         hysteresis_ratio=(
             None
             if hysteresis is None
@@ -196,10 +196,10 @@ def make_calibration(
             if not used
         ),
         residual_rms_ratio=fit.rms_ratio,
-        residual_worst_ratio=fit.worst_ratio,
-        least_stretch_ratio=min(stretches),
-        largest_stretch_ratio=max(stretches),
-        deepest_m=max(push.depth_m for push in pushes),
+        max_residual_ratio=fit.worst_ratio,
+        min_stretch_ratio=min(stretches),
+        max_stretch_ratio=max(stretches),
+        max_depth_m=max(push.depth_m for push in pushes),
         table=table,
     )
 
@@ -221,12 +221,12 @@ def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> l
 
 
 def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
-    mooney, hysteresis = calibration.mooney_share, calibration.hysteresis_ratio
+    mooney, hysteresis = calibration.mooney_ratio, calibration.hysteresis_ratio
     fitted = {
         "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
         "slack_width_m": calibration.slack_width_m,
         "cubic_ratio": calibration.cubic_ratio,
-        **({} if mooney is None else {"mooney_share": mooney}),
+        **({} if mooney is None else {"mooney_ratio": mooney}),
         **({} if hysteresis is None else {"hysteresis_ratio": hysteresis}),
     }
     if as_json:
@@ -236,7 +236,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
                 "rows": calibration.rows,
                 "left_out": [one.model_dump() for one in calibration.left_out],
                 "residual_rms_ratio": calibration.residual_rms_ratio,
-                "residual_worst_ratio": calibration.residual_worst_ratio,
+                "max_residual_ratio": calibration.max_residual_ratio,
                 "table": calibration.table is not None,
                 **{name: one.model_dump() for name, one in fitted.items()},
             }
@@ -246,7 +246,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
         "slack_width_m": ("slack width", 1e3, "mm"),
         "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
-        "mooney_share": ("Mooney weight", 1.0, ""),
+        "mooney_ratio": ("Mooney weight", 1.0, ""),
         "hysteresis_ratio": ("energy lost in a cycle", 100.0, "%"),
     }
     print_fields(
@@ -264,7 +264,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
             (
                 "residuals",
                 f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
-                f"{100 * calibration.residual_worst_ratio:.1f} % max",
+                f"{100 * calibration.max_residual_ratio:.1f} % max",
             ),
             ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
         ]

@@ -58,7 +58,7 @@ def demo(
                 "strokes": result.strokes,
                 "followed": result.followed,
                 "bag": str(result.bag),
-                "pictures": [str(image) for image in result.images],
+                "figures": [str(image) for image in result.images],
             }
         )
         return

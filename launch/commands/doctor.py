@@ -138,8 +138,8 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
             ("reachable", "yes" if result["reachable"] else "NO"),
             (
                 "reachable samples",
-                f"{100 * result['share']:.1f} % of {result['samples']}, "
-                + ", ".join(f"{side} {100 * one['share']:.1f} %" for side, one in arms.items()),
+                f"{100 * result['fraction']:.1f} % of {result['samples']}, "
+                + ", ".join(f"{side} {100 * one['fraction']:.1f} %" for side, one in arms.items()),
             ),
             *((f"{side} branch", ", ".join(one["branch"].values())) for side, one in arms.items()),
             (
@@ -155,7 +155,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
         (
             side,
             one["limit"],
-            f"{100 * one['share']:.1f} %",
+            f"{100 * one['fraction']:.1f} %",
             f"{math.degrees(one['first_tilt_rad']):.1f}°",
             f"{1e3 * one['first_depth_m']:.0f} mm",
         )
@@ -177,10 +177,10 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
                 f"{1e3 * one['depth_m']:.0f} mm",
             )
             for side, arm in arms.items()
-            for kind, one in arm["least_margins"].items()
+            for kind, one in arm["min_margins"].items()
         ],
     )
-    for path in result["broken_ways"]:
+    for path in result["blocked_paths"]:
         words.print(f"no path {path}", markup=False)
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
@@ -193,6 +193,6 @@ def _margin(value: float, unit: str) -> str:
         "rad": f"{math.degrees(value):.1f}°",
         "m": f"{1e3 * value:.0f} mm",
         "N": f"{value:.1f} N",
-        "share": f"{100 * (1.0 - value):.0f} % used",
+        "ratio": f"{100 * (1.0 - value):.0f} % used",
     }
     return shown[unit]

@@ -84,10 +84,10 @@ def compliance(
             [
                 (
                     f"{row['depth_mm']:.0f}",
-                    f"{row['wanted_n']:.3f}",
-                    f"{row['presented_n']:.3f}",
-                    f"{100 * (row['presented_n'] / max(row['wanted_n'], 1e-9) - 1):+.1f}",
-                    f"{row['retreat_mm']:.2f}",
+                    f"{row['target_n']:.3f}",
+                    f"{row['rendered_n']:.3f}",
+                    f"{100 * (row['rendered_n'] / max(row['target_n'], 1e-9) - 1):+.1f}",
+                    f"{row['normal_offset_mm']:.2f}",
                 )
                 for row in result["rows"]
             ],
@@ -95,7 +95,7 @@ def compliance(
         print_fields(
             [
                 ("stretch", f"{result['stretch_ratio']:.3f}"),
-                ("maximum edge force", f"{result['largest_edge_force_n']:.1f} N"),
+                ("maximum edge force", f"{result['max_edge_force_n']:.1f} N"),
                 ("advance per depth", f"{result['advance_per_depth']:.2f}"),
                 ("low-pass filter of the depth", f"{result['filter_ms']:.0f} ms"),
                 ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),

@@ -127,7 +127,7 @@ def stroke(
         typer.Option(
             min=1,
             max=1000,
-            help="Number of strokes, each with another seed in a graph of its own; gives the 95 % "
+            help="Number of strokes, each with another seed in a separate graph; gives the 95 % "
             "interval of the mean.",
         ),
     ] = 1,
@@ -301,7 +301,7 @@ def compliance(
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
     if as_json:
-        print_json({**result, "picture": str(image)})
+        print_json({**result, "figure": str(image)})
         return
     columns = ["position", "depth, mm", "object, N", "rendered, N", "error, %", "offset, mm"]
     cells = [
@@ -414,7 +414,7 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
-        columns += [f"+{each['lead_ms']:.0f} ms rms", "lag, ms"]
+        columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
     rows = []
     for result in results:
         now, *ahead = result["prediction"]

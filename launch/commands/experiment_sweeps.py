@@ -87,7 +87,7 @@ def robustness(
 ) -> None:
     """Evaluate drawn apparatuses: sheet, fingertip, image and force over many laboratories.
 
-    Each draw is a process of its own with a graph and a stroke. Image and force are evaluated at
+    Each draw is a separate process with a graph and a stroke. Image and force are evaluated at
     rest, without the graph. The same --output continues an interrupted sweep.
     """
     from flexsheet.launch.experiments import robustness as experiment
@@ -184,7 +184,7 @@ def sensitivity(
         )
         draw_sensitivity(result, image)
     if as_json:
-        print_json({**result, "picture": str(image)})
+        print_json({**result, "figure": str(image)})
         return
     metrics = list(result["tolerances"])
     largest = {

@@ -113,7 +113,7 @@ def explain(
 ) -> None:
     """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""
     found = [
-        {"code": one.code, "means": one.meaning, "what to do": one.remedy}
+        {"code": one.code, "meaning": one.meaning, "remedy": one.remedy}
         for one in find_entries(message)[:MAX_ENTRIES]
     ]
     if as_json:

@@ -31,8 +31,8 @@ ApparatusOption = Annotated[
     typer.Option(
         "--apparatus",
         metavar="FILE|seed:N",
-        help="What is true in the simulator: a file, or a draw such as seed:7,paper,calibrated; "
-        "default: the scene.",
+        help="True parameters of the simulation: a file, or a draw such as "
+        "seed:7,paper,calibrated; default: the scene.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

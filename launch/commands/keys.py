@@ -29,9 +29,7 @@ class KeyCommand(TyperCommand):
     """Command whose last argument may be a key that starts with "-"."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move a key that starts with "-" behind "--", so that click does not parse it as an
-        option.
-        """
+        """Insert "--" before a key that starts with "-", which click would parse."""
         keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
         if keys and "--" not in args:
             args = [one for one in args if one not in keys] + ["--", *keys]

@@ -215,13 +215,13 @@ class ForceSample:
 
     depth_m: float
     wanted_n: float
-    presented_n: float
+    rendered_n: float
     normal_offset_m: float
 
     @property
     def error_ratio(self) -> float:
         """Return the error relative to the object's force, at least FORCE_JND_FLOOR_N."""
-        return (self.presented_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
+        return (self.rendered_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
 
 
 class ForceReference:
@@ -247,7 +247,7 @@ class ForceReference:
         return ForceSample(
             depth_m=depth_m,
             wanted_n=self._interpolate_curve_n(at_ns, depth_m),
-            presented_n=pressed_n * self._history_ratio(at_ns, press),
+            rendered_n=pressed_n * self._history_ratio(at_ns, press),
             normal_offset_m=float((press.surface - middle) @ press.normal),
         )
 
@@ -357,7 +357,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     return {
         "rows": resting,
         "worst_percent": float(np.abs(errors).max()),
-        "aimed_percent": 100.0 * TARGET_ERROR_RATIO,
+        "target_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {
             "speed_mm_per_s": 1e3 * PUSH_M_PER_S,
@@ -365,7 +365,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
                 {
                     "depth_mm": 1e3 * one.depth_m,
                     "wanted_n": one.wanted_n,
-                    "presented_n": one.presented_n,
+                    "rendered_n": one.rendered_n,
                 }
                 for one in moving
             ],
@@ -382,7 +382,7 @@ def _evaluate_moving(
 ) -> Iterator[ForceSample]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
         sample = reference.evaluate(at_ns, press)
-        if max(sample.wanted_n, sample.presented_n) >= FORCE_JND_FLOOR_N:
+        if max(sample.wanted_n, sample.rendered_n) >= FORCE_JND_FLOOR_N:
             yield sample
 
 
@@ -391,7 +391,7 @@ def _make_row(press: Press, hold: RestInterval, samples: Sequence[ForceSample]) 
         "place": press.place,
         "depth_mm": 1e3 * hold.depth_m,
         "wanted_n": float(np.mean([one.wanted_n for one in samples])),
-        "presented_n": float(np.mean([one.presented_n for one in samples])),
+        "rendered_n": float(np.mean([one.rendered_n for one in samples])),
         "error_percent": 100.0 * float(np.mean([one.error_ratio for one in samples])),
-        "retreat_mm": 1e3 * float(np.mean([one.normal_offset_m for one in samples])),
+        "normal_offset_mm": 1e3 * float(np.mean([one.normal_offset_m for one in samples])),
     }

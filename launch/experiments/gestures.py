@@ -80,7 +80,7 @@ def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
     file = Path(name_or_file)
     if not file.suffix and not file.exists():
         raise ExperimentError(
-            f'"{name_or_file}" is neither a gesture nor a file; '
+            f'"{name_or_file}" is not a gesture or a file; '
             f"{did_you_mean(name_or_file, list(GESTURES))} Or give a CSV file of a recorded finger"
         )
     try:
@@ -283,7 +283,7 @@ def _evaluate_prediction(
     if len(at_ns) >= MIN_SAMPLES and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
         lag = estimate_lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
     return {
-        "lead_ms": lead_s * 1e3,
+        "horizon_ms": lead_s * 1e3,
         **error_mm(follower - leader),
         "lag_ms": None if lag is None else lag * 1e3,
     }

@@ -65,7 +65,7 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """Name what is evaluated, as in the results."""
+    """Evaluated metrics, by their names in the results."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"

@@ -150,13 +150,13 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
         if position == positions[0]:
             panel.plot(
                 [row["depth_mm"] for row in moving],
-                [row["presented_n"] for row in moving],
+                [row["rendered_n"] for row in moving],
                 ".",
                 color="0.5",
                 markersize=3,
                 label=f"rendered, moving at {result['moving']['speed_mm_per_s']:.0f} mm/s",
             )
-        rendered = [row["presented_n"] for row in rows]
+        rendered = [row["rendered_n"] for row in rows]
         panel.plot(depths[1:], rendered, "o", color="C1", label="rendered, at rest")
         panel.set_title(position)
         panel.set_xlabel("finger depth, mm")

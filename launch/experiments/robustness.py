@@ -40,7 +40,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the draw as the option --apparatus takes it."""
+    """Return the draw in the form of the option --apparatus."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 

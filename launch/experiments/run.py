@@ -158,7 +158,8 @@ def make_image_procedure(
 ) -> Procedure:
     """Make a procedure that images each case with each correction.
 
-    with_maps: also image the coordinate ramps, for dense error maps. with_eyes: also for each eye.
+    with_maps: also image the coordinate ramps, for dense error maps. with_eyes: also
+    image for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

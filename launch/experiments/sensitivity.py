@@ -1,4 +1,4 @@
-"""Measure what each tolerance of the apparatus does alone: what must be calibrated how well."""
+"""Measure the effect of each tolerance of the apparatus alone."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from flexsheet.nodes.twin.tolerance_table import (
 SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 
 
-class Evaluation(StrEnum):
-    """Name how a row was evaluated.
+class EvaluationKind(StrEnum):
+    """Method by which a row was evaluated.
 
     offline: at rest, without a graph. graph: in motion. not_measured: only motion shows it, and no
     graph ran. not_simulated: no simulator node uses it.
@@ -102,14 +102,14 @@ def select_parameters(names: str | None) -> list[str]:
     return selected
 
 
-def evaluation_of(parameter: str, *, with_graph: bool) -> Evaluation:
+def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:
     """Return how a parameter is evaluated."""
     if parameter in NOT_SIMULATED:
-        return Evaluation.NOT_SIMULATED
+        return EvaluationKind.NOT_SIMULATED
     if parameter not in TIMING:
-        return Evaluation.OFFLINE
+        return EvaluationKind.OFFLINE
     in_motion = with_graph and parameter.partition(".")[0] not in ("sheet", "eyes", "projector")
-    return Evaluation.GRAPH if in_motion else Evaluation.NOT_MEASURED
+    return EvaluationKind.GRAPH if in_motion else EvaluationKind.NOT_MEASURED
 
 
 def run_sensitivity(
@@ -140,7 +140,7 @@ def run_sensitivity(
     folder.mkdir(parents=True, exist_ok=True)
     trials: dict[str, dict[str, Any]] = {}
     for parameter, evaluation in evaluations.items():
-        if evaluation is Evaluation.OFFLINE:
+        if evaluation is EvaluationKind.OFFLINE:
             trials[_trial_name(parameter)] = {
                 **common,
                 "kind": "sensitivity",
@@ -148,7 +148,7 @@ def run_sensitivity(
                 "sigmas": SIGMAS,
                 "metrics": sorted(AFFECTED[parameter.partition(".")[0]]),
             }
-        elif evaluation is Evaluation.GRAPH:
+        elif evaluation is EvaluationKind.GRAPH:
             for sigma in SIGMAS:
                 name = _trial_name(parameter, sigma)
                 apparatus = deviate_apparatus(
@@ -157,7 +157,7 @@ def run_sensitivity(
                 file = folder / f"{name}.yaml"
                 write_file(file, format_apparatus(apparatus))
                 trials[name] = _stroke_trial(common, file)
-    if Evaluation.GRAPH in evaluations.values():
+    if EvaluationKind.GRAPH in evaluations.values():
         file = folder / "nominal.yaml"
         write_file(file, format_apparatus(nominal_apparatus(scene)))
         trials["nominal"] = _stroke_trial(common, file)
@@ -190,7 +190,7 @@ def _stroke_trial(common: dict[str, Any], apparatus_file: Path) -> dict[str, Any
     return {**common, "kind": "stroke", "apparatus": str(apparatus_file.resolve())}
 
 
-def _make_rows(parameter: str, evaluation: Evaluation, found: dict[str, Row]) -> list[Row]:
+def _make_rows(parameter: str, evaluation: EvaluationKind, found: dict[str, Row]) -> list[Row]:
     """Return a row per sigma; a metric without value is None.
 
     Offline, an effect is the change of each vector, pixel and push. In a graph it is the mean error
@@ -200,14 +200,14 @@ def _make_rows(parameter: str, evaluation: Evaluation, found: dict[str, Row]) ->
     for sigma in SIGMAS:
         row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
         row |= dict.fromkeys(Metric)
-        if evaluation is Evaluation.OFFLINE:
+        if evaluation is EvaluationKind.OFFLINE:
             effects = found[_trial_name(parameter)].get("effects")
             if effects is not None:
                 row |= dict.fromkeys(Metric, 0.0)
                 row |= {
                     key: value for key, value in effects[f"{sigma:g}"].items() if value is not None
                 }
-        elif evaluation is Evaluation.GRAPH:
+        elif evaluation is EvaluationKind.GRAPH:
             nominal, one = found["nominal"], found[_trial_name(parameter, sigma)]
             if "error" not in nominal and "error" not in one:
                 for metric, key in (

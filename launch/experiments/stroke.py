@@ -544,9 +544,7 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return arc lengths (n, 2) m around the cylinder of the sheet's contact line and of the
-    points.
-    """
+    """Return arc lengths (n, 2) m around the cylinder of contact line and points."""
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
     _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])

@@ -39,7 +39,7 @@ MAX_ERROR_CHARACTERS = 600
 
 
 class TrialError(ExperimentError):
-    """Raised in the process that waits for a trial which gave no row."""
+    """Raised in the parent process for a trial without a row."""
 
     code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."
@@ -180,7 +180,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
 
 
 def execute_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one trial in a process of its own, and return its row.
+    """Run one trial in a separate process, and return its row.
 
     Raises TrialError if the process fails, or if a stop was requested.
     """

@@ -48,7 +48,7 @@ def _tell(text: str) -> None:
 
 
 def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
-    """Stroke once in a graph of its own, and return the stroke's results with the flags."""
+    """Stroke once in a separate graph, and return the stroke's results with the flags."""
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:

@@ -52,7 +52,7 @@ class ArmModel:
 
 
 class ArmPair:
-    """Both arms: what the scene states of them, and what is true."""
+    """Assumed geometry of both arms from the scene, and their true geometry."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
         true_scene = apply_apparatus(scene, apparatus)

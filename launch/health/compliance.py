@@ -101,24 +101,24 @@ def compliance_result(
     rows = [
         {
             "depth_mm": 1e3 * float(depth),
-            "wanted_n": float(wanted_n),
-            "presented_n": float(rendered_n),
-            "retreat_mm": 1e3 * float(offset_m),
+            "target_n": float(target_n),
+            "rendered_n": float(rendered_n),
+            "normal_offset_mm": 1e3 * float(offset_m),
         }
-        for depth, wanted_n, rendered_n, offset_m in zip(
+        for depth, target_n, rendered_n, offset_m in zip(
             depths, target, rendered, offsets, strict=True
         )
     ]
     return {
         "scene": scene.name,
-        "law": law.name,
+        "force_model": law.name,
         "stretch_ratio": shown.stretch_ratio,
-        "largest_edge_force_n": float(shown.centre.edge_force_n.max()),
+        "max_edge_force_n": float(shown.centre.edge_force_n.max()),
         "advance_per_depth": shown.centre.advance_per_depth,
         "worst_error_ratio": float(np.abs(shown.centre.error_ratio).max()),
-        "aimed_ratio": TARGET_ERROR_RATIO,
+        "target_error_ratio": TARGET_ERROR_RATIO,
         "weber_ratio": [WEBER_RATIO, WEBER_RATIO_BARE],
-        "force_change_by_place_ratio": compute_force_uncertainty_ratio(
+        "force_change_by_position_ratio": compute_force_uncertainty_ratio(
             shown.centre, scene.tolerances.sheet_position_m
         ),
         "delay_ms": 1e3 * delay_s,

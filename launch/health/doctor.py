@@ -19,6 +19,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
 from flexsheet.launch.running.runs import find_orphans, is_free, list_live_runs, root
 from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
+from flexsheet.messages.notes import NodeNote
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
@@ -78,7 +79,9 @@ def check_load() -> Finding:
     else:
         text, busy = describe_pressure(pressure), pressure.busy
     if busy:
-        return Finding("load", "warning", f"this computer is busy: {text}", BUSY_REMEDY)
+        return Finding(
+            "load", "warning", f"this computer {NodeNote.COMPUTER_BUSY.phrase} {text}", BUSY_REMEDY
+        )
     return Finding("load", "ok", text)
 
 

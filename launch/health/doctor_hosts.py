@@ -30,7 +30,7 @@ from flexsheet.launch.running.host import (
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
-from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES, NodeNote, describe_self_check
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
@@ -325,7 +325,7 @@ def _check_clocks(
             )
     if not texts:
         return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
-    what = f"{'; '.join(texts)}; {1e3 * limit_s:g} ms are allowed"
+    what = f"{'; '.join(texts)}; {1e3 * limit_s:g} {NodeNote.CLOCK_UNCERTAIN.phrase}"
     if bad:
         return HostFinding(probe.host, "clocks", "failed", what, remedy)
     return HostFinding(probe.host, "clocks", "ok", what)
@@ -394,7 +394,7 @@ def find_rate_problem(port: PortStatus) -> str | None:
 OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
     NodeRole.CAMERA: ("camera", "check whether another program uses the camera: docs/camera.md"),
     NodeRole.RENDERER: (
-        "picture",
+        "image",
         f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
     ),
 }

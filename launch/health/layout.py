@@ -80,10 +80,6 @@ class ContactSample:
     twists_world: Floats
 
 
-FindContacts = Callable[[Scene], Sequence[ContactSample]]
-"""Function that samples the contacts of a scene's object."""
-
-
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
     """Sheet poses that the arms must reach, with tilt (n,), depth (n,) and contact (n, 3)."""
@@ -286,15 +282,10 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
     )
 
 
-def check_layout(
-    scene: Scene,
-    *,
-    progress: Progress = lambda text: None,
-    find_contacts: FindContacts = sample_contacts,
-) -> Layout:
+def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Layout:
     """Check both arms over the scene's working range, and find remedies if one fails."""
     progress("finding the contacts on the object")
-    samples = make_samples(scene, find_contacts(scene))
+    samples = make_samples(scene, sample_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
     left_reach = find_best_reach(left, right, samples.poses)
@@ -424,13 +415,13 @@ def make_layout_result(layout: Layout) -> dict[str, Any]:
     return {
         "scene": layout.scene.name,
         "reachable": layout.reachable,
-        "share": float(layout.reached.mean()),
-        "share_at_working_speed": float(layout.followed.mean()),
+        "fraction": float(layout.reached.mean()),
+        "fraction_at_working_speed": float(layout.followed.mean()),
         "speed_everywhere_m_per_s": layout.speed_m_per_s(1.0),
         "speed_at_half_m_per_s": layout.speed_m_per_s(0.5),
         "samples": len(layout.samples.poses),
         "arms": {side: _arm_result(layout, reach) for side, reach in layout.arms()},
-        "broken_ways": list(layout.blocked_paths),
+        "blocked_paths": list(layout.blocked_paths),
         "remedies": [{"what": one.what, **one.values} for one in layout.remedies],
     }
 
@@ -439,11 +430,11 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
     binding = reach.binding
     present = sorted(set(binding[binding >= 0].tolist()))
     return {
-        "share": float(reach.reachable.mean()),
-        "share_at_working_speed": float(reach.trackable.mean()),
+        "fraction": float(reach.reachable.mean()),
+        "fraction_at_working_speed": float(reach.trackable.mean()),
         "branch": reach.branch._asdict(),
         "binding": [_summarize_limit(layout, number, binding) for number in present],
-        "least_margins": find_min_margins(layout, reach),
+        "min_margins": find_min_margins(layout, reach),
     }
 
 
@@ -455,7 +446,7 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
     first = int(where[order[0]])
     return {
         "limit": LIMITS[number],
-        "share": float(len(where) / len(binding)),
+        "fraction": float(len(where) / len(binding)),
         "first_tilt_rad": float(samples.tilt_rad[first]),
         "first_depth_m": float(samples.depth_m[first]),
         "first_contact_world_m": samples.contact_world_m[first].tolist(),
@@ -472,8 +463,8 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
         "workspace": (("workspace",), "m"),
         "flange distance": (("flange distance",), "m"),
         "edge force": (("edge force",), "N"),
-        "joint speed": (SPEEDS, "share"),
-        "tool speed": (("tool speed",), "share"),
+        "joint speed": (SPEEDS, "ratio"),
+        "tool speed": (("tool speed",), "ratio"),
     }
     result: dict[str, dict[str, float | str]] = {}
     for kind, (limits, unit) in kinds.items():
@@ -498,7 +489,7 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    grid = _Grid.from_layout(layout)
+    grid = _TiltDepthGrid.from_layout(layout)
     present = {int(n) for _, reach in layout.arms() for n in set(_binding_limits(reach).tolist())}
     colors = {n: f"C{i % 10}" for i, n in enumerate(sorted(present - {-1}))}
     required = 1e3 * layout.scene.working_range.speed_m_per_s
@@ -524,24 +515,20 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index of the limit that excludes each sample (n,); -1 where the arm reaches
-    it.
-    """
+    """Return the index of each sample's limiting limit (n,); -1 within reach."""
     return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
-    """Cells over tilt and depth. rows, columns: cell of each sample (n,). frame: plot
-    options.
-    """
+class _TiltDepthGrid:
+    """Cells over tilt and depth. rows, columns: of each sample (n,). frame: plot options."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
     frame: dict[str, Any]
 
     @classmethod
-    def from_layout(cls, layout: Layout) -> _Grid:
+    def from_layout(cls, layout: Layout) -> _TiltDepthGrid:
         tilt, depth = layout.samples.tilt_rad, layout.samples.depth_m
         most = layout.scene.working_range.tilt_rad
         deepest = layout.scene.working_range.push_depth_m

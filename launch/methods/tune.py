@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
@@ -28,6 +28,14 @@ from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mea
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import DISK_ERRORS, make_write_error
+from flexsheet.messages.methods import (
+    Correction,
+    MarkerMethod,
+    SheetForceMethod,
+    SheetShapeMethod,
+    TrackingMethod,
+    TriangulationMethod,
+)
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Point, Trial
 
@@ -66,8 +74,9 @@ class Tunable:
     settings: Mapping[str, Setting]
 
 
-def _make_settings(*names: str) -> dict[str, Setting]:
-    return {name: name for name in names}
+def _make_settings(methods: object) -> dict[str, Setting]:
+    """Return the settings for all names of a literal type of `messages.methods`."""
+    return {name: name for name in get_args(methods)}
 
 
 def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
@@ -79,19 +88,19 @@ TUNABLES = (
         "marker",
         "marker",
         ("flexsheet.nodes.triangulator.benchmarks:MARKER",),
-        _make_settings("moments", "weighted_centroid", "subpixel_fit"),
+        _make_settings(MarkerMethod),
     ),
     Tunable(
         "triangulation",
         "triangulation",
         ("flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",),
-        _make_settings("dlt"),
+        _make_settings(TriangulationMethod),
     ),
     Tunable(
         "tracking",
         "tracking",
         ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _make_settings("none", "one_euro", "adaptive"),
+        _make_settings(TrackingMethod),
     ),
     Tunable(
         "sheet-force",
@@ -100,7 +109,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:SHEET_LAWS",
             "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
         ),
-        _make_settings("linear", "scaled", "table"),
+        _make_settings(SheetForceMethod),
     ),
     Tunable(
         "sheet-shape",
@@ -109,7 +118,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:QUICK_SHAPE",
             "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
         ),
-        _make_settings("four_triangles", "reduced_order"),
+        _make_settings(SheetShapeMethod),
     ),
     Tunable(
         "correction",
@@ -118,7 +127,7 @@ TUNABLES = (
             "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION",
             "flexsheet.launch.methods.benchmarks:CORRECTION",
         ),
-        _make_settings("none", "one_plane", "four_triangles", "two_pass"),
+        _make_settings(Correction),
     ),
     Tunable(
         "soft-body",

@@ -32,7 +32,7 @@ PROFILES = tuple(one.value for one in Profile)
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Hold the parts of `seed:N[,modern|paper][,calibrated]`."""
+    """Parts of `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile
@@ -98,7 +98,7 @@ def format_apparatus(apparatus: Apparatus) -> str:
     yaml.width = 4096
     text = io.StringIO()
     text.write(
-        f"# Apparatus of scene {apparatus.scene}, {apparatus.origin}: what is true in the\n"
+        f"# Apparatus of scene {apparatus.scene}, {apparatus.origin}: true parameters of the\n"
         "# simulator, as differences from `nominal`. See docs/apparatus.md.\n"
     )
     yaml.dump(apparatus.model_dump(mode="json", exclude_none=True), text)

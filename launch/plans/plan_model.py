@@ -160,7 +160,7 @@ class ResolvedGraph(StrictModel):
     scene_text: str
     scene: dict[str, Any] | None
     apparatus: dict[str, Any] | None = Field(
-        default=None, description="what is true in the simulator; null: the scene is"
+        default=None, description="true parameters of the simulation; null: those of the scene"
     )
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, ResolvedNode]

@@ -27,6 +27,7 @@ from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
@@ -174,7 +175,7 @@ class HostAgent:
     def _stop(self, reason: str) -> None:
         """Engage an e-stop received through the socket."""
         writer = tools_on(self._host)
-        self._on_problem(f"e-stop of {writer}, latched until it is reset")
+        self._on_problem(f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
     def _latch_estop(self, estop: EStop, header: Header) -> None:
@@ -184,7 +185,7 @@ class HostAgent:
             if self._latched is not None and header.writer in self._launchers:
                 return
             if self._latched is None:
-                self._on_problem(f"e-stop of {header.writer}, latched until it is reset")
+                self._on_problem(f"e-stop of {header.writer}, {NodeNote.ESTOP_KEPT.phrase}")
             # A stamp from the future would prevent every later reset.
             self._engage(estop, now_ns if clock_problem else min(header.source_ns, now_ns))
         elif header.writer in self._plan.may_reset_estop() and self._latched is not None:

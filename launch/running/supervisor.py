@@ -57,6 +57,7 @@ from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
@@ -537,7 +538,8 @@ class RunningGraph:
             return f"was not ready within {node.start_deadline_s:g} s"
         if hangs:
             self.hangs[node.name] += 1
-            return f"hung: no heartbeat for {node.liveness_s:g} s; its log contains the stacks"
+            missing = f"{NodeNote.NODE_HUNG.phrase} for {node.liveness_s:g} s"
+            return f"{missing}; its log contains the stacks"
         return describe_exit(code)
 
     async def _detect_hang(self, child: Child, node: ResolvedNode) -> bool:

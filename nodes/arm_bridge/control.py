@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, scale_speeds
@@ -290,7 +291,7 @@ class ArmControl:
         if arm_faults == (ArmFault.WATCHDOG,):
             # A cycle was late, and the arm has stopped automatically: restart from its position.
             self._restart_idle()
-            self.reason = "the arm's watchdog stopped it"
+            self.reason = NodeNote.ARM_WATCHDOG.phrase
             self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
         elif arm_faults and not self.faults:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
@@ -413,7 +414,7 @@ class ArmControl:
         if self._disarm_reason is None and (
             goal is None or not goal.overdue_s <= self._timeouts.stop_after_s
         ):
-            return "waiting for a sheet target" if goal is None else "no sheet target"
+            return "waiting for a sheet target" if goal is None else NodeNote.NO_SHEET_TARGET.phrase
         return None
 
     def _settle(self) -> None:
@@ -443,7 +444,7 @@ class ArmControl:
             self._must_idle = self._must_idle and measured is None
             return self._send("idle", self.commanded_rad, geometry, step_s)
         self.handle(Event.CONNECTED)
-        self._silence = "the other arm is silent" if other else "waiting for the other arm"
+        self._silence = NodeNote.OTHER_ARM_SILENT.phrase if other else "waiting for the other arm"
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
         self._check_measurement(geometry, other, measured)
@@ -523,7 +524,7 @@ class ArmControl:
         is_late = late_s > self._timeouts.hold_after_s
         self.handle(Event.LATE if is_late else Event.IN_TIME)
         if is_late:
-            self.reason = "sheet target or other arm late"
+            self.reason = NodeNote.TARGET_OR_ARM_LATE.phrase
         else:
             self._together = self._together or other.mode == "follow"
             self.reason = "" if self._together else "waits for the other arm"

@@ -295,7 +295,9 @@ class ModbusLink:
             raise ArmRefusedError(f"the arm refused the command: Modbus exception {code}")
         status = decode_status(answer.registers)
         if status.accepted != self._sequence:
-            raise ArmAnswerError(f"answer to command {status.accepted}, awaited {self._sequence}")
+            raise ArmAnswerError(
+                f"expected the answer to command {self._sequence}, found {status.accepted}"
+            )
         return status
 
     def close(self) -> None:

@@ -53,7 +53,7 @@ class ArmBridgeParameters(NodeParameters):
         default=0.06, description="longest extrapolation of a target"
     )
     max_tracking_error_rad: Positive = Field(
-        default=0.12, description="largest lag of a measured joint behind its command"
+        default=0.12, description="maximum lag of a measured joint behind its command"
     )
     arming: Literal["manual", "auto"] = Field(
         default="manual",

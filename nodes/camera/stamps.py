@@ -19,7 +19,7 @@ period apart would change the pairing repeatedly, and drop a frame each time."""
 
 
 class StampCheck:
-    """Check whether a driver's stamps are readings of this host's monotonic clock.
+    """Check of a driver's stamps: whether they are readings of this host's monotonic clock.
 
     A stamp is plausible if it is at most a second before the frame's arrival, not after it, and
     after the previous stamp.  Stamps of another clock differ by hours or years.  The caller drops a

@@ -194,9 +194,7 @@ def make_page_logger() -> logging.Logger:
 
 
 def shorten_traceback(record: logging.LogRecord) -> bool:
-    """Replace a record's traceback by its last line; return True, so that the record is
-    logged.
-    """
+    """Replace a record's traceback by its last line; return True, so that it is logged."""
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
         record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
@@ -205,9 +203,7 @@ def shorten_traceback(record: logging.LogRecord) -> bool:
 
 
 class PageConnection(ServerConnection):
-    """Connection that answers malformed HTTP with status 400, where websockets logs a
-    traceback.
-    """
+    """Connection that answers malformed HTTP with status 400 instead of a traceback."""
 
     refused = False
 

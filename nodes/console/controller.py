@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import resolve_method
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
@@ -364,8 +365,8 @@ class ConsoleController:
         """Reset the e-stop; ReleaseError if the graph would ignore the reset."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
-                f"this console's host may not reset an e-stop; use {' or '.join(others)}, or "
-                "set may_reset_estop of this host in the launch file"
+                f"this console's host {NodeNote.MAY_NOT_RESET.phrase}; "
+                f"use {' or '.join(others)}, or set may_reset_estop of this host in the launch file"
             )
         self.stopped = None
         self._publish(EStop(engaged=False, reason="reset at the console"))

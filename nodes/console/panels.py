@@ -175,9 +175,7 @@ def make_topics_table(
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Describe the position of the fingertip, or why it is unknown, in a box of constant
-    height.
-    """
+    """Describe the fingertip's position, or why it is unknown, in a box of constant height."""
     return f'<div class="fs-finger">{make_paragraph(_finger(fingertip))}</div>'
 
 

@@ -55,9 +55,7 @@ class SurfacePicker:
         )
 
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
-        """Return the point `depth_m` below the surface point nearest to `near`; negative:
-        above.
-        """
+        """Return the point `depth_m` below the surface near `near`; negative: above it."""
         found = self._shape.closest(apply(self._object_from_world, near))
         inside = found.point - depth_m * found.normal
         return self._within(apply(self._world_from_object, inside))

@@ -106,8 +106,8 @@ def make_sheet_triangles() -> Indices:
 def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
     """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet.
 
-    points: of `compute_sheet_points`. A miss is NaN. Method of Moeller and Trumbore (1997), on the
-    triangles around the vertex whose direction is nearest to the ray.
+    points: from `compute_sheet_points`. A miss gives NaN. Method of Moeller and Trumbore
+    (1997), on the triangles around the vertex whose direction is nearest to the ray.
     """
     direction = towards - origin
     directions = points - origin

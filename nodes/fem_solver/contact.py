@@ -161,8 +161,7 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 
 
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
-    """Return the depths (m) of a force curve: dense up to `linear_m`, then geometric up to the
-    maximum push."""
+    """Return the depths (m) of a force curve, dense up to `linear_m`, then geometric."""
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
         linear_m, max_push_m, max(2, round(4 * np.log2(max_push_m / linear_m)) // 2 + 1)
@@ -191,12 +190,10 @@ class SphereContact:
         *,
         young_modulus_pa: float,
         finger_radius_m: float,
-        penalty_ratio: float = PENALTY_RATIO,
     ) -> None:
         """Sample the contact points of the skin.
 
         shape: the smooth surface that the response's triangles approximate, in the mesh frame.
-        penalty_ratio: see `PENALTY_RATIO`.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -211,7 +208,7 @@ class SphereContact:
         self._normals = found.normal.reshape(len(corners), -1, 3)
         sides = corners[:, 1:3] - corners[:, :1]
         areas = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-        penalty = penalty_ratio * young_modulus_pa / finger_radius_m
+        penalty = PENALTY_RATIO * young_modulus_pa / finger_radius_m
         self._penalty = penalty * areas / len(self._shape)
         self._centres = corners.mean(axis=1)
         self._size = np.linalg.norm(corners - self._centres[:, None], axis=2).max(axis=1)
@@ -486,8 +483,7 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
-        """Return the skin displacement (3 s,) under forces (k,), N, for some rows (k,) of a
-        table."""
+        """Return the skin displacement (3 s,) under forces (k,), N, for k rows of a table."""
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
         # Slices of consecutive rows avoid the copy that fancy indexing would make.

@@ -73,8 +73,7 @@ class EquilibriumState:
 
 @dataclass(frozen=True, slots=True)
 class _StickState:
-    """Sticking contact points (k,), their offsets from the sphere's centre and the skin normals,
-    both (k, 3)."""
+    """Sticking points (k,) with offsets from the sphere's centre and skin normals (k, 3)."""
 
     points: Ints
     offsets: Floats

@@ -51,8 +51,7 @@ class SurfaceLocator:
         self._sides, self._inverse = sides, gram @ sides
 
     def weights(self, points: Floats) -> tuple[Ints, Floats]:
-        """Return nodes and shape functions, both (q, 6), at the skin points nearest to points (q,
-        3)."""
+        """Return nodes and shape functions (q, 6) at the skin nearest to points (q, 3)."""
         _, near = self._tree.query(points, k=CANDIDATES)
         offset = points[:, None] - self._origin[near]
         local = np.einsum("qkij,qkj->qki", self._inverse[near], offset)

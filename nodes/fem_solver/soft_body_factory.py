@@ -62,7 +62,7 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Return the soft body with each available method, the best first.
 
-        Errors as `load_or_compute` and `build_scene_body`.
+        Raises the errors of `load_or_compute` and `build_scene_body`.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0

@@ -17,6 +17,9 @@ def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Flo
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
+MAX_ITERATIONS = 20
+
+
 def distort(normalized: Floats, distortion: Floats) -> Floats:
     """Distort undistorted normalized image coordinates (..., 2).
 
@@ -35,15 +38,15 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
     )
 
 
-def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) -> Floats:
+def undistort(distorted: Floats, distortion: Floats) -> Floats:
     """Invert `distort` by fixed-point iteration; normalized coordinates (..., 2).
 
-    The iteration stops when no coordinate changes by more than 1e-13, or after `iterations`. It
+    The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`. It
     converges where the distortion's slope is well below one, as inside the image of usual lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
-    for _ in range(iterations):
+    for _ in range(MAX_ITERATIONS):
         x, y = point[..., 0], point[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -8,14 +8,14 @@ from statistics import median
 INTERVALS = 15
 MIN_INTERVALS = 8
 MAX_PERIOD_S = 0.1
-"""Longest period that is believed; longer intervals are interruptions."""
+"""Maximum period; longer intervals are interruptions."""
 
 TOLERANCE_RATIO = 0.2
-"""Deviation from the scene's period up to which the scene's counts."""
+"""Maximum deviation at which the scene's period is returned."""
 
 
 class MeasuredPeriod:
-    """Hold the scene's period until the messages show another one."""
+    """Estimate of a message period, initially the scene's."""
 
     def __init__(self, scene_period_s: float) -> None:
         self._scene_period_s = scene_period_s

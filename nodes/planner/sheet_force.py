@@ -47,13 +47,13 @@ def make_force_model(
     if calibration is None:
         return ScaledSheetModel(rubber)
     refuse_other_sheet(calibration, sheet)
-    mooney = calibration.mooney_share
+    mooney = calibration.mooney_ratio
     model = make_model(
         rubber,
         modulus_thickness_n_per_m=float(calibration.modulus_thickness_n_per_m.value),
         slack_width_m=float(calibration.slack_width_m.value),
         cubic_ratio=float(calibration.cubic_ratio.value),
-        mooney_share=0.0 if mooney is None else float(mooney.value),
+        mooney_ratio=0.0 if mooney is None else float(mooney.value),
     )
     table = calibration.table
     if table is None:
@@ -151,7 +151,7 @@ def _trials(
                 continue
             yield Trial(
                 method=model.name,
-                case={"stretch": stretch, "depth_mm": 1e3 * depth, "place": label},
+                case={"stretch": stretch, "depth_mm": 1e3 * depth, "position": label},
                 run=partial(
                     model.evaluate,
                     stretch,

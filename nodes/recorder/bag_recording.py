@@ -17,6 +17,7 @@ from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.files import free_bytes
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
@@ -145,7 +146,7 @@ class BagRecording:
         """Close the bag after an error, and report the error."""
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self.note = f"NOT RECORDING: {error}"
+        self.note = f"{NodeNote.NOT_RECORDING.phrase} {error}"
         self._on_error(error)
         if bag is not None:
             # The disk error is already reported, and a truncated bag can be read.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input
@@ -62,7 +63,7 @@ class SheetPosePredictor:
         if sheet is None:
             fresh = age_s <= self._max_age_s
             why = "implausible flange poses" if fresh else f"arm poses {age_s:.2f} s old"
-        self.note = f"{why}: keeping the last valid sheet plane"
+        self.note = f"{why}: {NodeNote.LAST_SHEET_PLANE.phrase}"
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
         return self._sheet

@@ -108,7 +108,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 "membrane": True,
             }
         truth = reference(scene, *edges, tip)
-        case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "place": where}
+        case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "position": where}
         for method, shape in shapes.items():
             yield Trial(
                 method=method,

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.triangulator.filters import Estimate
+from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuro, Unfiltered
 
 Floats = NDArray[np.float64]
 Model = tuple[float, float, float, float]
@@ -46,7 +47,7 @@ SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
 Predictions in between use weights in between."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
-"""Age up to which earlier states are kept."""
+"""Maximum age of stored earlier states."""
 
 STAMP_JITTER_NS = 2_000_000
 """Time by which a scored age may fall short of its horizon."""
@@ -283,7 +284,7 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """Hold the bank's states (models, 5, 3) at one time, and what it has learnt of the hand.
+    """States of the filter bank (models, 5, 3) at one time, with the learnt weights.
 
     covariance: (3, 3) m^2 of the newest measured point, in the world frame.
     axes: columns (3, 3) in the world frame along which the measurement noise is uncorrelated; the
@@ -444,7 +445,7 @@ def _prediction_errors(
     """Return the errors (scored horizons, 3, models) m with which earlier states predicted a point.
 
     The first are the innovations (models, 3) after the newest state.  Each other horizon takes the
-    newest state that is as old, else the oldest.  The second result holds their ages in ms.
+    newest state that is as old, else the oldest.  The second result contains their ages in ms.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -488,3 +489,11 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         velocity_variance=mix @ estimate.velocity_variance,
     )
     return rotated, variances
+
+
+TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
+    "none": Unfiltered,
+    "one_euro": OneEuro,
+    "adaptive": AdaptiveBank,
+}
+"""Filters by name, made for a finger's maximum speed (m/s)."""

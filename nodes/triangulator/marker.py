@@ -408,7 +408,8 @@ def subpixel_fit(
 MAX_ELLIPSE_MISFIT = 0.035
 MAX_ODD_MISFIT = 0.03
 """Bounds on an ellipse's residuals and on their odd part, as a fraction of the marker's height.
-They are tighter than a disc's: an ellipse fits a partly covered disc well, but for the odd part."""
+They are tighter than a disc's, because an ellipse fits a partly covered disc well, except for the
+odd part."""
 
 
 def fit_flat_markers(

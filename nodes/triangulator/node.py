@@ -21,6 +21,7 @@ from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.data_association import DataAssociation
 from flexsheet.nodes.triangulator.fingertip import (
     DetectorConfig,
@@ -33,7 +34,6 @@ from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.skew import compensate_detection_skew
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,

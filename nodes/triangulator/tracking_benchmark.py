@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 
 Floats = NDArray[np.float64]
@@ -123,7 +123,7 @@ def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]])
                 for method in TRACKING_METHODS:
                     just_measured = method == "none" and horizon_s == 0.0
                     in_range = method not in WITHOUT_VELOCITY or motion.resting or just_measured
-                    case: Case = {"motion": name, "lead_ms": round(1e3 * horizon_s)}
+                    case: Case = {"motion": name, "horizon_ms": round(1e3 * horizon_s)}
                     trial = _trial(scene, method, case, seen, horizon_s, in_range=in_range)
                     yield replace(trial, in_scene=in_scene)
 

@@ -168,7 +168,7 @@ def decelerate(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
 
 @dataclass(slots=True)
 class Servo:
-    """Move six joints towards set-points like critically damped second-order servos.
+    """Six joint servos of second order with critical damping.
 
     lag_s: lag of a joint behind a set-point of constant velocity.
     joints_rad: positions of the encoders at the motors.
@@ -209,7 +209,7 @@ class Servo:
 
 
 class Controller:
-    """Simulate one arm's controller: it checks command blocks and answers with its status.
+    """Simulated controller of one arm, which checks command blocks and answers with its status.
 
     It rejects an invalid new command (magic, version, CRC, mode, sequence) by a Modbus exception.
     It enters its fault state, where it brakes and stops, for joints out of range or not finite, for
@@ -354,7 +354,7 @@ class Controller:
 
 
 class ArmServer:
-    """Serve a controller by Modbus TCP."""
+    """Modbus TCP server of a controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]

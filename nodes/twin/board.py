@@ -53,7 +53,7 @@ class BoardError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Hold the uneven light on a board: its gradient across the image, and the room's texture."""
+    """Uneven light on a board: its gradient across the image, and the room's texture."""
 
     gain: float
     slope_x: float
@@ -62,7 +62,7 @@ class Light:
 
 
 class TwinBoard:
-    """Show a board to a rig with the true lenses; noise and light come from `seed`."""
+    """Board in front of a rig with the true lenses; `seed` determines noise and light."""
 
     def __init__(
         self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None
@@ -190,8 +190,7 @@ class TwinBoard:
         return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
-        """Return the level of the board where each ray meets its plane, and the fraction that meets
-        it."""
+        """Return the board's level on each ray, and the fraction of the ray that meets it."""
         board = self.board
         plane_from_ray = np.linalg.inv(eye_from_board[:3, [0, 1, 3]]).astype(np.float32)
         on_plane = rays @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]

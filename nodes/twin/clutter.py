@@ -25,11 +25,10 @@ FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
 
 
 class Trajectory(Protocol):
-    """Give a position over simulation time."""
+    """Interface of a position over simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the world position (3,), or that relative to the fingertip for a carried
-        object."""
+        """Return the position (3,), world; of a carried object relative to the fingertip."""
         ...
 
 
@@ -43,7 +42,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Move at constant velocity through `start` at time 0."""
+    """Motion at constant velocity through `start` at time 0."""
 
     start: Point
     velocity_m_per_s: Point
@@ -68,7 +67,7 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """Hold skin: a tapered capsule between two points, behind the finger and its marker."""
+    """Skin: a tapered capsule between two points, behind the finger and its marker."""
 
     start: Trajectory
     end: Trajectory
@@ -80,7 +79,7 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class SecondMarker:
-    """Hold a bead like the marker."""
+    """Bead that resembles the marker."""
 
     path: Trajectory
     radius_m: float = MARKER_RADIUS_M
@@ -91,7 +90,7 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """Hold a lamp's reflection: a small spot whose light adds to the background.
+    """Reflection of a lamp: a small spot whose light adds to the background.
 
     It saturates above some 255.  A curved mirror often shows it in one view only.
     """
@@ -105,7 +104,7 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Hold a dark or skin-coloured capsule of constant level in front of everything else."""
+    """Dark or skin-coloured capsule of constant level in front of everything else."""
 
     start: Trajectory
     end: Trajectory
@@ -117,7 +116,7 @@ class Occluder:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Hold the lit rubber sheet behind the finger, at rest in the plane z = 0, with its grain.
+    """Lit rubber sheet behind the finger, at rest in the plane z = 0, with its grain.
 
     contrast: standard deviation of the grain's levels.
     """
@@ -131,7 +130,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """Hold all clutter; rendered in this order, with the finger and its marker before `markers`."""
+    """All clutter; rendered in this order, with the finger and its marker before `markers`."""
 
     sheet: Sheet | None = None
     limbs: tuple[Capsule, ...] = ()

@@ -38,7 +38,7 @@ COARSE_LIGHT = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ErrorMap:
-    """Hold the error of each seen point.
+    """Error map: the error of each visible point.
 
     errors_m: (rows, columns, 2), seen minus expected position, x right, y up; NaN where nothing is
     seen.

@@ -24,7 +24,7 @@ from flexsheet.messages.scene import Projector, Scene
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
-from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
@@ -54,7 +54,7 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised when an image does not show what is to be measured; the message says what is
+    """Raised when an image does not show what is to be measured; the message states what is
     missing."""
 
     code = "not-measurable"
@@ -63,7 +63,7 @@ class NotMeasurableError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Hold a fan of rays: from `origin` (3,) along first + column * right + row * down, each
+    """Fan of rays: from `origin` (3,) along first + column * right + row * down, each
     (3,)."""
 
     origin: Floats
@@ -81,7 +81,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Hold the first hits of a fan of rays.
+    """First hits of a fan of rays.
 
     triangle: (height, width), -1 where nothing is hit.
     inverse_range: (height, width), one over the ray parameter of the hit, 0 without a hit.
@@ -134,7 +134,7 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """Map between projector pixels and points of the true sheet."""
+    """Projector that maps between its pixels and points of the true sheet."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """vertices: (vertices, 3) of the sheet, world.  triangles: (triangles, 3)."""
@@ -195,8 +195,7 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return world points (n, 3) of the sheet that pixels (n, 2) light first, and which
-        exist."""
+        """Return the sheet's points (n, 3) that pixels (n, 2) light, and which exist."""
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
         limit = np.array([self._rays.width - 1, self._rays.height - 1])
@@ -355,7 +354,7 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """Find the largest bright blob of an image, and where lines through it begin and end."""
+    """Largest bright blob of an image, and the ends of lines through it."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -378,8 +377,7 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return where the object begins and ends (rows) on a column, interpolated between
-        columns."""
+        """Return the object's first and last row on a column, interpolated over columns."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
@@ -464,7 +462,7 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
-    """Hold the true state at which a frame was shown.
+    """True state at which a frame was shown.
 
     world_from_flange_left, world_from_flange_right: (4, 4).
     finger_tip: (3,) or None.
@@ -473,7 +471,7 @@ class EyeSituation:
     """
 
     scene: Scene
-    rubber: Rubber
+    rubber: TrueRubber
     world_from_flange_left: Floats
     world_from_flange_right: Floats
     finger_tip: Floats | None
@@ -524,7 +522,7 @@ def true_sheet(
     world_from_flange_right: Floats,
     finger_tip: Floats | None,
     *,
-    rubber: Rubber,
+    rubber: TrueRubber,
     friction_coefficient: float | None = None,
 ) -> DeformedSheet:
     """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or

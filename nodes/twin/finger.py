@@ -32,7 +32,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the finger cannot follow; the message says why and what to change."""
+    """Raised for a path that the finger cannot follow; the message contains the remedy."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the row that the text names."
@@ -40,7 +40,7 @@ class FingerPathError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SineSum:
-    """Hold band-limited noise: a sum of sines per axis with standard deviation 1, for all times."""
+    """Band-limited noise: a sum of sines per axis with standard deviation 1, for all times."""
 
     frequencies_hz: Floats
     phases_rad: Floats
@@ -63,7 +63,7 @@ class SineSum:
 
 
 class Path(Protocol):
-    """Define the steady part of a finger's motion: at rest before and after the path."""
+    """Interface of the steady part of a finger's motion, at rest before and after the path."""
 
     @property
     def points(self) -> Floats: ...
@@ -88,7 +88,7 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """Follow a polyline in time, its corners rounded by a moving mean of +-ROUNDING_S.
+    """Polyline in time, its corners rounded by a moving mean of +-ROUNDING_S.
 
     The mean of a polyline is exact through its integral.  It never leaves the polyline's hull,
     never exceeds its speed, and has a continuous velocity.  It is meant for paths of a few points:
@@ -101,8 +101,7 @@ class RoundedLines:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> RoundedLines:
-        """Make the path through points (n, 3) at increasing times (n,), the first taken as time
-        0."""
+        """Make the path through points (n, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
         areas = 0.5 * (points[1:] + points[:-1]) * np.diff(times)[:, None]
         integral = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
@@ -146,7 +145,7 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """Follow a cubic spline through samples of a motion, at rest at both ends.
+    """Cubic spline through samples of a motion, at rest at both ends.
 
     Between samples `h` apart its error is some h^4 / 100 times the motion's fourth derivative.
     This is below a micrometre for a reach of 10 mm in 50 ms that is sampled every 4 ms.
@@ -159,8 +158,7 @@ class SmoothPath:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> SmoothPath:
-        """Make the path through points (n >= 2, 3) at increasing times (n,), the first as time
-        0."""
+        """Make the path through points (n >= 2, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
         spline = CubicSpline(times, points, bc_type="clamped")
         return SmoothPath(times, points, spline, spline.derivative())
@@ -219,7 +217,7 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FingerState:
-    """Hold the fingertip at one time; `path_time_s` is negative during the reach to the path."""
+    """Fingertip at one time; `path_time_s` is negative during the reach to the path."""
 
     position: Floats
     velocity: Floats
@@ -313,8 +311,7 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position and velocity without unsteadiness, and the (wander, tremor)
-        amplitudes."""
+        """Return the steady position and velocity, and the wander and tremor amplitudes."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -350,8 +347,7 @@ class FingerMotion:
 
 
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
-    """Return the minimum-jerk rise from 0 to 1 over s = 0..1 and its slope (Flash and Hogan
-    1985)."""
+    """Return the minimum-jerk rise from 0 to 1 and its slope (Flash and Hogan 1985)."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 
 

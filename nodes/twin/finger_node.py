@@ -27,7 +27,7 @@ JITTER_STREAM = 1
 
 
 class TwinFingerParameters(SimulatorParameters):
-    """Hold the parameters; `seed` determines the finger's unsteadiness and the camera's noise."""
+    """Parameters; `seed` determines the finger's unsteadiness and the camera's noise."""
 
     seed: int = Field(default=2006, description="not that of any chart")
     rest_world_m: tuple[float, float, float] = Field(
@@ -118,8 +118,7 @@ class TwinFingerNode(Node):
             self._follow(path)
 
     def _follow(self, path: FingerPath) -> None:
-        """Switch to a path now; a path that cannot be followed raises an error and changes
-        nothing."""
+        """Switch to a path now; an infeasible path raises an error and changes nothing."""
         now_ns = self.clock.now_ns()
         self.motion = self.motion.followed_by(
             (now_ns - self.motion_from_ns) * 1e-9,
@@ -147,7 +146,7 @@ class TwinFingerNode(Node):
     def expose(self, middle_ns: int) -> StereoPair:
         """Render the image pair with the stamp `middle_ns`, and publish the truth at that time.
 
-        The true exposure differs from the stamp as the apparatus says.  Needs a scene.
+        The true exposure differs from the stamp as the apparatus states. Requires a scene.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()

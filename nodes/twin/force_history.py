@@ -39,7 +39,7 @@ CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
 
 
 class ForceHistory:
-    """Hold the history of one force of the sheet.
+    """History of one force of the sheet.
 
     hysteresis_ratio: share of the loading's energy that a cycle from zero force loses, the part
         lost by creep included.

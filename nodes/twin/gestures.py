@@ -264,9 +264,7 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """Return the angle (n,) rad of some rounds, with start and end at rest over a quarter of a
-    round.
-    """
+    """Return the angle (n,) rad of some rounds, which start and end at rest."""
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
     return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])

@@ -19,7 +19,7 @@ MIN_SWAY_FREQUENCY_RATIO = 0.1
 
 @dataclass(frozen=True, slots=True)
 class HeadSway:
-    """Hold a motion of standard deviation `sway_m` per axis, a function of time."""
+    """Motion of standard deviation `sway_m` per axis, a function of time."""
 
     sway_m: float
     noise: SineSum

@@ -59,8 +59,8 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class Rubber:
-    """Describe the sheet at rest.
+class TrueRubber:
+    """Dimensions and material of the true sheet at rest.
 
     width_m: between the clamps when slack; height_m: along them.
     density_kg_per_m3: 0 for a sheet without weight.
@@ -78,7 +78,7 @@ class Rubber:
 
 @dataclass(frozen=True, slots=True)
 class DeformedSheet:
-    """Hold the equilibrium of the sheet.
+    """Equilibrium of the sheet.
 
     rest_m: (rows, columns, 2) from the left bottom corner.
     positions: (rows, columns, 3) world.
@@ -108,9 +108,7 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """Return (cells + 1,) coordinates from 0 to `length_m`, finest at `focus_m`, or uniform for
-    None.
-    """
+    """Return (cells + 1,) coordinates up to `length_m`, finest at `focus_m`; None: uniform."""
     if focus_m is None:
         return np.linspace(0.0, length_m, cells + 1)
     samples = np.linspace(0.0, length_m, 4001)
@@ -143,7 +141,7 @@ class _Mesh:
     midway between their neighbours.
     """
 
-    def __init__(self, rubber: Rubber, x: Floats, y: Floats, slack_tension: float) -> None:
+    def __init__(self, rubber: TrueRubber, x: Floats, y: Floats, slack_tension: float) -> None:
         self.slack_tension = slack_tension
         columns, rows = len(x), len(y)
         self.shape = (rows, columns)
@@ -236,9 +234,7 @@ class _Mesh:
         return total - self.load_n.ravel(), blocks.reshape(elements, 27, 27)
 
     def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
-        """Return the sparse stiffness of the free coordinates; contact: (nodes, 3, 3) diagonal
-        blocks.
-        """
+        """Return the sparse free stiffness; contact: (nodes, 3, 3) diagonal blocks."""
         free = stiffness.ravel()[self._is_free]
         values = np.bincount(self._slot, free, minlength=len(self._unique))
         for node in np.nonzero(contact.any(axis=(1, 2)))[0]:
@@ -312,7 +308,7 @@ def relaxed_stress(
 
 
 class _Finger:
-    """Keep nodes out of a rigid sphere by a penalty; nodes that it has touched stick to it.
+    """Rigid sphere that nodes cannot enter (penalty); touched nodes stick to it.
 
     stuck: (nodes,) nodes that stick, each at its position in `anchor` (nodes, 3).
     friction_coefficient: Coulomb's, or None for nodes that never slip.
@@ -386,7 +382,7 @@ class _Finger:
 
 
 def solve(
-    rubber: Rubber,
+    rubber: TrueRubber,
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
     *,
@@ -497,7 +493,7 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
     return nodes
 
 
-def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber) -> Floats:
+def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
     """Return (nodes,) 1 at the focus, decreasing to 0 at the distance of the clamps."""
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus

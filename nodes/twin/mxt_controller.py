@@ -57,7 +57,7 @@ class MxtError(FlexsheetError):
 
 
 class MxtController:
-    """Simulate one arm's controller, which takes and answers one packet per cycle.
+    """Simulated controller of one arm, which receives and answers one packet per cycle.
 
     An error ends its program: the arm brakes, and no packet is answered until `restart`.  Errors
     are: a move without a first packet that only asks; an unsupported data type; numbers that are
@@ -207,7 +207,7 @@ class MxtController:
             self._moved = False
 
     def _move(self, send_type: int, data: Floats, flags: int) -> None:
-        """Take a set-point; raise MxtError for one that ends the program."""
+        """Accept a set-point; raise MxtError for one that ends the program."""
         if self._master is None:
             raise MxtError("a move ahead of the first packet")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
@@ -289,7 +289,7 @@ def structure_flags(joints_rad: Floats) -> int:
 
 
 class MxtServer:
-    """Serve a controller on a UDP port."""
+    """UDP server of a controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Nail:
-    """Hold the marker and the direction of the finger, all in the world's directions.
+    """Marker and the direction of the finger, all in the world's directions.
 
     marker_offset_m: (3,) from the fingertip (the pad's contact point) to the marker's centre.
     marker_normal: (3,) of a flat marker; None: a ball.

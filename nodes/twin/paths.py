@@ -60,7 +60,7 @@ def touchable(scene: Scene) -> tuple[float, float]:
 
 
 class Ground:
-    """Map surface positions of a scene's object to points, from its front.
+    """Map from surface positions of a scene's object to points, from its front.
 
     Positions are measured along geodesics: first along the object's x axis, then at right angles to
     that. They are computed on a grid, interpolated by bicubic splines and projected onto the
@@ -99,9 +99,7 @@ class Ground:
         self._lay_out(front, np.cross(across, front.normal))
 
     def points(self, places: Floats) -> Floats:
-        """Return world points (n, 3) of positions (n, 3); beyond the touchable range, the nearest
-        limit.
-        """
+        """Return world points (n, 3) of positions (n, 3), limited to the touchable range."""
         along, arc = places[:, 0], places[:, 1]
         rough = np.column_stack([spline(along, arc, grid=False) for spline in self._splines])
         found = self._shape.closest(rough)
@@ -110,9 +108,7 @@ class Ground:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the distance from the front to the limit of tilt or to the end, and whether it
-        ends.
-        """
+        """Return the distance to the limit of tilt or to the end; True: to the end."""
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
             heading = heading - here.normal * (heading @ here.normal)

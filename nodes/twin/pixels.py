@@ -78,7 +78,7 @@ GRAIN = 1 << 21
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Describe the sensor; levels are digital numbers (0..255), linear.
+    """Image sensor; levels are digital numbers (0..255), linear.
 
     photons_per_level: full-well photons over 255; the variance of a level L is L over it.
     blur_px: standard deviation of the lens's point spread in focus.
@@ -124,8 +124,8 @@ class Sensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
-    """Hold one camera of the rig, the rays through its pixels, and its noisy backgrounds.
+class CameraView:
+    """One camera of the rig with the rays through its pixels and its noisy backgrounds.
 
     slopes_x, slopes_y: x/z and y/z of each pixel's ray, in the camera.
     canvas: where images are drawn; between images it equals the background.
@@ -141,9 +141,7 @@ class Eye:
     noisy: list[Image]
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
-        """Return pixel (2,) and depth (m) of a world point; the pixel is invalid when the depth is
-        <= 0.
-        """
+        """Return pixel (2,) and depth (m) of a world point; depths <= 0 are invalid."""
         x, y, z = (
             self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
         ).tolist()
@@ -166,7 +164,7 @@ class Eye:
 
 
 class TwinCamera:
-    """Draw stereo pairs of a true rig; `seed` determines the noise."""
+    """Stereo camera that renders pairs with a true rig; `seed` determines the noise."""
 
     def __init__(
         self,
@@ -245,7 +243,9 @@ class TwinCamera:
             _wipe(eye, windows)
         return pictures[0], pictures[1]
 
-    def _views(self, position: Position, exposure_s: float) -> Iterator[tuple[Eye, Floats, Floats]]:
+    def _views(
+        self, position: Position, exposure_s: float
+    ) -> Iterator[tuple[CameraView, Floats, Floats]]:
         """Return each camera with its instants (n,) and the fingertips (n, 3) at them."""
         instants_s, tips = self._instants(position, exposure_s)
         left, right = self.eyes
@@ -267,7 +267,7 @@ class TwinCamera:
         instants_s = exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
-    def _exposed(self, eye: Eye, windows: list[Window]) -> Image:
+    def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
         """Return the image: a noisy background with the touched windows drawn on it."""
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
@@ -280,7 +280,9 @@ class TwinCamera:
         noise = self._grain[start : start + levels.size].reshape(levels.shape)
         return quantize(levels + self.sensor.noise(levels) * noise)
 
-    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, marker: bool) -> list[Window]:
+    def _draw(
+        self, eye: CameraView, tips: Floats, times_s: Floats, *, marker: bool
+    ) -> list[Window]:
         """Draw all that is not background on the eye's canvas; gives the windows it touches.
 
         tips: (n, 3) over the exposure, times_s: (n,).
@@ -319,13 +321,15 @@ class TwinCamera:
                 windows.append(self._limb(eye, ends, radii_m, occluder.level, moved, lit=False))
         return [window for window in windows if window is not None]
 
-    def _spot(self, eye: Eye, thing: SecondMarker | Highlight, places: Floats) -> Window | None:
+    def _spot(
+        self, eye: CameraView, thing: SecondMarker | Highlight, places: Floats
+    ) -> Window | None:
         adds = isinstance(thing, Highlight)
         return self._disc(eye, places, thing.radius_m, thing.level, adds=adds)
 
     def _limb(
         self,
-        eye: Eye,
+        eye: CameraView,
         ends: Floats,
         radii_m: tuple[float, float],
         level: float,
@@ -379,7 +383,7 @@ class TwinCamera:
         return window
 
     def _disc(
-        self, eye: Eye, places: Floats, radius_m: float, level: float, *, adds: bool = False
+        self, eye: CameraView, places: Floats, radius_m: float, level: float, *, adds: bool = False
     ) -> Window | None:
         """Draw a luminous ball at world points (n, 3) over the exposure; None if not visible.
 
@@ -401,7 +405,7 @@ class TwinCamera:
         canvas += cover * (light if adds else light - canvas)
         return window
 
-    def _flat_disc(self, eye: Eye, places: Floats, normal: Floats) -> Window | None:
+    def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
         """Draw the marker as a flat disc at world points (n, 3), seen as an ellipse; None if it is
         not visible, or seen from behind.
 
@@ -435,7 +439,9 @@ class TwinCamera:
         canvas += cover * (np.float32(self.sensor.marker_level * self.sensor.exposure) - canvas)
         return window
 
-    def _eye(self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None) -> Eye:
+    def _eye(
+        self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None
+    ) -> CameraView:
         """Return one camera with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
@@ -443,7 +449,7 @@ class TwinCamera:
         if self.clutter.sheet is not None and sheet is not None:
             self._lay(self.clutter.sheet, sheet, canvas, slopes, camera_from_world)
         canvas *= np.float32(self.sensor.exposure)
-        eye = Eye(
+        eye = CameraView(
             side=side,
             lens=lens,
             camera_from_world=camera_from_world,
@@ -524,7 +530,7 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
 
 
 def rasterize_ball(
-    eye: Eye, centres: Floats, radius_m: float, spread_px: float, window: Window
+    eye: CameraView, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
     """Return the fraction of each pixel's light that comes from a ball, the mean over centres (n,
     3).
@@ -564,7 +570,7 @@ def _is_static(thing: SecondMarker | Highlight) -> bool:
     return isinstance(thing.path, FixedPoint) and not thing.carried
 
 
-def _wipe(eye: Eye, windows: list[Window]) -> None:
+def _wipe(eye: CameraView, windows: list[Window]) -> None:
     for window in windows:
         eye.canvas[window] = eye.background[window]
 

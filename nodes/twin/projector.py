@@ -98,7 +98,7 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """Simulate a stereo rig before a flat sheet that the projector lights from behind."""
+    """Stereo rig in front of a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """camera, projector: the true ones."""

@@ -11,7 +11,7 @@ J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """Hold the jobs that wait, and tell which frames are rendered.
+    """Queue of jobs, which selects the frames that are rendered.
 
     max_length: number of jobs that may wait.
     min_interval_s: time before the same key is rendered again.

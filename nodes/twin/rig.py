@@ -1,7 +1,7 @@
 """Simulate the true stereo rig and its lenses.
 
-A scene's camera block is a data sheet. The device differs from it by amounts of its own, which only
-a calibration determines. The projection is the simulator's own, because it is the reference of the
+A scene's camera block is a data sheet. The device differs from it by deviations that only a
+calibration determines. The projection is the simulator's own, because it is the reference of the
 camera model that the nodes use.
 """
 

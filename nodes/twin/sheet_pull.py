@@ -12,7 +12,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.force_history import ForceHistory
-from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, Rubber, solve
+from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
 
 Floats = NDArray[np.float64]
 
@@ -22,10 +22,10 @@ CELLS = 8
 STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
 
 
-def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> Rubber:
+def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
     """Return the simulator's sheet; sheet: the true one."""
     gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
-    return Rubber(
+    return TrueRubber(
         sheet.width_m,
         sheet.height_m,
         sheet.thickness_m,
@@ -42,7 +42,7 @@ def true_friction(apparatus: Apparatus | None) -> float | None:
 
 @dataclass(slots=True)
 class SheetPull:
-    """Hold the sheet's pull over the distance of its edges, and both arms' compliances, m/N.
+    """Pull of the sheet over the distance of its edges, and both arms' compliances, m/N.
 
     A finger's push on the sheet is not part of the pull: it is small beside the tension.
     weight_n: (3,) of the sheet, of which each flange carries half.
@@ -58,9 +58,7 @@ class SheetPull:
 
     @classmethod
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
-        """Compute the pull of the true sheet with the simulator's membrane; None if both arms are
-        rigid.
-        """
+        """Compute the pull of the true sheet by the membrane; None if both arms are rigid."""
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
         if not any(compliances):

@@ -20,13 +20,12 @@ import numpy as np
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
-MAX_DEVELOPMENT_SEED = 99
 MAX_DEVIATION_SIGMAS = 3.0
 """Normal draws are limited to this: beyond it a laboratory notices the fault."""
 
 
 class Profile(StrEnum):
-    """Name the equipment of a laboratory.
+    """Equipment of a laboratory.
 
     modern: a 60 Hz camera with a short read-out, a controller with a short period.
     paper: a camera of 15 to 48 Hz that reads out for most of a frame, a controller period of
@@ -38,7 +37,7 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """Draw a value; `spread` gives the value at a number of standard deviations."""
+    """Interface of a distribution that draws values."""
 
     def draw(self, random: np.random.Generator) -> Any: ...
 
@@ -47,7 +46,7 @@ class Distribution(Protocol):
         ...
 
     def text(self, scale: float) -> str:
-        """Describe the distribution for people, its numbers multiplied by `scale`."""
+        """Format the distribution, its numbers multiplied by `scale`."""
         ...
 
 
@@ -138,7 +137,7 @@ class LogUniform:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class OneOf:
     """One of a few values, all equally likely; in order, so that more sigmas mean a later one."""
 
     values: tuple[float, ...]
@@ -229,7 +228,7 @@ _ROWS = (
               "drift 0.2 mrad, from memory", calibrated=Normal(0.0, 0.045e-3),
               calibrated_source="docs/camera.md: residual 0.024 px of 540"),
     Tolerance("camera.rate_hz", "Hz", 1.0, Always(60.0), "USB3 cameras: 60 to 120 Hz",
-              paper=Choice((15.0, 30.0, 48.0)), calibrated_source=""),
+              paper=OneOf((15.0, 30.0, 48.0)), calibrated_source=""),
     Tolerance("camera.read_out_s", "ms (paper: frames)", MS, Uniform(1.5e-3, 4e-3),
               "computed: 614,400 bytes over USB3, or over 1394a at 0.9 frame",
               paper=Always(0.9), frame_periods=(Profile.PAPER,)),
@@ -261,7 +260,7 @@ _ROWS = (
               "KR16: response 50 ms, tracking 120 ms (Arbo)", paper=Uniform(0.0, 40e-3),
               calibrated=HalfNormal(1e-3), pair=Uniform(0.0, 0.5e-3),
               calibrated_source="launch/experiments/lag.py: standard error 0.6 to 1.9 ms"),
-    Tolerance("arms.*.controller_period_s", "ms", MS, Choice((1e-3, 2e-3, 4e-3)),
+    Tolerance("arms.*.controller_period_s", "ms", MS, OneOf((1e-3, 2e-3, 4e-3)),
               "RV-1A: 7.1 ms (docs/mxt.md); newer controllers: 1 to 4 ms",
               paper=Always(7.1e-3)),
     Tolerance("arms.*.controller_jitter_s", "ms", MS, Uniform(0.02e-3, 0.1e-3), J,
@@ -377,7 +376,7 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Return an apparatus that is nominal but for one row of the table, at `sigmas`.
+    """Return an apparatus that is nominal except for one row of the table, at `sigmas`.
 
     All components of a vector, and both arms or lenses, are at the same quantile.  Raises KeyError
     for a key that is not in the table.

@@ -28,7 +28,7 @@ NEAREST_VERTICES = 3
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
-    """Hold the true object: vertices (vertices, 3) world, outward triangles, unit normals.
+    """True object: vertices (vertices, 3) world, outward triangles, unit normals.
 
     Along a sharp edge vertices are doubled.
 
@@ -44,7 +44,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """Compute the scene's true object, of any shape; of a plane the touchable rectangle."""
+    """True object of a scene, of any shape; of a plane, the touchable rectangle."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -84,7 +84,7 @@ class TrueBody:
         """
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
-                f"displacement of {len(displacement)} vertices, skin of {len(skin_vertices)}"
+                f"displacement: expected {len(skin_vertices)} vertices, found {len(displacement)}"
             )
         corners, weights = self._on_skin(skin_vertices, skin_triangles)
         return self._object(self._rest + np.einsum("vc,vcx->vx", weights, displacement[corners]))

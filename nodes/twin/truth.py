@@ -22,10 +22,10 @@ Floats = NDArray[np.float64]
 
 
 class SimulatorParameters(NodeParameters):
-    """Hold the parameters of a simulator node; only these contain the apparatus."""
+    """Parameters of a simulator node; only these contain the apparatus."""
 
     apparatus: Apparatus | None = Field(
-        default=None, description="what is true; null: the scene is. `--apparatus` sets it"
+        default=None, description="true parameters; null: those of the scene. `--apparatus` sets it"
     )
 
 

@@ -67,7 +67,7 @@ def compute_numbers(session: Session) -> dict[str, Any]:
             },
             "strokes": [_stroke(session, one) for one in session.errors.runs if one.sums],
             "followed": [
-                {"begins_s": session.seconds(one.zero_ns), **one.figures()}
+                {"start_s": session.seconds(one.zero_ns), **one.figures()}
                 for one in session.errors.runs
                 if one.followed.exposures
             ],
@@ -92,7 +92,7 @@ def compute_numbers(session: Session) -> dict[str, Any]:
                 for seconds, kind, text in sorted(session.events.stored)
             ],
         },
-        "pictures": {
+        "images": {
             "stereo": session.stereo.count,
             "eye": session.eye.count,
             "frame": session.drawn.count,
@@ -174,7 +174,7 @@ def _stroke(session: Session, stroke: FingerRun) -> dict[str, Any]:
     scales = {"delta_d": ("mm", 1e3), "delta_theta": ("deg", DEGREES)}
     row: dict[str, Any] = {
         "seconds": stroke.stroke_s,
-        "begins_s": session.seconds(stroke.stroke_window_ns[0]),
+        "start_s": session.seconds(stroke.stroke_window_ns[0]),
     }
     for name, (unit, scale) in scales.items():
         for prefix in ("", "true_"):

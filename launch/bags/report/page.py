@@ -35,7 +35,7 @@ SECTIONS = {
     "sheet": "Finger and sheet",
     "arms": "Arms",
     "nodes": "Nodes and methods",
-    "pictures": "Images",
+    "images": "Images",
 }
 
 EVENTS_SHOWN = 60
@@ -106,7 +106,7 @@ def render_page(session: Session) -> str:
         *_section("sheet", _sheet(numbers, charts)),
         *_section("arms", _arms(numbers, charts)),
         *_section("nodes", _nodes(numbers)),
-        *_section("pictures", _pictures(session, numbers)),
+        *_section("images", _images(session, numbers)),
         "</main>",
     ]
     head = (
@@ -315,7 +315,7 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
             ("stroke, s", "start, s", "Δd, mm", "Δθ, degrees", "true Δd, mm",
              "true Δθ, degrees"),
             [
-                (one["seconds"], one["begins_s"], *(_mean(one[key]) for key in (
+                (one["seconds"], one["start_s"], *(_mean(one[key]) for key in (
                     "delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")))
                 for one in strokes
             ],
@@ -329,7 +329,7 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
              "drop-outs", "true Δd, mm", "true Δθ, degrees"),
             [
                 (
-                    one["path"], one["begins_s"], one["seconds"], 100.0 * one["contact_ratio"],
+                    one["path"], one["start_s"], one["seconds"], 100.0 * one["contact_ratio"],
                     None if one["following_ratio"] is None else 100.0 * one["following_ratio"],
                     one["drop_outs"],
                     *(_format_sizes(one["contact"][key]) for key in (
@@ -411,7 +411,7 @@ def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
         yield "</details>"
 
 
-def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
+def _images(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
     albums = (
         ("Stereo camera", session.stereo, "stereo",
          "Record stereo images with: flexsheet bag record BAG --include stereo."),
@@ -425,7 +425,7 @@ def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
         if not shots:
             yield _missing(missing)
             continue
-        if numbers["pictures"][key] > len(shots):
+        if numbers["images"][key] > len(shots):
             rest = f", without {album.left_out} shots at bookmarks" if album.left_out else ""
             yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
         yield from _album(title, album)

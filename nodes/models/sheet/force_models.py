@@ -79,7 +79,7 @@ def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
         width_m=rubber.width_m,
         height_m=rubber.height_m,
         thickness_m=rubber.thickness_m,
-        mooney_share=rubber.mooney_share,
+        mooney_ratio=rubber.mooney_ratio,
     )
 
 
@@ -179,7 +179,7 @@ CUBIC_FACTOR = 2.43
 
 def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
     """Return depth / width / sqrt(strain); pushes of equal scaled depth are similar."""
-    strain = strain_measure(stretch_ratio, rubber.mooney_share)
+    strain = strain_measure(stretch_ratio, rubber.mooney_ratio)
     return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
 
@@ -208,7 +208,7 @@ def _push_tension(
     """Return the additional force on each clamp due to a push (n,), N, and E t W, N."""
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
-    scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
+    scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_ratio), 1e-12) ** 0.5
     near = 1.0 - min(relative[0], MAX_RELATIVE_X) ** 2
     where = near**-_PULL_X * (1.0 - _PULL_Y * min(relative[1], 1.0) ** 2)
     taut = max(stretch_ratio, 1.0) ** -_PULL_STRETCH
@@ -250,7 +250,7 @@ class ScaledSheetModel:
         rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
         x, y = relative_position(rubber, s, position_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
-        strain = strain_measure(s, rubber.mooney_share)
+        strain = strain_measure(s, rubber.mooney_ratio)
         depth_ratio = depths / rubber.width_m
         radius = finger_radius_m / rubber.width_m / _FITTED_RADIUS
         height = rubber.height_m / rubber.width_m
@@ -407,13 +407,13 @@ def make_model(
     modulus_thickness_n_per_m: float,
     slack_width_m: float,
     cubic_ratio: float,
-    mooney_share: float,
+    mooney_ratio: float,
 ) -> ScaledSheetModel:
     """Make the scaled model from calibrated parameters, for stretch ratios of the nominal width."""
     rubber = replace(
         nominal,
         width_m=slack_width_m,
         young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
-        mooney_share=mooney_share,
+        mooney_ratio=mooney_ratio,
     )
     return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)

@@ -168,8 +168,8 @@ class _Grid:
         self.shape = (rows, columns)
         self.rest = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         self.centre = 0.5 * np.array([rubber.width_m, rubber.height_m])
-        self.c1 = rubber.young_modulus_pa / 6.0 * (1.0 - rubber.mooney_share)
-        self.c2 = rubber.young_modulus_pa / 6.0 * rubber.mooney_share
+        self.c1 = rubber.young_modulus_pa / 6.0 * (1.0 - rubber.mooney_ratio)
+        self.c2 = rubber.young_modulus_pa / 6.0 * rubber.mooney_ratio
         self.force_scale = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
 
         number = np.arange(rows * columns).reshape(rows, columns)

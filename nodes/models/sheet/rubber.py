@@ -11,7 +11,7 @@ import numpy as np
 class Rubber:
     """Dimensions and material of a slack sheet, clamped along two edges.
 
-    width_m: distance of the clamped edges. height_m: length of an edge. mooney_share: C2 / (C1 +
+    width_m: distance of the clamped edges. height_m: length of an edge. mooney_ratio: C2 / (C1 +
     C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), 0 (neo-Hookean) to below 1.
     """
 
@@ -19,7 +19,7 @@ class Rubber:
     height_m: float
     thickness_m: float
     young_modulus_pa: float
-    mooney_share: float = 0.0
+    mooney_ratio: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise ValueError for a size, modulus or Mooney fraction outside its range."""
@@ -29,5 +29,5 @@ class Rubber:
                 f"sheet: width_m, height_m, thickness_m and young_modulus_pa {sizes} must be "
                 "finite and above 0"
             )
-        if not 0.0 <= self.mooney_share < 1.0:
-            raise ValueError(f"mooney_share: {self.mooney_share} must be at least 0 and below 1")
+        if not 0.0 <= self.mooney_ratio < 1.0:
+            raise ValueError(f"mooney_ratio: {self.mooney_ratio} must be at least 0 and below 1")

@@ -23,13 +23,13 @@ PUSH_FACTOR = 0.95
 """Stiffness of a small push over edge force per width: 0.9-1.0 for a fingertip radius of 10 mm."""
 
 
-def strain_measure(stretch_ratio: float, mooney_share: float = 0.0) -> float:
+def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
     """Return the nominal stress of uniaxial tension over E: (s - s^-2)/3 (1 - m + m/s).
 
     s is the stretch ratio and m the Mooney fraction. The result is 0 for a slack sheet.
     """
     s = max(stretch_ratio, 1.0)
-    return (s - s**-2) / 3.0 * (1.0 - mooney_share + mooney_share / s)
+    return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
 
 
 def edge_force_n(
@@ -39,14 +39,14 @@ def edge_force_n(
     width_m: float,
     height_m: float,
     thickness_m: float,
-    mooney_share: float = 0.0,
+    mooney_ratio: float = 0.0,
 ) -> float:
     """Return the force (N) on each clamped edge of the unpushed sheet; 0 for a slack sheet.
 
     width_m: distance of the edges when slack. height_m: length of an edge.
     """
     area_modulus = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m)
-    return area_modulus * strain_measure(stretch_ratio, mooney_share)
+    return area_modulus * strain_measure(stretch_ratio, mooney_ratio)
 
 
 def stretch_for_edge_force(
@@ -102,7 +102,7 @@ def compute_sag_m(
         return np.zeros(u.shape)
     clamp_factor = _clamp_factor(rubber.width_m, rubber.height_m)
     stiffness = clamp_factor * rubber.young_modulus_pa * rubber.thickness_m
-    tension = stiffness * strain_measure(stretch, rubber.mooney_share)
+    tension = stiffness * strain_measure(stretch, rubber.mooney_ratio)
     # r = sag/L solves  (8/3 stiffness) r^3 + tension r = |load| L / 8, which has one real root.
     stiffening = 8.0 / 3.0 * stiffness
     half_q = abs(load_pa) * edge_distance_m / (16.0 * stiffening)
