@@ -24,8 +24,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from flexsheet.launch.plans.documents import BadInputError, Problem, read_document
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
+from flexsheet.launch.plans.launch_file import read_launch_file
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.plans.plan_model import (
     LAUNCHER,
@@ -706,7 +707,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
         if not is_loopback(address) and not plan.keys:
             raise BadInputError(
                 [
-                    read_document(Path(plan.launch_file)).problem(
+                    read_launch_file(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
                         f"{address} is not loopback, and the hosts have no keys",
                         f"create a key on each host (flexsheet keys new {name}) and install all "
