@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from flexsheet.launch.plans.drawing import svg
 from website import (
     apparatus_figure,
     arm_states_page,
@@ -20,7 +21,7 @@ from website import (
     tolerances_page,
     tracking_page,
 )
-from website.graph import DRAWINGS, svg
+from website.graph import DRAWINGS
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 

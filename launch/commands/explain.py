@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption
 from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
 from flexsheet.messages.errors import FlexsheetError
 

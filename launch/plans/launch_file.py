@@ -16,6 +16,7 @@ from flexsheet.launch.plans.documents import (
     read_document,
 )
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
+from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file, list_shipped
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
@@ -27,11 +28,6 @@ CONSOLE_NICE = 10
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
 """Path of the bags that the console records, relative to the working folder."""
-
-SHIPPED = Path(__file__).resolve().parent.parent
-"""Folder of the launch files of the package; its folder `scenes` contains the scenes."""
-
-SUFFIXES = (".yaml", ".yml")
 
 MERGED_LEVELS = 4
 """Mappings of an extended launch file are merged down to nodes.NAME.parameters."""
@@ -121,24 +117,6 @@ class LaunchFile(StrictModel):
     )
 
 
-def list_shipped(folder: Path) -> list[str]:
-    """Return the names of the launch files or scenes in a folder of the package."""
-    return sorted(file.stem for file in folder.glob("*.yaml"))
-
-
-def find_file(name: str | Path, shipped: Path, folder: Path | None = None) -> Path:
-    """Return the path of a YAML file that is given by its path or by its name in the package.
-
-    shipped: folder of the package with such files. folder: folder to which a path is relative;
-    default: the current one. A file that does not exist is returned as it is given.
-    """
-    path = (folder or Path()) / name
-    named = shipped / f"{name}.yaml"
-    if not path.exists() and not str(name).endswith(SUFFIXES) and named.is_file():
-        return named
-    return path
-
-
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file and the files that it extends.  Raises BadInputError.
 
@@ -155,12 +133,12 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     name = document.values.get("extends")
     if not isinstance(name, str):
         return document
-    base = find_file(name, SHIPPED, path.parent)
+    base = find_file(name, LAUNCH_FILES, path.parent)
     if not base.is_file():
         raise document.error(
             ("extends",),
             f'"{name}" does not exist',
-            f"name a file, or a shipped launch file: {', '.join(list_shipped(SHIPPED))}",
+            f"name a file, or a shipped launch file: {', '.join(list_shipped(LAUNCH_FILES))}",
         )
     chain = (*extending, path.resolve())
     if base.resolve() in chain:

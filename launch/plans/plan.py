@@ -30,13 +30,10 @@ from flexsheet.launch.plans.documents import (
 )
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
-    SHIPPED,
     LaunchFile,
     apply_console,
     apply_record,
     apply_setting,
-    find_file,
-    list_shipped,
     read_launch_file,
 )
 from flexsheet.launch.plans.plan_model import (
@@ -61,6 +58,7 @@ from flexsheet.launch.plans.routing import (
     make_endpoints,
     resolve_further_inputs,
 )
+from flexsheet.launch.plans.shipped import SCENES, find_file, list_shipped
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.node import NodeParameters, find_role
@@ -152,9 +150,9 @@ def load_graph(
 def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, Scene | None]:
     if spec.scene is None:
         return None, None
-    path = find_file(spec.scene, SHIPPED / "scenes", document.folder(("scene",)))
+    path = find_file(spec.scene, SCENES, document.folder(("scene",)))
     if not path.is_file():
-        names = ", ".join(list_shipped(SHIPPED / "scenes"))
+        names = ", ".join(list_shipped(SCENES))
         document.report(
             ("scene",),
             f'"{spec.scene}" does not exist',

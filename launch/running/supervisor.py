@@ -18,7 +18,7 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -238,15 +238,21 @@ class Child:
 class RunningGraph:
     """The processes of a graph's nodes.
 
-    host: start only the nodes of this host; None starts all on this computer. report: called with
+    host: start only the nodes of this host; None starts all on this computer. without: names of
+    nodes that are not started. report: called with
     (node, line) for every line of log; `run.logs` contains all lines, too.
     """
 
     def __init__(
-        self, plan: ResolvedGraph, *, host: str | None = None, report: Report | None = None
+        self,
+        plan: ResolvedGraph,
+        *,
+        host: str | None = None,
+        without: Collection[str] = (),
+        report: Report | None = None,
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
-        self.nodes = plan.nodes_on(host)
+        self.nodes = [node for node in plan.nodes_on(host) if node.name not in without]
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
