@@ -29,7 +29,7 @@ INTRODUCTION = """\
 
 Parameters of each node.  Set them in a launch file under `nodes: NAME: parameters:`, or on the
 command line by `--set NAME.PARAMETER=VALUE`.  Names contain the units.  The command
-`flexsheet node describe NODE` prints the parameters with ports and timers.
+`flexsheet node info NODE` prints the parameters with ports and timers.
 """
 
 

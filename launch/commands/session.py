@@ -69,9 +69,7 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     statuses: dict[str, Status] = {}
     hosts: dict[str, HostStatus] = {}
     run_interruptible(_collect_statuses(plan, found, statuses, hosts))
-    rows = [
-        _describe_node(name, node.host, statuses.get(name)) for name, node in plan.nodes.items()
-    ]
+    rows = [_describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
     suspicions = _list_suspicions(statuses)
     estops = {name: one.estop for name, one in hosts.items() if one.estop is not None}
     if as_json:
