@@ -121,7 +121,13 @@ def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
     """Return a row of the table of nodes; null where the node does not report."""
     row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
     if status is None:
-        none = {"cpu": None, "memory_mb": None, "lost": None, "inputs": [], "outputs": []}
+        none: dict[str, Any] = {
+            "cpu": None,
+            "memory_mb": None,
+            "lost": None,
+            "inputs": [],
+            "outputs": [],
+        }
         return row | none | {"errors": None, "note": ""}
     lost = sum(port.dropped + port.gaps + port.rejected for port in status.inputs)
     return row | {
