@@ -18,20 +18,27 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from flexsheet.launch.commands.options import FORMER_NAMES, name_values
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, examples, words
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import DISK_ERRORS, FileWriteError, make_write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
+    "try": ("trying",),
     "launch": ("launching",),
+    "run": ("session:run_app",),
+    "stop": ("session:stop_app",),
+    "status": ("session:status_app",),
+    "logs": ("session:logs_app",),
+    "graph": ("drawing",),
     "node": ("node",),
+    "param": ("param",),
     "topic": ("topic",),
     "bag": ("bag",),
     "arms": ("arms",),
     "experiment": ("experiment", "experiment_sweeps"),
     "apparatus": ("apparatus",),
     "demo": ("demo",),
-    "try": ("trying",),
     "chart": ("chart",),
     "tune": ("tune",),
     "calibrate": (
@@ -49,28 +56,30 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 """Map each command to its modules in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first module defines the typer app `app`; the others add to it with `register(app)`.
+The first module defines the typer app `app`, or the one that is named after a colon; the others add
+to it with `register(app)`.
 """
-
-
-FORMER_NAMES = {"prepare": "precompute", "service": "systemd"}
-"""Former command names with their current names; hidden in the help."""
 
 
 @cache
 def load_command(name: str) -> Any:
     """Return the click command of a name in `COMMANDS`."""
-    first, *further = (
-        import_module(f"flexsheet.launch.commands.{module}") for module in COMMANDS[name]
-    )
-    for module in further:
-        module.register(first.app)
-    command = get_command(first.app)
+    first, *further = COMMANDS[name]
+    module, _, attribute = first.partition(":")
+    app: typer.Typer = getattr(_import(module), attribute or "app")
+    for other in further:
+        _import(other).register(app)
+    command = get_command(app)
     command.name = name
+    name_values(command)
     return command
 
 
-INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "topic", "arms"})
+def _import(module: str) -> Any:
+    return import_module(f"flexsheet.launch.commands.{module}")
+
+
+INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms"})
 """Commands that SIGINT may end without cleanup until their event loop handles it.
 
 The other commands clean up after the KeyboardInterrupt that Python's handler raises.
@@ -81,7 +90,7 @@ class CommandTable(Mapping[str, Any]):
     """Read-only table of commands by name; imports each command on first use."""
 
     def __getitem__(self, name: str) -> Any:
-        return load_command(FORMER_NAMES.get(name, name))
+        return load_command(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(COMMANDS)
@@ -95,6 +104,7 @@ class CommandGroup(TyperGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        name_values(self)
         self.commands = CommandTable()  # type: ignore[assignment]  # a read-only mapping
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -110,9 +120,12 @@ app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    # Subcommands inherit this setting.
-    context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=examples("flexsheet try", "flexsheet launch launch/demo.yaml", "flexsheet topic list"),
+    # Subcommands inherit these settings.
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "token_normalize_func": lambda name: FORMER_NAMES.get(name, name),
+    },
+    epilog=examples("flexsheet try", "flexsheet launch demo", "flexsheet topic list"),
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from flexsheet.messages.types import FingertipReason, SelfCheck, SuspectedCause
+from flexsheet.messages.types import FingertipReason, SelfCheck, SheetReason, SuspectedCause
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
 
@@ -34,6 +34,74 @@ class NodeNote(Enum):
     ARM_WATCHDOG = (
         "the arm's watchdog stopped it",
         BUSY_FIRST + "Then read the log of the arm's bridge, which sent no command for 100 ms.",
+    )
+    WAITING_FOR_ARM = (
+        "waiting for the arm",
+        "Wait for the arm's controller. If the note remains, check its power, address and cable.",
+    )
+    WAITING_FOR_OTHER_ARM = (
+        "waiting for the other arm",
+        "The other arm's bridge is starting. If the note remains, read its log: `flexsheet logs`.",
+    )
+    FOLLOWS_OTHER_ARM = (
+        "waits for the other arm",
+        "Both arms move together. `flexsheet arms status` shows what the other one waits for.",
+    )
+    OTHER_ARM_NOT_READY = (
+        "the other arm is not ready",
+        "Enable both arms: `flexsheet arms enable`. It prints the reason if an arm refuses.",
+    )
+    OTHER_ARM_FAULT = (
+        "other arm:",
+        "Remove the cause at the other arm, then reset: `flexsheet arms reset`.",
+    )
+    NOT_READY = (
+        "not ready",
+        "Check that nobody is near the arms, then: `flexsheet arms enable`.",
+    )
+    DISABLED = (
+        "disabled",
+        "Somebody has disabled the arms. Ask why, then: `flexsheet arms enable`.",
+    )
+    RESTARTING = (
+        "restarts after a reset",
+        "Wait a second. If the note remains, read the log of the bridge: `flexsheet logs`.",
+    )
+    ARM_STANDS_STILL = (
+        "waits for the arm to stand still",
+        "Wait until the arm rests. If the note remains, check that nothing moves it.",
+    )
+    CHECKING_PATH = (
+        "checks the path to the target",
+        "Wait: the arms search for a path without collision. It takes at most some seconds.",
+    )
+    MEASURED_VIOLATION = (
+        "measured:",
+        "The arm has left its limits. Move it back by hand, then: `flexsheet arms reset`.",
+    )
+    COMMANDED_VIOLATION = (
+        "commanded:",
+        "A command was outside a limit and was not sent. Reset, and report it with a recording.",
+    )
+    JOINT_RANGE = (
+        "joint out of range",
+        "The controller refused a joint angle. Compare its limits with `arms` of the scene.",
+    )
+    STEP_SIZE = (
+        "step too large",
+        "The controller refused a step. Compare its speed limits with `arms` of the scene.",
+    )
+    COMMAND_NOT_FINITE = (
+        "command not finite",
+        "The controller received an invalid number. Check the network, and report it.",
+    )
+    CONTROLLER_WATCHDOG = (
+        "watchdog: no command",
+        BUSY_FIRST + "Then read the log of the arm's bridge, and reset: `flexsheet arms reset`.",
+    )
+    STATUS_STALE = (
+        "its joints are not used",
+        "The controller's program stands still or restarts: check it, then reset.",
     )
     NO_PATH = (
         "no path:",
@@ -97,6 +165,42 @@ class NodeNote(Enum):
     def code(self) -> str:
         """Return the name for `flexsheet explain`."""
         return self.name.lower().replace("_", "-")
+
+
+SHEET_REASON_TEXTS: dict[SheetReason, str] = {
+    "ok": "",
+    "fingertip_invalid": "the fingertip is not tracked",
+    "fingertip_not_finite": "the fingertip is not finite",
+    "fingertip_too_old": "the fingertip is too old",
+    "fingertip_in_future": "the fingertip is stamped in the future",
+    "implausible_input": "the finger is too far away or too fast",
+    "ambiguous_side": "the finger is inside the object, and its side is unclear",
+    "through_object": "the finger has passed through the object",
+    "past_object_edge": "the finger is past the object's edge",
+    "beyond_tilt": "the finger is beyond the tilt of the sheet",
+    "beyond_spin": "the sheet has rotated too far about its normal; lift the finger",
+    "past_sheet_width": "the finger is past the sheet's usable width",
+    "past_sheet_height": "the finger is past the sheet's usable height",
+    "concave_contact": "the object is concave there, and the flat sheet touches its rim",
+}
+"""Why the sheet holds its pose, by `reason` of the topic `sheet_target`; the console shows it."""
+
+SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
+    "fingertip_invalid": "Find out why: `flexsheet topic echo fingertip --field reason`.",
+    "fingertip_not_finite": "Report this error of the triangulator, with a recording.",
+    "fingertip_too_old": BUSY_FIRST + "Then check camera and triangulator: `flexsheet status`.",
+    "fingertip_in_future": "Check the clocks of the hosts: `flexsheet doctor hosts`.",
+    "implausible_input": "Move the finger into the working range, slower; cover reflections.",
+    "ambiguous_side": "Lift the finger out of the object, and approach it from one side.",
+    "through_object": "Lift the finger, and approach the object from the front again.",
+    "past_object_edge": "Move the finger back to the object's surface.",
+    "beyond_tilt": "Move the finger back, or allow more tilt: `working_range` of the scene.",
+    "beyond_spin": "Lift the finger and touch the object again.",
+    "past_sheet_width": "Move the finger towards the middle of the sheet.",
+    "past_sheet_height": "Move the finger towards the middle of the sheet.",
+    "concave_contact": "Touch the object beside the hollow: a flat sheet cannot enter it.",
+}
+"""Remedies by `reason` of the topic `sheet_target`, except "ok"."""
 
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {

@@ -76,6 +76,8 @@ _ROWS = (
     Topic("estop", types.EStop, _LATCHED, None, True, "emergency stop, latched", many_writers=True),
     Topic("recording", types.Recording, _LATCHED, None, True, "start and stop of a recording",
           many_writers=True),
+    Topic("parameter", types.ParameterChange, _EVERY, None, True,
+          "changes of parameters of running nodes", many_writers=True),
     Topic("bookmark", types.Bookmark, _EVERY, None, True, "marked times in a bag",
           many_writers=True),
     Topic("arming", types.Arming, _EVERY, None, True,

@@ -449,6 +449,17 @@ class Status(Message):
     self_checks: tuple[SelfCheck, ...] = Field(
         default=(), description="residuals of the node that have data"
     )
+    changed_parameters: str = Field(
+        default="{}", description="parameters changed since the start, as a JSON object"
+    )
+
+
+class ParameterChange(Message):
+    """Change of a parameter of a running node, from `flexsheet param set`."""
+
+    node: str
+    parameter: str
+    value: str = Field(description="new value as JSON")
 
 
 class NodeProcess(MessagePart):

@@ -52,7 +52,7 @@ class UnknownNodeError(FlexsheetError, KeyError):
     """The node name is not in the table; the message suggests a similar one."""
 
     code = "unknown-node"
-    remedy = "`flexsheet node list` prints all names."
+    remedy = "`flexsheet node types` prints all names."
 
 
 def node_class(name: str) -> type[Node]:

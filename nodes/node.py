@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import json
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +45,7 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.topics import Delivery, Topic, find_topic
-from flexsheet.messages.types import ArmState, PortStatus, SelfCheck, Status
+from flexsheet.messages.types import ArmState, ParameterChange, PortStatus, SelfCheck, Status
 from flexsheet.nodes import NodeRole
 
 M = TypeVar("M", bound=Message)
@@ -270,6 +271,9 @@ class Node:
     role: ClassVar[NodeRole | None] = None
     optional_inputs: ClassVar[frozenset[str]] = frozenset()
     """Ports that stay unconnected in a graph in which no node writes their topic."""
+    live_parameters: ClassVar[frozenset[str]] = frozenset()
+    """Parameters that may change while the node runs, because each use reads them from
+    `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
     opens_devices: ClassVar[bool] = False
     """Whether it opens devices, ports or files, so that a replay must not start it."""
 
@@ -319,6 +323,7 @@ class Node:
         self.last_error = ""
         self.reported_problems = 0
         self.note = ""
+        self.changed_parameters: dict[str, Any] = {}
         self.self_checks: tuple[SelfCheck, ...] = ()
         self.started_ns = clock.now_ns()
         self._execution_log = ExecutionLog(clock)
@@ -353,6 +358,17 @@ class Node:
             for port in self.inputs
             if inspect.iscoroutinefunction(self._handler(port))
         }
+
+    def on_parameter(self, change: ParameterChange, _: Header) -> None:
+        """Change a parameter while the node runs.  Raises ValueError for one that is fixed."""
+        if change.node != self.name:
+            return
+        if change.parameter not in self.live_parameters:
+            raise ValueError(f'parameter "{change.parameter}" cannot change while the node runs')
+        value = json.loads(change.value)
+        kind = type(self.parameters)
+        self.parameters = kind.model_validate({**dict(self.parameters), change.parameter: value})
+        self.changed_parameters[change.parameter] = value
 
     async def setup(self) -> None:
         """Open devices; the runner calls it once before the first message."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import json
 import os
 import signal
 import sys
@@ -265,6 +266,7 @@ def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
         clock_offsets=tuple(node.clock_table.offsets.values()),
         execution_log=node.drain_execution_log(),
         self_checks=node.self_checks,
+        changed_parameters=json.dumps(node.changed_parameters),
     )
 
 

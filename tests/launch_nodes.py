@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.types import ArmState, EStop, Fingertip, Side, TwinFinger
+from flexsheet.messages.types import ArmState, EStop, Fingertip, ParameterChange, Side, TwinFinger
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
@@ -95,11 +95,17 @@ class Relay(Node):
         self.estop.publish(EStop(engaged=False, reason=f"{age_ms:.0f} ms {chance}"))
 
 
+class ListenerParameters(NodeParameters):
+    patience_s: float = 1.0
+
+
 class Listener(Node):
     """Publish one e-stop when the finger has reached a distance."""
 
-    parameters: NodeParameters
+    live_parameters: ClassVar[frozenset[str]] = frozenset({"patience_s"})
+    parameters: ListenerParameters
     twin__finger: Input[TwinFinger]
+    parameter: Input[ParameterChange]
     estop: Output[EStop]
 
     said = False

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flexsheet.launch import cli
@@ -184,17 +185,17 @@ def test_topic_list_is_the_table(flexsheet: Command) -> None:
     assert "twin/finger_path" in flexsheet("topic", "list").out
 
 
-def test_node_list_and_describe(flexsheet: Command) -> None:
-    assert [row["type"] for row in flexsheet("node", "list", "--json").json()] == list(NODES)
-    described = flexsheet("node", "describe", "planner", "--json").json()
+def test_node_types_and_info(flexsheet: Command) -> None:
+    assert [row["type"] for row in flexsheet("node", "types", "--json").json()] == list(NODES)
+    described = flexsheet("node", "info", "planner", "--json").json()
     assert {"port": "sheet_target", "direction": "output", "message": "SheetTarget"} in described[
         "ports"
     ]
     assert "prediction_horizon_s" in [row["parameter"] for row in described["parameters"]]
-    said = flexsheet("node", "describe", "tests.launch_nodes:Beacon")
+    said = flexsheet("node", "info", "tests.launch_nodes:Beacon")
     assert "twin__finger" in said.out
     assert "rate_hz" in said.out
-    said = flexsheet("node", "describe", "planer")
+    said = flexsheet("node", "info", "planer")
     assert (said.code, said.out) == (2, "")
     assert 'did you mean "planner"?' in said.err
 
@@ -314,6 +315,126 @@ def test_info_shows_the_graph(flexsheet: Command, running: Path) -> None:
     assert "path_time_s" in described["fields"]
 
 
+def test_bandwidth_and_delay_are_measured_per_writer(flexsheet: Command, running: Path) -> None:
+    (row,) = flexsheet("topic", "bw", "twin/finger", "--duration", "1", "--json").json()
+    assert row["writer"] == "beacon"
+    assert row["min_bytes"] <= row["mean_bytes"] <= row["max_bytes"] < 5000
+    assert row["bytes_per_s"] > 0
+    (row,) = flexsheet("topic", "delay", "twin/finger", "--duration", "1", "--json").json()
+    assert 0 < row["age_ms"]["p50"] <= row["age_ms"]["max"]
+
+
+def test_nodes_of_the_running_graph_are_listed(flexsheet: Command, running: Path) -> None:
+    rows = {row["node"]: row for row in flexsheet("node", "list", "--json").json()}
+    assert rows["beacon"]["type"] == "tests.launch_nodes:Beacon"
+    described = flexsheet("node", "info", "beacon", "--json").json()
+    assert {"port": "twin__finger", "direction": "output", "message": "TwinFinger",
+            "topic": "twin/finger"} in described["ports"]  # fmt: skip
+    assert "value" in described["parameters"][0]
+
+
+def test_status_shows_rates_of_all_nodes(flexsheet: Command, running: Path) -> None:
+    said = flexsheet("status", "--json")
+    rows = {row["node"]: row for row in said.json()["nodes"]}
+    assert said.code == 0, said.out
+    assert set(rows) >= {"beacon", "listener", "recorder"}
+    assert {port["topic"] for port in rows["beacon"]["outputs"]} >= {"twin/finger", "status"}
+    assert said.json()["self_checks"] == []
+    assert "twin/finger" in flexsheet("status").out
+
+
+def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None:
+    lines = flexsheet("logs", "recorder", "--json").out.splitlines()
+    assert any(json.loads(line)["event"] == "recording" for line in lines)
+    assert len(flexsheet("logs", "recorder", "-n", "1").out.splitlines()) == 1
+    said = flexsheet("logs", "recordr")
+    assert (said.code, 'did you mean "recorder"?' in said.err) == (2, True)
+
+
+def test_a_parameter_is_read_and_changed_in_the_running_graph(
+    flexsheet: Command, running: Path
+) -> None:
+    rows = {row["parameter"]: row for row in flexsheet("param", "list", "--json").json()}
+    assert rows["listener.patience_s"]["live"]
+    assert not rows["beacon.rate_hz"]["live"]
+    assert flexsheet("param", "set", "listener.patience_s", "2.5", "--json").json()["value"] == 2.5
+    assert flexsheet("param", "get", "listener.patience_s").out == "2.5\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("set", "beacon.rate_hz", "9"), 2, "start the graph again with --set beacon.rate_hz=9"),
+        (("set", "listener.patience_s", "soon"), 2, "listener.patience_s=soon: is invalid"),
+        (("set", "listener.patience", "1"), 2, 'did you mean "patience_s"?'),
+        (("get", "listner.patience_s"), 2, 'did you mean "listener"?'),
+    ],
+)
+def test_a_parameter_that_cannot_be_changed_is_explained(
+    flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, said: str
+) -> None:
+    result = flexsheet("param", *arguments)
+    assert (result.code, said in result.err) == (code, True), result.err
+
+
+def test_the_running_graph_is_printed_and_drawn(
+    flexsheet: Command, running: Path, tmp_path: Path
+) -> None:
+    assert "twin/finger -> listener" in flexsheet("graph").out
+    links = flexsheet("graph", "--json").json()["links"]
+    assert {"from": "beacon", "to": "listener", "topics": ["twin/finger"]} in links
+    for name in ("graph.svg", "graph.mmd"):
+        assert flexsheet("graph", "-o", tmp_path / name).code == 0
+        assert "twin/finger" in (tmp_path / name).read_text()
+    assert flexsheet("graph", "-o", tmp_path / "graph.gif").code == 2
+
+
+def test_a_node_that_runs_is_not_started_again(flexsheet: Command, running: Path) -> None:
+    said = flexsheet("run", "beacon")
+    assert (said.code, "--without beacon" in said.err) == (1, True)
+    assert 'did you mean "beacon"?' in flexsheet("run", "becon").err
+
+
+def test_fields_of_a_bag_are_plotted(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
+    image = tmp_path / "plot.svg"
+    fields = ["twin/finger.path_time_s", "twin/finger.position_world_m"]
+    (time_s, position) = flexsheet("bag", "plot", recorded, *fields, "-o", image, "--json").json()
+    assert np.array(position["values"]).shape == (len(position["times_s"]), 3)
+    assert np.all(np.diff(time_s["times_s"]) > 0)
+    assert "<svg" in image.read_text()
+    assert "fingertip" in flexsheet("bag", "plot", recorded, "fingertip.position_m").err
+    said = flexsheet("bag", "plot", recorded, "twin/finger.position_wrld_m")
+    assert (said.code, 'did you mean "position_world_m"?' in said.err) == (2, True)
+
+
+def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:
+    """A graph without a node works with that node from another terminal, and ends on `stop`."""
+    file = write(tmp_path, GRAPH)
+    command = [sys.executable, "-m", "flexsheet"]
+    graph = subprocess.Popen(
+        [*command, "launch", str(file), "--without", "beacon", "--json"],
+        cwd=ROOT, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    node = None
+    try:
+        assert graph.stdout is not None
+        run = json.loads(graph.stdout.readline())["run"]
+        node = subprocess.Popen([*command, "run", "beacon", "--run", run], cwd=ROOT)
+        echo = [*command, "topic", "echo", "twin/finger", "-1", "--json", "--run", run]
+        heard = subprocess.check_output(echo, cwd=ROOT, timeout=DEADLINE_S)
+        assert json.loads(heard)["header"]["writer"] == "beacon"
+        node.send_signal(signal.SIGINT)
+        assert node.wait(DEADLINE_S) == 0
+        subprocess.run([*command, "stop", "--run", run], cwd=ROOT, check=True, timeout=DEADLINE_S)
+        assert graph.wait(DEADLINE_S) == 0
+    finally:
+        for process in (graph, node):
+            if process is not None and process.poll() is None:
+                process.kill()
+        if graph.stdout is not None:
+            graph.stdout.close()
+
+
 def test_pub_reaches_the_graph(flexsheet: Command, running: Path) -> None:
     said = flexsheet("topic", "pub", "display", "{correction: none, stereo: mono}", "--count", "2")
     assert said.code == 0
@@ -338,13 +459,14 @@ def test_a_running_graph_can_be_recorded(flexsheet: Command, running: Path, tmp_
 def test_verify_steps_a_node_and_compares(
     flexsheet: Command, recorded: Path, tmp_path: Path
 ) -> None:
-    result = flexsheet("bag", "verify", "listener", recorded, "--json").json()
+    result = flexsheet("bag", "verify", recorded, "listener", "--json").json()
     assert result["ok"], str(result)
     assert result["same_bytes"]
     assert result["topics"]["estop"] == {
         "recorded": 1, "replayed": 1, "compared": 1, "beyond_tolerance": 0, "worst": {},
     }  # fmt: skip
-    assert flexsheet("bag", "verify", "listener", recorded).code == 0
+    assert flexsheet("bag", "verify", recorded, "listener").code == 0
+    # The former order of the arguments is still accepted.
     again = flexsheet("bag", "verify", "listener", recorded, "--json").json()
     assert again["digest"] == result["digest"]
 
@@ -357,7 +479,7 @@ def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path
         for topic, message, header, log_ns in reader:
             other = EStop(engaged=True, reason="eleven") if topic == "estop" else message
             writer.write(TOPICS[topic], other, header, log_ns)
-    said = flexsheet("bag", "verify", "listener", forged, "--json")
+    said = flexsheet("bag", "verify", forged, "listener", "--json")
     assert said.code == 3
     assert said.json()["topics"]["estop"]["worst"] == {"reason": 1.0}
 
@@ -388,16 +510,16 @@ def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
 
 
 def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
-    said = flexsheet("bag", "verify", "listner", recorded)
+    said = flexsheet("bag", "verify", recorded, "listner")
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
-    said = flexsheet("bag", "verify", "recorder", recorded)
+    said = flexsheet("bag", "verify", recorded, "recorder")
     assert (said.code, "it recorded this bag" in said.err) == (1, True)
     bare = tmp_path / "bare.mcap"
     with BagWriter(bare):
         pass
     assert (
         'does not contain the attachment "plan.json"'
-        in flexsheet("bag", "verify", "listener", bare).err
+        in flexsheet("bag", "verify", bare, "listener").err
     )
     assert flexsheet("bag", "info", tmp_path / "no.mcap").code == 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -19,13 +20,14 @@ from typer.testing import CliRunner
 
 from flexsheet.launch import cli
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.experiment import DEMO_FILE
+from flexsheet.launch.commands.options import FORMER_NAMES
 from flexsheet.launch.commands.output import (
     examples_in,
     logs_on_stderr,
     print_json,
     print_json_line,
 )
+from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
 from website.commands_page import commands
 
@@ -51,7 +53,7 @@ def parse(line: str) -> str:
 
 def test_the_command_line_is_this() -> None:
     assert set(COMMANDS) >= {
-        "launch", "node list", "node describe", "topic list", "topic info", "topic echo",
+        "launch", "node list", "node info", "topic list", "topic info", "topic echo",
         "topic hz", "topic pub", "bag record", "bag play", "bag info", "bag recover", "bag export",
         "bag verify", "experiment stroke", "experiment tilt", "experiment push", "chart",
         "calibrate stereo", "calibrate check", "calibrate projector", "calibrate arms",
@@ -76,11 +78,47 @@ def test_a_command_explains_itself_with_examples_that_parse(name: str) -> None:
         assert parameter.help, f"flexsheet {name}: {parameter.name} is not explained"
 
 
-@pytest.mark.parametrize(("former", "name"), cli.FORMER_NAMES.items())
-def test_a_former_name_of_a_command_is_a_hidden_alias(former: str, name: str) -> None:
-    table = cli.CommandTable()
-    assert table[former] is table[name]
-    assert former not in set(table)
+@pytest.mark.parametrize(
+    ("former", "current"),
+    [
+        ("prepare --help", "precompute --help"),
+        ("service install --help", "systemd install --help"),
+        ("arms ready --help", "arms enable --help"),
+        ("node describe --help", "node info --help"),
+    ],
+)
+def test_a_former_name_of_a_command_is_a_hidden_alias(former: str, current: str) -> None:
+    texts = [CliRunner().invoke(cli.app, line.split()).output for line in (former, current)]
+    assert texts[0].split("Options")[1] == texts[1].split("Options")[1]
+    pairs = list(zip(former.split(), current.split(), strict=True))
+    at = next(i for i, (old, new) in enumerate(pairs) if old != new)
+    listed = CliRunner().invoke(cli.app, [*former.split()[:at], "--help"]).output
+    assert f"│ {pairs[at][0]} " not in listed
+    assert f"│ {pairs[at][1]} " in listed
+
+
+@pytest.mark.parametrize("former", FORMER_NAMES)
+def test_a_former_name_of_an_option_is_no_longer_one(former: str) -> None:
+    options = {option for one in COMMANDS.values() for each in one.params for option in each.opts}
+    assert f"--{former}" not in options
+
+
+VALUE_NAME = re.compile(r"[A-Z][A-Z0-9_.=-]*([x|,: ][A-Z0-9_.]+|\|seed:N)*|[a-z]+(\|[a-z]+)+|'X.*'")
+"""Names in capitals; a choice is written as it is."""
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_options_of_a_command_are_shown_in_one_way(name: str) -> None:
+    for parameter in COMMANDS[name].params:
+        given = parameter.metavar
+        if getattr(parameter, "is_flag", False):
+            assert given == "", f"{name} {parameter.opts}: a flag has no value"
+        else:
+            assert VALUE_NAME.fullmatch(given), f"{name} {parameter.opts}: {given}"
+        assert not str(parameter.default).startswith(str(ROOT)), f"{name} {parameter.opts}"
+        assert ("--output" in parameter.opts) == ("-o" in parameter.opts), f"{name}: -o, --output"
+        assert parameter.help.endswith((".", ")")), f"{name} {parameter.opts}: no sentence"
+    assert COMMANDS[name].help.split("\n")[0].endswith("."), f"{name}: no sentence"
 
 
 @pytest.mark.parametrize("words", [(), ("launch",), ("systemd", "install"), ("node", "list")])
@@ -132,11 +170,11 @@ def test_looking_into_a_graph_loads_little() -> None:
     ("words", "offered"),
     [
         ("flexsheet topic echo finger", "fingertip"),
-        ("flexsheet node describe pla", "planner"),
+        ("flexsheet node info pla", "planner"),
         ("flexsheet chart triang", "triangulation"),
         ("flexsheet bag ver", "verify"),
         ("flexsheet topic echo --on", "--once"),
-        ("flexsheet bag verify tri", "triangulator"),
+        ("flexsheet bag verify a.mcap tri", "triangulator"),
         ("flexsheet bag record a.mcap --include ste", "stereo"),
         ("flexsheet launch launch/lab.yaml --host le", "left"),
         ("flexsheet tune a.yaml --family soft", "soft-body"),

@@ -17,10 +17,12 @@ from flexsheet.messages.notes import (
     FINGERTIP_REMEDIES,
     SELF_CHECK_FINDINGS,
     SELF_CHECK_REMEDIES,
+    SHEET_REASON_REMEDIES,
+    SHEET_REASON_TEXTS,
     NodeNote,
 )
 from flexsheet.messages.topics import UnknownTopicError, find_topic
-from flexsheet.messages.types import FingertipReason, SuspectedCause
+from flexsheet.messages.types import FingertipReason, SheetReason, SuspectedCause
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -44,6 +46,12 @@ def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
     assert set(FINGERTIP_REMEDIES) == set(get_args(FingertipReason)) - {"ok"}
 
 
+def test_every_reason_of_a_sheet_at_rest_has_a_text_and_a_remedy() -> None:
+    reasons = set(get_args(SheetReason))
+    assert set(SHEET_REASON_TEXTS) == reasons
+    assert set(SHEET_REASON_REMEDIES) == reasons - {"ok"}
+
+
 def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
     causes = set(get_args(SuspectedCause))
     assert set(SELF_CHECK_FINDINGS) == set(SELF_CHECK_REMEDIES) == causes
@@ -55,6 +63,10 @@ def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
         ("bag", "bag"),
         ("BagError", "bag"),
         ("saturated", "saturated"),
+        ("marker in one view", "marker_in_one_view"),
+        ("The sheet holds its pose: the fingertip is too old.", "fingertip_too_old"),
+        ("The left arm reports: waits for the arm to stand still.", "arm-stands-still"),
+        ("left arm: fault (arm: joint out of range)", "joint-range"),
         ("handler failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),

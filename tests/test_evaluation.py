@@ -339,7 +339,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(ExperimentError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
-        sensitivity.select_parameters("sheet.modulus_ration")
+        sensitivity.select_parameters(["sheet.modulus_ration"])
 
 
 # The bound of a followed finger

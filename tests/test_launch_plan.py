@@ -304,3 +304,68 @@ def test_an_optional_input_without_a_writer_is_not_connected(tmp_path: Path) -> 
     assert not ports["arm_left"].endpoints
     with_arms = load_graph(ROOT / "launch" / "demo.yaml").nodes["planner"]
     assert all(port.endpoints for port in with_arms.inputs)
+
+
+def test_a_launch_file_extends_another_by_name(tmp_path: Path) -> None:
+    text = """
+extends: demo
+scene: organ
+nodes:
+  twin_eye: null
+  renderer:
+    parameters: {rate_hz: 20}
+  beacon: {type: "tests.launch_nodes:Beacon", topics: {twin__finger: null}}
+"""
+    plan, demo = load_graph(write(tmp_path, text)), load_graph(ROOT / "launch/demo.yaml")
+    assert set(plan.nodes) == {*demo.nodes, "beacon"} - {"twin_eye"}
+    assert plan.nodes["renderer"].parameters["rate_hz"] == 20.0
+    assert plan.nodes["renderer"].nice == demo.nodes["renderer"].nice
+    calibration = plan.nodes["triangulator"].parameters["calibration"]
+    assert calibration == demo.nodes["triangulator"].parameters["calibration"]
+    assert plan.scene_file == str(ROOT / "launch/scenes/organ.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("extends: demmo\n", 'graph.yaml:1: extends: "demmo" does not exist; name a file, or a'),
+        ("extends: graph.yaml\n", "graph.yaml:1: extends: "),
+        ("extends: demo\nscene: nowhere\n", 'graph.yaml:2: scene: "nowhere" does not exist'),
+        ("extends: demo\nnodes: {planner: {nise: 1}}\n", "graph.yaml:2: nodes.planner.nise: unkno"),
+        ((ROOT / "launch/scenes/plane.yaml").read_text(), "is a scene, not a launch file"),
+    ],
+)
+def test_an_error_of_an_extension_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    errors = complaint(tmp_path, text)
+    assert said in errors
+    assert len(errors.splitlines()) == 1
+
+
+def test_an_error_in_an_extended_file_names_that_file(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(GRAPH.replace("rate_hz: 20", "rate_hz: fast"))
+    assert "base.yaml:6: nodes.beacon.parameters.rate_hz" in complaint(
+        tmp_path, "extends: base.yaml\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("type_name", "remedy"),
+    [
+        ("no.such:Thing", "run the command in the folder that contains no/such.py, add that"),
+        ("tests.launch_nodes:Thing", "define the class Thing in tests.launch_nodes"),
+    ],
+)
+def test_a_node_that_cannot_be_imported_names_one_remedy(
+    tmp_path: Path, type_name: str, remedy: str
+) -> None:
+    errors = complaint(tmp_path, GRAPH.replace(f"type: {BEACON}", f"type: {type_name}"))
+    assert remedy in errors
+    assert len(errors.splitlines()) == 1, "the listener's topic without a writer follows from it"
+
+
+def test_another_scene_is_a_setting(tmp_path: Path) -> None:
+    plan = load_graph(ROOT / "launch/demo.yaml", settings=["scene=launch/scenes/plane.yaml"])
+    assert plan.scene is not None
+    assert plan.scene["object"]["geometry"]["shape"] == "plane"
+    wrong = complaint(tmp_path, "extends: demo\n", settings=["scene=none.yaml"])
+    assert wrong.splitlines()[0].startswith("--scene none.yaml: scene: ")

@@ -1,68 +1,11 @@
-"""Draw the node graph as SVG.
+"""Define the drawings of the node graph in the documentation.
 
 The positions of boxes and arrows are constants.  A test compares the arrows with the launch files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
-Position = tuple[float, float]
-
-WIDTH, HEIGHT = 132, 34
-"""Size of a box, px."""
-
-STYLE = """
-  text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
-  .label { font-size: 11.5px; fill: #57606a; paint-order: stroke; stroke: #ffffff;
-    stroke-width: 4px }
-  .host { fill: none; stroke: #8c959f; stroke-dasharray: 5 4 }
-  .box { fill: #eef2ff; stroke: #4f5fb0 }
-  .device { fill: #f6f8fa; stroke: #8c959f }
-  .arrow { fill: none; stroke: #57606a; stroke-width: 1.4 }
-  .wire { stroke-dasharray: 4 3 }
-  #head { fill: #57606a }
-  @media (prefers-color-scheme: dark) {
-    text { fill: #e6edf3 }
-    .label { fill: #a5adba; stroke: #14151a }
-    .box { fill: #232a4d; stroke: #8794dd }
-    .device { fill: #22262e }
-    .arrow { stroke: #a5adba }
-    #head { fill: #a5adba }
-  }
-"""
-
-
-@dataclass(frozen=True)
-class Arrow:
-    """Topics from one node to another, or a connection to a device (wire).
-
-    path: points of the SVG polyline; label_at: position of the label.
-    """
-
-    writer: str
-    reader: str
-    topics: tuple[str, ...]
-    path: str
-    label_at: Position
-    wire: str = ""
-    is_bidirectional: bool = False
-
-
-@dataclass(frozen=True)
-class GraphDrawing:
-    """Drawing of a graph.
-
-    hosts: left, top, width and height by name.  boxes, devices: centres by name.
-    """
-
-    title: str
-    size: tuple[int, int]
-    hosts: dict[str, tuple[float, float, float, float]]
-    boxes: dict[str, Position]
-    devices: dict[str, Position]
-    arrows: Sequence[Arrow]
+from flexsheet.launch.plans.drawing import Arrow, GraphDrawing, Position
 
 
 def _arrow(writer: str, reader: str, topics: str, path: str, label_at: Position) -> Arrow:
@@ -174,42 +117,3 @@ TWIN = GraphDrawing(
 )
 
 DRAWINGS = {"graph.svg": LAB, "graph-twin.svg": TWIN}
-
-
-def svg(drawing: GraphDrawing) -> str:
-    """Return the drawing as an SVG file, for light and dark colour schemes."""
-    width, height = drawing.size
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" role="img" aria-label="{drawing.title}">',
-        f"<style>{STYLE}</style>",
-        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
-        'markerHeight="7" orient="auto-start-reverse"><path id="head" d="M0 0L8 4L0 8z"/>'
-        "</marker></defs>",
-    ]
-    for name, (left, top, w_px, h_px) in drawing.hosts.items():
-        lines.append(
-            f'<rect class="host" x="{left}" y="{top}" width="{w_px}" height="{h_px}" rx="8"/>'
-        )
-        lines.append(
-            f'<text class="label" x="{left + 10}" y="{top + 18}" '
-            f'style="text-anchor:start">{name}</text>'
-        )
-    for arrow in drawing.arrows:
-        start = ' marker-start="url(#tip)"' if arrow.is_bidirectional else ""
-        kind = "arrow wire" if arrow.wire else "arrow"
-        lines.append(
-            f'<polyline class="{kind}" points="{arrow.path}" marker-end="url(#tip)"{start}/>'
-        )
-    for kind, positions in (("box", drawing.boxes), ("device", drawing.devices)):
-        for name, (x, y) in positions.items():
-            round_px = 5 if kind == "box" else HEIGHT // 2
-            lines.append(
-                f'<rect class="{kind}" x="{x - WIDTH / 2:g}" y="{y - HEIGHT / 2:g}" '
-                f'width="{WIDTH}" height="{HEIGHT}" rx="{round_px}"/>'
-            )
-            lines.append(f'<text x="{x}" y="{y + 4.5}">{name}</text>')
-    for arrow in drawing.arrows:
-        (x, y), label = arrow.label_at, arrow.wire or ", ".join(arrow.topics)
-        lines.append(f'<text class="label" x="{x}" y="{y}">{label}</text>')
-    return "\n".join([*lines, "</svg>", ""])

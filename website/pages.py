@@ -16,6 +16,7 @@ from pathlib import Path
 
 from benchmarks import soft_body_size
 from flexsheet.launch.methods import charts
+from flexsheet.launch.plans.drawing import svg
 from website import (
     apparatus_figure,
     arm_states_page,
@@ -29,7 +30,7 @@ from website import (
     tolerances_page,
     tracking_page,
 )
-from website.graph import DRAWINGS, svg
+from website.graph import DRAWINGS
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

@@ -7,11 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import (
+    CYLINDER,
+    CalibratedOption,
+    JsonOption,
+    ProfileOption,
+    SceneOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
-    CommandError,
     examples,
     print_json,
     print_table,
@@ -23,14 +27,6 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Draw and show true parameters of the simulation, as differences from the scene.",
 )
-
-SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
-PROFILES = ("modern", "paper")
-
-SceneOption = Annotated[
-    Path,
-    typer.Option("--scene", metavar="FILE", help="Scene file.", autocompletion=complete.yaml_files),
-]
 
 
 @app.command(
@@ -47,19 +43,10 @@ def sample(
             min=0, help="Seed of the draw; 0 to 99 are for development, others for evaluation."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="New file.")],
-    profile: Annotated[
-        str,
-        typer.Option(
-            metavar="|".join(PROFILES),
-            help="modern: 60 Hz camera; paper: the equipment of the paper.",
-        ),
-    ] = "modern",
-    calibrated: Annotated[
-        bool,
-        typer.Option("--calibrated", help="Draw what remains after the laboratory has calibrated."),
-    ] = False,
-    scene: SceneOption = SCENE_FILE,
+    output: Annotated[Path, output_file("Apparatus file to write.")],
+    profile: ProfileOption = "modern",
+    calibrated: CalibratedOption = False,
+    scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
     """Draw an apparatus from the table of tolerances, and write it to a file."""
@@ -68,10 +55,6 @@ def sample(
     from flexsheet.messages.files import write_file
     from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
 
-    if profile not in PROFILES:
-        raise CommandError(
-            f'--profile: unknown profile "{profile}"; write {" or ".join(PROFILES)}', BAD_INPUT
-        )
     drawn = sample_apparatus(
         load_scene(scene), seed, profile=Profile(profile), calibrated=calibrated
     )
@@ -93,7 +76,7 @@ def show(
     apparatus: Annotated[
         str, typer.Argument(metavar="FILE|seed:N", help="Apparatus file, or a draw.")
     ],
-    scene: SceneOption = SCENE_FILE,
+    scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
     """Check an apparatus, and list how it differs from its scene.

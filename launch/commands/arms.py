@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
+from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.options import JsonOption, RunOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -51,7 +52,6 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     raise typer.Exit(run_interruptible(_command(run, None, lambda arms: len(arms) == 2, as_json)))
 
 
-@app.command("ready", hidden=True, epilog=examples("flexsheet arms ready"))
 @app.command(epilog=examples("flexsheet arms enable"))
 def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
     """Allow the arms to move; make sure first that nobody is near them.
@@ -68,7 +68,6 @@ def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
     )
 
 
-@app.command("stand-down", hidden=True, epilog=examples("flexsheet arms stand-down"))
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
 def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False) -> None:
     """Stop both arms and slacken the sheet, until `flexsheet arms enable`."""

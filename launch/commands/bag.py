@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
+from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.options import (
+    BagArgument,
+    DurationOption,
+    JsonOption,
+    RunOption,
+    TopicsOption,
+    find_launch_file,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -39,29 +49,26 @@ app = typer.Typer(
     help="Record, play and analyse bags, which are MCAP files of recorded topics.",
 )
 
-BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="Bag file.", autocompletion=complete.bags)
-]
-TopicsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        help="Topic to use; repeat for several; default: all.",
-        autocompletion=complete.topics,
-    ),
-]
+FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", hidden=True)]
 
 
 @app.command(
     epilog=examples(
-        "flexsheet bag record session.mcap",
-        "flexsheet bag record fingers.mcap --topic fingertip --duration 10",
-        "flexsheet bag record with-pictures.mcap --include stereo",
+        "flexsheet bag record",
+        "flexsheet bag record -o session.mcap --include stereo",
+        "flexsheet bag record -o fingers.mcap --topic fingertip --duration 10",
+        "flexsheet bag record -o hour.mcap --max-bag-duration 600 --max-bag-size 500",
     )
 )
 def record(
     *,
-    bag: BagArgument,
+    bag: Annotated[
+        Path | None, typer.Argument(metavar="BAG", help="Bag file to write, as with --output.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        output_file("Bag file to write; default: a file in runs/ named after the time.", "BAG"),
+    ] = None,
     topics: TopicsOption = None,
     include: Annotated[
         list[str] | None,
@@ -72,70 +79,102 @@ def record(
             autocompletion=complete.topics,
         ),
     ] = None,
-    also: Annotated[
-        list[str] | None, typer.Option("--also", hidden=True, help="Former name of --include.")
-    ] = None,
-    duration: Annotated[
+    max_size_mb: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", help="Duration of the recording, s; default: until Ctrl-C."
+            "-b",
+            "--max-bag-size",
+            metavar="MB",
+            min=1.0,
+            help="Size at which another bag is started: BAG-2.mcap, BAG-3.mcap and so on.",
         ),
     ] = None,
+    max_duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "-d",
+            "--max-bag-duration",
+            metavar="SECONDS",
+            min=1.0,
+            help="Duration at which another bag is started.",
+        ),
+    ] = None,
+    duration: DurationOption = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Record the topics of the running graph until Ctrl-C; default: all topics that are logged."""
     running = running_graph(run)
-    if bag.exists():
+    target = output or bag or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}.mcap"
+    if target.exists():
         raise CommandError(
-            f"{bag}: the file exists and is not overwritten; name a new file", BAD_INPUT
+            f"{target}: the file exists and is not overwritten; name a new file", BAD_INPUT
         )
     logs_on_stderr()
-    included = [*(include or ()), *(also or ())]
+    limits = {
+        "max_bag_bytes": None if max_size_mb is None else round(1e6 * max_size_mb),
+        "max_bag_duration_s": max_duration_s,
+    }
     run_interruptible(
-        _record(bag, topics=topics or [], include=included, running=running, seconds=duration)
+        _record(
+            target,
+            topics=topics or [],
+            include=include or [],
+            limits=limits,
+            running=running,
+            seconds=duration,
+        )
     )
+    bags = sorted(target.parent.glob(f"{target.stem}-*{target.suffix}"))
+    bags = [target, *(one for one in bags if one.stem.removeprefix(f"{target.stem}-").isdigit())]
     if as_json:
-        print_json({"bag": str(bag)})
+        print_json({"bag": str(target), "bags": [str(one) for one in bags]})
     else:
-        words.print(f"recorded {bag}", markup=False)
+        words.print(f"recorded {', '.join(map(str, bags))}", markup=False)
 
 
 @app.command(
     epilog=examples(
-        "flexsheet bag play session.mcap --rate 0.5",
-        "flexsheet bag play session.mcap --topic twin/finger_path --launch graph.yaml",
+        "flexsheet bag play session.mcap -r 0.5",
+        "flexsheet bag play session.mcap --launch replay",
     )
 )
 def play(
     *,
     bag: BagArgument,
     rate: Annotated[
-        float, typer.Option(help="Playback speed as a factor of real time.", min=0.01)
+        float,
+        typer.Option(
+            "-r",
+            "--rate",
+            metavar="FACTOR",
+            min=0.01,
+            help="Playback speed as a factor of real time.",
+        ),
     ] = 1.0,
     start: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Start position in the bag, s.", min=0.0)
+        float, typer.Option(metavar="SECONDS", help="Start position in the bag.", min=0.0)
     ] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Repeat playback until Ctrl-C.")] = False,
+    loop: Annotated[
+        bool, typer.Option("-l", "--loop", help="Repeat playback until Ctrl-C.")
+    ] = False,
     topics: TopicsOption = None,
     launch: Annotated[
         Path | None,
         typer.Option(
             "--launch",
-            metavar="FILE",
-            help="Launch file to start before playback and stop after it.",
-            autocompletion=complete.yaml_files,
+            metavar="LAUNCH_FILE",
+            help="Launch file of a graph to start before playback and stop after it.",
+            autocompletion=complete.launch_files,
+            callback=find_launch_file,
         ),
-    ] = None,
-    into: Annotated[
-        Path | None, typer.Option("--into", hidden=True, help="Former name of --launch.")
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Play the topics of a bag that are `external_topics` of the graph's launch file."""
     request = PlayRequest(bag, tuple(topics or ()), rate, start, loop, as_json)
-    raise typer.Exit(run_interruptible(_play(request, launch or into, run)))
+    raise typer.Exit(run_interruptible(_play(request, launch, run)))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
@@ -168,15 +207,17 @@ def info(bag: BagArgument, as_json: JsonOption = False) -> None:
     )
 
 
-@app.command(epilog=examples("flexsheet bag recover cut.mcap whole.mcap"))
+@app.command(epilog=examples("flexsheet bag recover cut.mcap -o whole.mcap"))
 def recover(
     bag: BagArgument,
-    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Recovered bag to write.")],
+    target: FormerOutput = None,
+    output: Annotated[Path | None, output_file("Recovered bag to write.", "BAG")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write the readable messages of a truncated or damaged bag to a new bag."""
     from flexsheet.messages.bag import recover as recover_bag
 
+    output = _require_output(output or target)
     with progress_bar(f"recovering {bag.name}") as progress:
         report = recover_bag(bag, output, progress=progress)
     if as_json:
@@ -198,19 +239,21 @@ def recover(
 
 @app.command(
     epilog=examples(
-        "flexsheet bag export session.mcap for-foxglove.mcap",
-        "flexsheet bag export session.mcap small.mcap --topic fingertip --topic sheet_target",
+        "flexsheet bag export session.mcap -o for-foxglove.mcap",
+        "flexsheet bag export session.mcap -o small.mcap --topic fingertip --topic sheet_target",
     )
 )
 def export(
     bag: BagArgument,
-    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="MCAP file to write.")],
+    target: FormerOutput = None,
+    output: Annotated[Path | None, output_file("MCAP file to write.")] = None,
     topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Convert a bag to an MCAP file for Foxglove and Rerun."""
     from flexsheet.launch.bags.export import export as export_bag
 
+    output = _require_output(output or target)
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
     if result.unreadable:
@@ -228,11 +271,12 @@ def export(
 
 @app.command(
     epilog=examples(
-        "flexsheet bag verify planner session.mcap",
-        "flexsheet bag verify triangulator session.mcap --tolerance 1e-9 --json",
+        "flexsheet bag verify session.mcap planner",
+        "flexsheet bag verify session.mcap triangulator --tolerance 1e-9 --json",
     )
 )
 def verify(
+    bag: BagArgument,
     node: Annotated[
         str,
         typer.Argument(
@@ -240,7 +284,6 @@ def verify(
             autocompletion=complete.node_types,
         ),
     ],
-    bag: BagArgument,
     tolerance: Annotated[
         float,
         typer.Option(
@@ -257,6 +300,8 @@ def verify(
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
+    if node.endswith(".mcap") and bag.suffix != ".mcap":  # the former order
+        bag, node = Path(node), str(bag)
     logs_on_stderr()
     with progress_bar(f"replaying {node} twice with {bag.name}") as progress:
         result = verify_node(bag, node, tolerance=tolerance, progress=progress)
@@ -281,13 +326,7 @@ def verify(
 def report(
     bag: BagArgument,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE.html",
-            help="HTML file to write; default: next to the bag.",
-        ),
+        Path | None, output_file("HTML file to write; default: next to the bag.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -308,6 +347,49 @@ def report(
     for finding in result["findings"]:
         words.print(f"{finding['gravity']}: {finding['text']}", markup=False)
     print(page)
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet bag plot session.mcap fingertip.position_m",
+        "flexsheet bag plot session.mcap arm_left.joints_rad sheet_target.stretch_ratio -o a.svg",
+    )
+)
+def plot(
+    bag: BagArgument,
+    fields: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="TOPIC.FIELD...",
+            help="Numeric fields, such as fingertip.position_m; one chart for each.",
+        ),
+    ],
+    output: Annotated[
+        Path | None, output_file("Image file to write (.svg, .png); default: next to the bag.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Plot fields of recorded topics over time; with --json, print their values instead.
+
+    With --json, an image is written only if --output is given.
+    """
+    from flexsheet.launch.bags.plot import draw_fields, read_fields
+
+    with progress_bar(f"reading {bag.name}") as progress:
+        series = read_fields(bag, fields, progress)
+    image = output if as_json else output or bag.with_suffix(".svg")
+    if image is not None:
+        draw_fields(series, image, title=bag.name)
+    if as_json:
+        print_json([one.to_json() for one in series])
+    else:
+        print(image)
+
+
+def _require_output(output: Path | None) -> Path:
+    if output is None:
+        raise CommandError("missing the file to write; add --output FILE", BAD_INPUT)
+    return output
 
 
 def _print_verification(result: Verification) -> None:
@@ -380,6 +462,7 @@ async def _record(
     *,
     topics: list[str],
     include: list[str],
+    limits: dict[str, Any],
     running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
@@ -399,6 +482,7 @@ async def _record(
         topics=tuple(topics),
         include=tuple(include),
         attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
+        **limits,
     )
     written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
     names = Recorder.further_inputs(parameters, written)

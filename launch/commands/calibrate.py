@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SeedOption, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -44,10 +44,14 @@ BoardOption = Annotated[
     str,
     typer.Option(metavar="COLUMNSxROWS", help="Number of inner corners of the board, such as 9x6."),
 ]
-SquareOption = Annotated[float, typer.Option(help="Side length of a board square, mm.", min=1e-3)]
+SquareOption = Annotated[
+    float, typer.Option(metavar="MM", help="Side length of a board square, mm.", min=1e-3)
+]
 MarkerOption = Annotated[
     float | None,
-    typer.Option(help="Side length of a ChArUco marker, mm; default: a chessboard.", min=1e-3),
+    typer.Option(
+        metavar="MM", help="Side length of a ChArUco marker, mm; default: a chessboard.", min=1e-3
+    ),
 ]
 DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
 FOUR_BITS = "DICT_4X4_50"
@@ -65,16 +69,9 @@ def stereo(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Stereo calibration file to write.")
-    ],
-    left: Annotated[
-        str | None, typer.Option(metavar="GLOB", help="Pattern of the left images, sorted by name.")
-    ] = None,
-    right: Annotated[
-        str | None,
-        typer.Option(metavar="GLOB", help="Pattern of the right images, sorted by name."),
-    ] = None,
+    output: Annotated[Path, output_file("Stereo calibration file to write.")],
+    left: LeftOption = "",
+    right: RightOption = "",
     device_source: Annotated[
         str | None,
         typer.Option(
@@ -95,7 +92,7 @@ def stereo(
         Path | None,
         typer.Option(metavar="SCENE", help="Scene file whose camera is simulated."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed of the simulated poses and noise.")] = 1,
+    seed: SeedOption = 1,
     pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="New folder for captured images.")
@@ -136,7 +133,7 @@ def stereo(
     scene: Scene | None = None
     command = ["flexsheet", "calibrate", "stereo"]
     try:
-        if left is not None and right is not None:
+        if left and right:
             left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
             command += ["--left", left, "--right", right]
             scene = None if scene_file is None else load_scene(scene_file)
@@ -346,9 +343,7 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Image file to write (.svg or .png).")
-    ],
+    output: Annotated[Path, output_file("Image file to write (.svg or .png).", "IMAGE")],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
@@ -374,12 +369,12 @@ def _format(value: object) -> str:
 
 
 def _check_single_source(
-    left: str | None, right: str | None, device_source: str | None, twin: Path | None
+    left: str, right: str, device_source: str | None, twin: Path | None
 ) -> None:
     """Raise CommandError unless exactly one source of images is chosen."""
-    files = left is not None or right is not None
+    files = bool(left or right)
     chosen = [files, device_source is not None, twin is not None]
-    if sum(chosen) != 1 or (files and (left is None or right is None)):
+    if sum(chosen) != 1 or (files and not (left and right)):
         raise CommandError(
             "give exactly one source of images: --left with --right, --device-source with --scene, "
             "or --twin",

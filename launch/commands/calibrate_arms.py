@@ -26,7 +26,14 @@ from flexsheet.launch.commands.calibrate import (
     load_optics,
     round_digits,
 )
-from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible
+from flexsheet.launch.commands.graph import run_interruptible
+from flexsheet.launch.commands.options import (
+    JsonOption,
+    RunOption,
+    SceneOption,
+    SeedOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -45,9 +52,6 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.types import Side
 
-SceneOption = Annotated[
-    Path, typer.Option("--scene", metavar="SCENE", help="Scene file with the camera's pose.")
-]
 CalibrationOption = Annotated[
     Path | None,
     typer.Option(
@@ -88,7 +92,7 @@ def arms(
     scene_file: SceneOption,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Arm calibration file to write.")],
+    output: Annotated[Path, output_file("Arm calibration file to write.")],
     left_arm: Annotated[
         Path | None,
         typer.Option(
@@ -105,9 +109,7 @@ def arms(
         bool, typer.Option("--twin", help="Calibrate simulated arms instead of recorded poses.")
     ] = False,
     places: Annotated[int, typer.Option(help="Number of simulated poses per arm.", min=6)] = 16,
-    seed: Annotated[
-        int, typer.Option(help="Random seed of the simulated bases, poses and noise.")
-    ] = 1,
+    seed: SeedOption = 1,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
@@ -168,7 +170,7 @@ def write_scene(
         Path, typer.Argument(metavar="CALIBRATION", help="Arm calibration file.")
     ],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to copy.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")],
+    output: Annotated[Path, output_file("Scene file to write.")],
     as_json: JsonOption = False,
 ) -> None:
     """Copy a scene with the base poses of an arm calibration."""

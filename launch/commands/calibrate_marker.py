@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import (
+    CYLINDER,
+    JsonOption,
+    SceneOption,
+    SeedOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -22,8 +28,6 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.messages.marker_calibration import MarkerCalibration
-
-SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 
 def register(app: typer.Typer) -> None:
@@ -40,16 +44,12 @@ def register(app: typer.Typer) -> None:
 
 def marker(
     *,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Marker calibration file to write.")
-    ],
+    output: Annotated[Path, output_file("Marker calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="CSV file of touches; columns: docs/set-up-marker.md."),
     ] = None,
-    scene_file: Annotated[
-        Path, typer.Option("--scene", metavar="FILE", help="Scene file of the finger, for --rows.")
-    ] = SCENE_FILE,
+    scene_file: SceneOption = CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(metavar="SCENE", help="Scene file whose finger is simulated instead."),
@@ -64,7 +64,7 @@ def marker(
             "--calibration", metavar="FILE", help="Stereo calibration of the camera, for --twin."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed of the simulation.")] = 1,
+    seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Fit where the marker is on the finger, relative to the pad.

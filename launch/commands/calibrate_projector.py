@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands.calibrate import edit_scene, load_optics, round_digits
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SceneOption, SeedOption, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -46,15 +46,10 @@ def register(app: typer.Typer) -> None:
 
 def projector(
     *,
-    scene_file: Annotated[
-        Path,
-        typer.Option(
-            "--scene", metavar="FILE", help="Scene file with the projector's nominal data."
-        ),
-    ],
+    scene_file: SceneOption,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Scene file to write; may be that of --scene."),
+        output_file("Scene file to write; may be that of --scene."),
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -97,9 +92,7 @@ def projector(
         ),
     ] = False,
     poses: Annotated[int, typer.Option(min=3, help="Number of poses of the simulated sheet.")] = 6,
-    seed: Annotated[
-        int, typer.Option(help="Random seed of the simulated deviations and noise.")
-    ] = 1,
+    seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate the projector and write the result into a scene.

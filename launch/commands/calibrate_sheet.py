@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import (
+    CYLINDER,
+    JsonOption,
+    SceneOption,
+    SeedOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -25,8 +31,6 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.sheet_calibration import SheetCalibration
 
-SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
-
 
 def register(app: typer.Typer) -> None:
     """Add the command to `flexsheet calibrate`."""
@@ -41,19 +45,12 @@ def register(app: typer.Typer) -> None:
 
 def sheet(
     *,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Sheet calibration file to write.")
-    ],
+    output: Annotated[Path, output_file("Sheet calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="CSV file of measured pushes; columns: docs/sheet.md."),
     ] = None,
-    scene_file: Annotated[
-        Path,
-        typer.Option(
-            "--scene", metavar="FILE", help="Scene file of the measured sheet, for --rows."
-        ),
-    ] = SCENE_FILE,
+    scene_file: SceneOption = CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(
@@ -80,7 +77,7 @@ def sheet(
         float,
         typer.Option(help="Standard deviation of the simulated force gauge's noise, N.", min=0.0),
     ] = 0.005,
-    seed: Annotated[int, typer.Option(help="Random seed of the noise.")] = 1,
+    seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Fit modulus times thickness, slack width and cubic term of a sheet to measured forces.

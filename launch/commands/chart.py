@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import CYLINDER, JsonOption, SceneOption, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -24,8 +24,6 @@ from flexsheet.launch.commands.output import (
 from flexsheet.launch.methods.results import replace_non_finite
 
 app = typer.Typer(add_completion=False)
-
-SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 
 @app.command(
@@ -44,18 +42,10 @@ def chart(
             help="Method family to measure; default: all.", autocompletion=complete.families
         ),
     ] = None,
-    scene_file: Annotated[
-        Path,
-        typer.Option(
-            "--scene",
-            metavar="FILE",
-            help="Scene file for the measurements.",
-            autocompletion=complete.yaml_files,
-        ),
-    ] = SCENE_FILE,
-    output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="Folder for the charts and results.")
-    ] = Path("runs/charts"),
+    scene_file: SceneOption = CYLINDER,
+    output: Annotated[Path, output_file("Folder for the charts and results.", "FOLDER")] = Path(
+        "runs/charts"
+    ),
     redraw: Annotated[
         bool,
         typer.Option("--redraw", help="Redraw the results stored in --output without measuring."),

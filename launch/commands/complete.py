@@ -10,6 +10,8 @@ from pathlib import Path
 
 import typer
 
+from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file, list_shipped
+
 
 def topics(incomplete: str) -> list[str]:
     """Complete topic names."""
@@ -30,9 +32,10 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 
-    file = next((word for word in context.args if word.endswith((".yaml", ".yml"))), None)
+    found = (find_file(word, LAUNCH_FILES) for word in context.args)
+    file = next((path for path in found if path.suffix in (".yaml", ".yml")), None)
     try:
-        return [] if file is None else _filter(load_graph(Path(file)).hosts, incomplete)
+        return [] if file is None else _filter(load_graph(file).hosts, incomplete)
     except BadInputError:
         return []
 
@@ -85,6 +88,41 @@ def files(*suffixes: str) -> Callable[[str], list[str]]:
 
 bags = files(".mcap")
 yaml_files = files(".yaml", ".yml")
+
+
+def launch_files(incomplete: str) -> list[str]:
+    """Complete launch files, and the names of those of the package."""
+    return _filter(list_shipped(LAUNCH_FILES), incomplete) + yaml_files(incomplete)
+
+
+def scenes(incomplete: str) -> list[str]:
+    """Complete scene files, and the names of those of the package."""
+    return _filter(list_shipped(SCENES), incomplete) + yaml_files(incomplete)
+
+
+def nodes(incomplete: str) -> list[str]:
+    """Complete the nodes of the running graph and the node types."""
+    from flexsheet.launch.commands.graph import NoGraphError, running_graph
+
+    try:
+        running = list(running_graph(None)[0].nodes)
+    except NoGraphError:
+        running = []
+    return list(dict.fromkeys([*_filter(running, incomplete), *node_types(incomplete)]))
+
+
+def node_parameters(incomplete: str) -> list[str]:
+    """Complete NODE.PARAMETER of the running graph."""
+    from flexsheet.launch.commands.graph import NoGraphError, running_graph
+
+    try:
+        plan, _ = running_graph(None)
+    except NoGraphError:
+        return []
+    return _filter(
+        (f"{node.name}.{name}" for node in plan.nodes.values() for name in node.parameters),
+        incomplete,
+    )
 
 
 def _filter(names: Iterable[str], incomplete: str) -> list[str]:

@@ -8,15 +8,20 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.experiment import (
-    DEMO_FILE,
-    LaunchOption,
-    OutputOption,
-    SettingsOption,
     make_result_folder,
     print_followed,
     print_strokes,
 )
-from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
+from flexsheet.launch.commands.options import (
+    DEMO,
+    ApparatusOption,
+    JsonOption,
+    LaunchOption,
+    OtherSceneOption,
+    ResultFolderOption,
+    SettingsOption,
+    with_scene,
+)
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
 
 app = typer.Typer(add_completion=False)
@@ -27,7 +32,8 @@ app = typer.Typer(add_completion=False)
 )
 def demo(
     *,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
     finger_path: Annotated[
@@ -39,19 +45,18 @@ def demo(
             autocompletion=complete.gestures,
         ),
     ] = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Stroke, tilt and push the simulated sheet on this computer, and draw the results."""
     from flexsheet.launch.experiments.demo import run_demo
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    path = None if finger_path is None else load_path(launch_file, finger_path)
+    given = with_scene(settings, scene)
+    path = None if finger_path is None else load_path(launch_file, finger_path, given)
     folder = make_result_folder(output, "demo")
     with progress_words() as progress:
-        result = run_demo(
-            launch_file, settings or (), folder, progress, path=path, apparatus=apparatus
-        )
+        result = run_demo(launch_file, given, folder, progress, path=path, apparatus=apparatus)
     if as_json:
         print_json(
             {

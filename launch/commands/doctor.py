@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -83,20 +82,9 @@ def doctor(
     epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml -o reach.png"),
 )
 def check_scene(
-    scene_file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SCENE", help="Scene file to check.", autocompletion=complete.yaml_files
-        ),
-    ],
+    scene_file: SceneArgument,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            help="Image file for the reachable range (.png or .svg).",
-        ),
+        Path | None, output_file("Image file for the reachable range (.png or .svg).", "IMAGE")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -30,12 +29,7 @@ def register(app: typer.Typer) -> None:
 
 
 def compliance(
-    scene_file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SCENE", help="Scene file to check.", autocompletion=complete.yaml_files
-        ),
-    ],
+    scene_file: SceneArgument,
     calibration: Annotated[
         Path | None,
         typer.Option(

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption, running_graph
+from flexsheet.launch.commands.graph import running_graph
+from flexsheet.launch.commands.options import JsonOption, find_launch_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -47,20 +48,22 @@ def hosts(
         typer.Argument(
             metavar="LAUNCH_FILE",
             help="Launch file; default: that of the graph running on this computer.",
-            autocompletion=complete.yaml_files,
+            autocompletion=complete.launch_files,
+            callback=find_launch_file,
         ),
     ] = None,
     host: Annotated[
         str | None,
         typer.Option(
+            metavar="HOST",
             help="Host name of this computer in the launch file; default: found by its address.",
             autocompletion=complete.hosts,
         ),
     ] = None,
-    patience: Annotated[
+    timeout: Annotated[
         float,
         typer.Option(
-            metavar="SECONDS", help="Maximum time to wait for the hosts' answers, s.", min=1.5
+            metavar="SECONDS", help="Maximum time to wait for the hosts' answers.", min=1.5
         ),
     ] = TIMEOUT_S,
     as_json: JsonOption = False,
@@ -74,7 +77,7 @@ def hosts(
     if run is not None and run.host not in (None, here):
         run = None
     with words.status("checking all hosts"):
-        findings = asyncio.run(check_hosts(plan, here, run, patience))
+        findings = asyncio.run(check_hosts(plan, here, run, timeout))
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
     else:

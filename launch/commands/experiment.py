@@ -8,8 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
+from flexsheet.launch.commands.options import (
+    DEMO,
+    ApparatusOption,
+    JsonOption,
+    LaunchOption,
+    OtherSceneOption,
+    ResultFolderOption,
+    SchedulerOption,
+    SettingsOption,
+    WorkersOption,
+    split_names,
+    with_scene,
+)
 from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
     examples,
     print_json,
     print_table,
@@ -27,29 +41,10 @@ app = typer.Typer(
     help="Run the paper's experiments on a graph.",
 )
 
-DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
-
-LaunchOption = Annotated[
-    Path,
+StrokeOption = Annotated[
+    float,
     typer.Option(
-        "--launch",
-        metavar="FILE",
-        help="Launch file of the graph.",
-        autocompletion=complete.yaml_files,
-    ),
-]
-OutputOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        metavar="FOLDER",
-        help="Folder for the bag and results; default: a new folder in runs/.",
-    ),
-]
-SettingsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
+        "--duration", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke."
     ),
 ]
 BothEyesOption = Annotated[
@@ -64,23 +59,8 @@ MapOption = Annotated[
     Path | None,
     typer.Option(
         "--map",
-        metavar="FILE.png",
-        help="Image file for a map of the error at each visible point; doubles the duration.",
-    ),
-]
-WorkersOption = Annotated[
-    int,
-    typer.Option(
-        "--workers", min=1, max=64, help="Number of simultaneous trials on this computer."
-    ),
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Address of a dask.distributed scheduler whose workers run the trials, such as "
-        "tcp://host:8786; default: this computer.",
+        metavar="IMAGE",
+        help="Image file (.png) of the error at each visible point; doubles the duration.",
     ),
 ]
 
@@ -97,7 +77,7 @@ def make_result_folder(output: Path | None, name: str) -> Path:
 
 def _record(
     launch_file: Path,
-    settings: list[str] | None,
+    settings: list[str],
     bag: Path,
     procedure: Procedure,
     progress: Progress,
@@ -106,22 +86,20 @@ def _record(
 ) -> None:
     from flexsheet.launch.experiments.run import run_experiment
 
-    run_experiment(launch_file, settings or (), bag, procedure, progress, apparatus=apparatus)
+    run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
     progress("reading the bag")
 
 
 @app.command(
     epilog=examples(
-        "flexsheet experiment stroke --seconds 30",
+        "flexsheet experiment stroke --duration 30",
         "flexsheet experiment stroke --set triangulator.tracking=none --json",
         "flexsheet experiment stroke --repeats 10 --ablations --radii --output runs/table-1",
     )
 )
 def stroke(
     *,
-    seconds: Annotated[
-        float, typer.Option(min=1.0, max=600.0, help="Duration of the motion, s.")
-    ] = 10.0,
+    seconds: StrokeOption = 10.0,
     repeats: Annotated[
         int,
         typer.Option(
@@ -144,16 +122,20 @@ def stroke(
     ] = False,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Stroke the cylinder over 60 degrees, and measure the sheet's errors (section V, Table I).
 
     With several strokes or variants, the same --output continues an interrupted sweep.
     """
+    given = with_scene(settings, scene)
+    if radii and scene is not None:
+        raise CommandError("--radii: measures the shipped cylinders; remove --scene", BAD_INPUT)
     if repeats > 1 or ablations or radii:
         from flexsheet.launch.experiments import stroke_table
 
@@ -164,7 +146,7 @@ def stroke(
         with progress_words() as progress:
             table = stroke_table.run_stroke_table(
                 variants,
-                settings or (),
+                given,
                 folder,
                 progress,
                 seconds=seconds,
@@ -183,7 +165,7 @@ def stroke(
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = make_stroke_procedure([seconds], progress)
-        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
         result = experiment.stroke_result(recording, errors, seconds, bag)
@@ -199,10 +181,11 @@ def tilt(
     *,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure image errors on an inclined sheet (section VI-B, Fig. 11)."""
@@ -213,7 +196,7 @@ def tilt(
         TILT,
         bag,
         launch_file,
-        settings,
+        with_scene(settings, scene),
         map_file=map_file,
         both_eyes=both_eyes,
         apparatus=apparatus,
@@ -246,10 +229,11 @@ def push(
     ] = 0.0,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure image errors on a pushed sheet (section VI-C, Fig. 13).
@@ -262,7 +246,7 @@ def push(
 
     settings = [
         *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
-        *(settings or ()),
+        *with_scene(settings, scene),
     ]
     bag, series = (
         make_result_folder(output, "push") / "push.mcap",
@@ -283,10 +267,11 @@ def push(
 @app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
 def compliance(
     *,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the force on the finger with the object's force, over the push depth."""
@@ -297,7 +282,8 @@ def compliance(
     bag, image = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
         procedure = experiment.make_compliance_procedure(progress)
-        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+        given = with_scene(settings, scene)
+        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
     if as_json:
@@ -323,7 +309,7 @@ def _measure_images(
     series: Series,
     bag: Path,
     launch_file: Path,
-    settings: list[str] | None,
+    settings: list[str],
     *,
     map_file: Path | None,
     both_eyes: bool,
@@ -372,31 +358,34 @@ def _print_rows(
         words.print(f"map: {map_file}")
 
 
-@app.command(epilog=examples("flexsheet experiment gestures --names tap,stop"))
+@app.command(epilog=examples("flexsheet experiment gestures --gesture tap --gesture stop"))
 def gestures(
     *,
     names: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            "--names",
-            metavar="NAME,...",
-            help="Gestures to run, separated by commas; default: all.",
+            "--gesture",
+            metavar="NAME",
+            help="Gesture to run; repeat for several; default: all.",
+            autocompletion=complete.gestures,
         ),
     ] = None,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the tracking error of a fingertip in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
 
-    selected = experiment.select_gestures(names)
+    selected = experiment.select_gestures(split_names(names))
     bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.make_gestures_procedure(selected, progress)
-        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+        given = with_scene(settings, scene)
+        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.gestures_result(bag, selected)
     if as_json:
         print_json(result)

@@ -8,16 +8,25 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.experiment import (
-    DEMO_FILE,
-    LaunchOption,
-    OutputOption,
-    SchedulerOption,
-    SettingsOption,
-    WorkersOption,
+    StrokeOption,
     make_result_folder,
     print_followed,
 )
-from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
+from flexsheet.launch.commands.options import (
+    DEMO,
+    ApparatusOption,
+    CalibratedOption,
+    JsonOption,
+    LaunchOption,
+    OtherSceneOption,
+    ProfileOption,
+    ResultFolderOption,
+    SchedulerOption,
+    SettingsOption,
+    WorkersOption,
+    split_names,
+    with_scene,
+)
 from flexsheet.launch.commands.output import (
     examples,
     print_json,
@@ -25,22 +34,6 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
-from flexsheet.nodes.twin.tolerance_table import Profile
-
-ProfileOption = Annotated[
-    Profile, typer.Option("--profile", help="Equipment of the laboratory that is drawn.")
-]
-CalibratedOption = Annotated[
-    bool,
-    typer.Option(
-        "--calibrated",
-        "--commissioned",
-        help="Draw what remains after the devices' calibration.",
-    ),
-]
-SecondsOption = Annotated[
-    float, typer.Option("--seconds", min=1.0, max=600.0, help="Duration of each stroke, s.")
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -54,7 +47,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         epilog=examples(
             "flexsheet experiment sensitivity --calibrated",
-            "flexsheet experiment sensitivity --parameters sheet.modulus_ratio --json",
+            "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
         )
     )(sensitivity)
     app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))(
@@ -72,17 +65,18 @@ def robustness(
             help="Draws to evaluate; 0-99 are for development, the others for reports.",
         ),
     ],
-    profile: ProfileOption = Profile.MODERN,
+    profile: ProfileOption = "modern",
     calibrated: CalibratedOption = False,
-    seconds: SecondsOption = 10.0,
+    seconds: StrokeOption = 10.0,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
     keep_bags: Annotated[
         bool, typer.Option("--keep-bags", help="Keep the bag of each trial in the folder.")
     ] = False,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate drawn apparatuses: sheet, fingertip, image and force over many laboratories.
@@ -91,17 +85,18 @@ def robustness(
     rest, without the graph. The same --output continues an interrupted sweep.
     """
     from flexsheet.launch.experiments import robustness as experiment
+    from flexsheet.nodes.twin.tolerance_table import Profile
 
     selected = experiment.parse_seeds(seeds)
     folder = make_result_folder(output, "robustness")
     with progress_words() as progress:
         result = experiment.run_robustness(
             launch_file,
-            settings or (),
+            with_scene(settings, scene),
             folder,
             selected,
             progress,
-            profile=profile,
+            profile=Profile(profile),
             calibrated=calibrated,
             seconds=seconds,
             workers=workers,
@@ -132,11 +127,11 @@ def robustness(
 def sensitivity(
     *,
     parameters: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            "--parameters",
-            metavar="KEY,...",
-            help="Rows of the table of tolerances, separated by commas; default: all.",
+            "--parameter",
+            metavar="KEY",
+            help="Row of the table of tolerances; repeat for several; default: all.",
         ),
     ] = None,
     with_graph: Annotated[
@@ -147,14 +142,15 @@ def sensitivity(
             "four strokes each.",
         ),
     ] = False,
-    profile: ProfileOption = Profile.MODERN,
+    profile: ProfileOption = "modern",
     calibrated: CalibratedOption = False,
-    seconds: SecondsOption = 10.0,
+    seconds: StrokeOption = 10.0,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure what each tolerance does alone, at 1 and 3 standard deviations on both sides.
@@ -164,18 +160,19 @@ def sensitivity(
     """
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.launch.experiments.pictures import draw_sensitivity
+    from flexsheet.nodes.twin.tolerance_table import Profile
 
-    selected = experiment.select_parameters(parameters)
+    selected = experiment.select_parameters(split_names(parameters))
     folder = make_result_folder(output, "sensitivity")
     image = folder / "sensitivity.png"
     with progress_words() as progress:
         result = experiment.run_sensitivity(
             launch_file,
-            settings or (),
+            with_scene(settings, scene),
             folder,
             selected,
             progress,
-            profile=profile,
+            profile=Profile(profile),
             calibrated=calibrated,
             with_graph=with_graph,
             seconds=seconds,
@@ -228,10 +225,11 @@ def follow(
             autocompletion=complete.gestures,
         ),
     ],
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    output: OutputOption = None,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Follow a recorded finger, and compare with what the arms' limits allow.
@@ -241,12 +239,11 @@ def follow(
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    path = load_path(launch_file, finger_path)
+    given = with_scene(settings, scene)
+    path = load_path(launch_file, finger_path, given)
     bag = make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:
-        result = experiment.run_follow(
-            launch_file, settings or (), bag, path, progress, apparatus=apparatus
-        )
+        result = experiment.run_follow(launch_file, given, bag, path, progress, apparatus=apparatus)
     if as_json:
         print_json(result)
         return

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption
 from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
 from flexsheet.messages.errors import FlexsheetError
 
@@ -42,8 +42,15 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return the entries of all errors, node notes and fingertip rejection reasons."""
-    from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_REMEDIES, NodeNote
+    """Return the entries of all errors, notes of nodes, and reasons that the console shows."""
+    from flexsheet.messages.notes import (
+        FINGERTIP_REMEDIES,
+        SELF_CHECK_FINDINGS,
+        SELF_CHECK_REMEDIES,
+        SHEET_REASON_REMEDIES,
+        SHEET_REASON_TEXTS,
+        NodeNote,
+    )
 
     for package in PACKAGES:
         root = import_module(f"flexsheet.{package}")
@@ -57,7 +64,14 @@ def entries() -> tuple[Entry, ...]:
         ),
         *(Entry(note.code, note.phrase, note.remedy, phrase=note.phrase) for note in NodeNote),
         *(Entry(reason, "", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()),
-        *(Entry(cause, "", remedy) for cause, remedy in SELF_CHECK_REMEDIES.items()),
+        *(
+            Entry(reason, SHEET_REASON_TEXTS[reason], remedy, phrase=SHEET_REASON_TEXTS[reason])
+            for reason, remedy in SHEET_REASON_REMEDIES.items()
+        ),
+        *(
+            Entry(cause, SELF_CHECK_FINDINGS[cause], remedy, phrase=SELF_CHECK_FINDINGS[cause])
+            for cause, remedy in SELF_CHECK_REMEDIES.items()
+        ),
     )
 
 
@@ -79,11 +93,13 @@ def find_entries(text: str) -> list[Entry]:
     A text matches entries whose class name or phrase it contains; otherwise entries that have at
     least `MIN_SHARED_WORDS` words in common with it, weighted by rarity.
     """
-    if exact := [entry for entry in entries() if text in (entry.code, entry.name)]:
+    code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
+    if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:
         return exact
     words = _words(text)
     named = [entry for entry in entries() if entry.name and entry.name.lower() in words]
     contained = [entry for entry in entries() if entry.phrase and entry.phrase in text]
+    contained.sort(key=lambda entry: -len(entry.phrase))
     if named or contained:
         return named + contained
     known = {entry: _words(f"{entry.code} {entry.meaning} {entry.remedy}") for entry in entries()}

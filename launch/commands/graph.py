@@ -4,38 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError
+from flexsheet.launch.commands.output import BAD_INPUT, CommandError, words
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
-
-RunOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--run",
-        help="Directory of the run; default: the newest running graph.",
-        autocompletion=complete.runs,
-    ),
-]
-ApparatusOption = Annotated[
-    str | None,
-    typer.Option(
-        "--apparatus",
-        metavar="FILE|seed:N",
-        help="True parameters of the simulation: a file, or a draw such as "
-        "seed:7,paper,calibrated; default: the scene.",
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 class NoGraphError(CommandError):
@@ -66,6 +44,49 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]
     return ResolvedGraph.model_validate_json(run.plan_file.read_text()), run
+
+
+async def receive_until(
+    plan: ResolvedGraph,
+    run: Run,
+    handlers: Mapping[str, Callable[[Any], None]],
+    done: Callable[[], bool],
+    timeout_s: float,
+) -> bool:
+    """Pass messages to handlers by topic until `done()`; return whether it was in time."""
+    from flexsheet.launch.running.tools import make_subscriber
+
+    satisfied = asyncio.Event()
+
+    def make_handler(handle: Callable[[Any], None]) -> Callable[[Any, Any], None]:
+        def receive(message: Any, _: Any) -> None:
+            handle(message)
+            if done():
+                satisfied.set()
+
+        return receive
+
+    subscribers = [
+        make_subscriber(
+            topic,
+            plan,
+            run,
+            make_handler(handle),
+            on_problem=lambda text: words.print(text, markup=False),
+        )
+        for topic, handle in handlers.items()
+    ]
+    for each in subscribers:
+        each.start()
+    try:
+        async with asyncio.timeout(timeout_s):
+            await satisfied.wait()
+    except TimeoutError:
+        return False
+    finally:
+        for each in subscribers:
+            each.close()
+    return True
 
 
 def run_interruptible(work: Coroutine[Any, Any, int]) -> int:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, LaunchArgument
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -41,7 +39,7 @@ HostArgument = Annotated[
 ]
 
 
-@app.command(epilog=examples("flexsheet keys new arm_left"))
+@app.command(epilog=examples("flexsheet keys new left"))
 def new(
     host: HostArgument,
     replace: Annotated[
@@ -81,7 +79,7 @@ def new(
         print(public)
 
 
-@app.command(epilog=examples("flexsheet keys show", "flexsheet keys show arm_left"))
+@app.command(epilog=examples("flexsheet keys show", "flexsheet keys show left"))
 def show(
     host: Annotated[
         str | None,
@@ -124,18 +122,11 @@ def show(
 @app.command(
     cls=KeyCommand,
     epilog=examples(
-        "flexsheet keys install lab.yaml arm_left 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'"
+        "flexsheet keys install launch/lab.yaml left 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'"
     ),
 )
 def install(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LAUNCH_FILE",
-            help="Launch file, the same on every host.",
-            autocompletion=complete.yaml_files,
-        ),
-    ],
+    launch_file: LaunchArgument,
     host: HostArgument,
     key: Annotated[
         str | None,
@@ -158,8 +149,8 @@ def install(
             key = derive_public_key(read_secret(secret_file(host)))
         except SecurityError as error:
             raise CommandError(str(error)) from error
-    install_key(file, host, key)
+    install_key(launch_file, host, key)
     if as_json:
-        print_json({"launch_file": str(file), "host": host, "public": key})
+        print_json({"launch_file": str(launch_file), "host": host, "public": key})
     else:
-        words.print(f"{file}: hosts.{host}.key = {key}", markup=False)
+        words.print(f"{launch_file}: hosts.{host}.key = {key}", markup=False)

@@ -5,14 +5,22 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
+from flexsheet.launch.commands.options import (
+    ApparatusOption,
+    DurationOption,
+    JsonOption,
+    LaunchArgument,
+    OtherSceneOption,
+    SettingsOption,
+    with_scene,
+)
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -35,47 +43,48 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 
 @app.command(
     epilog=examples(
-        "flexsheet launch launch/demo.yaml",
+        "flexsheet launch demo",
         "flexsheet launch launch/demo.yaml --console --record session.mcap",
-        "flexsheet launch lab.yaml --host arm_left",
-        "flexsheet launch launch/demo.yaml --set planner.prediction_horizon_s=0.02 --dry-run",
+        "flexsheet launch demo --scene organ",
+        "flexsheet launch launch/lab.yaml --host left",
+        "flexsheet launch demo --set planner.prediction_horizon_s=0.02 --dry-run",
     )
 )
 def launch(
     *,
-    file: Annotated[Path, typer.Argument(help="Launch file.", autocompletion=complete.yaml_files)],
+    launch_file: LaunchArgument,
+    scene: OtherSceneOption = None,
     host: Annotated[
         str | None,
         typer.Option(
+            metavar="HOST",
             help="Host whose nodes are started; default: the nodes of all hosts.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Print the resolved graph without starting it."),
+        typer.Option("-p", "--dry-run", help="Print the resolved graph without starting it."),
     ] = False,
-    settings: Annotated[
+    settings: SettingsOption = None,
+    apparatus: ApparatusOption = None,
+    without: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
+            "--without",
+            metavar="NODE",
+            help="Node that is not started, for `flexsheet run NODE`; repeat for several.",
         ),
     ] = None,
-    apparatus: ApparatusOption = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="BAG", help="Bag file to record the logged topics to."),
+        typer.Option(metavar="BAG", help="Bag file to write the logged topics to."),
     ] = None,
     console: Annotated[
         bool,
         typer.Option("--console", help="Add a browser console and its recorder to the graph."),
     ] = False,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS", help="Time until the graph stops after all nodes are ready, s."
-        ),
-    ] = None,
+    duration: DurationOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
@@ -88,7 +97,11 @@ def launch(
     from flexsheet.launch.plans.plan import load_graph
 
     plan = load_graph(
-        file, settings=settings or (), record=record, console=console, apparatus=apparatus
+        launch_file,
+        settings=with_scene(settings, scene),
+        record=record,
+        console=console,
+        apparatus=apparatus,
     )
     if dry_run:
         if as_json:
@@ -101,7 +114,8 @@ def launch(
         if as_json:
             print_json_line(describe_run(plan, run, host))
 
-    raise typer.Exit(asyncio.run(run_graph(plan, host, duration, when_ready=ready)))
+    work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
+    raise typer.Exit(asyncio.run(work))
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
@@ -115,13 +129,17 @@ async def run_graph(
     host: str | None,
     duration_s: float | None,
     *,
+    without: Collection[str] = (),
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
-    """Run a graph until a signal, or `duration_s` after it is ready; return the exit code."""
+    """Run a graph until a signal, or `duration_s` after it is ready; return the exit code.
+
+    without: names of nodes that are not started.
+    """
     from flexsheet.launch.running.supervisor import RunningGraph
 
     stop_requested = asyncio.Event()
-    graph = RunningGraph(plan, host=host, report=_print_log_line)
+    graph = RunningGraph(plan, host=host, without=without, report=_print_log_line)
 
     def on_signal() -> None:
         if stop_requested.is_set():
@@ -184,7 +202,13 @@ async def _run_until(
 
 
 def _print_log_line(node: str, line: str) -> None:
-    """Print one line of a node's log; format JSON from structlog as readable text."""
+    """Print one line of a node's log."""
+    style, text = format_log_line(line)
+    words.print(f"{node:>16} | {text}", style=style, markup=False)
+
+
+def format_log_line(line: str) -> tuple[str, str]:
+    """Return the style and the text of one line of a log; JSON from structlog becomes readable."""
     style, text = "", line
     if line.startswith("{"):
         try:
@@ -200,7 +224,7 @@ def _print_log_line(node: str, line: str) -> None:
             text = " ".join([str(event), *(f"{key}={value}" for key, value in record.items())])
             if trace:
                 text += f"\n{trace}"
-    words.print(f"{node:>16} | {text}", style=style, markup=False)
+    return style, text
 
 
 def _format_settings(node: ResolvedNode) -> str:
@@ -241,7 +265,7 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
             for node in plan.nodes_on(host)
         ],
     )
-    words.print("for parameters with default values: flexsheet node describe TYPE", style="dim")
+    words.print("for parameters with default values: flexsheet node info TYPE", style="dim")
     print()
     print_table(
         ("topic", "from", "endpoints", "to"),

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption, running_graph
+from flexsheet.launch.commands.graph import NoGraphError, running_graph
+from flexsheet.launch.commands.options import JsonOption, RunOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
     print_fields,
     print_json,
-    print_table,
+    print_rows,
 )
+
+if TYPE_CHECKING:
+    from flexsheet.launch.plans.plan_model import ResolvedNode
 
 app = typer.Typer(
     add_completion=False,
@@ -25,63 +29,68 @@ app = typer.Typer(
 )
 
 
-@app.command(
-    "list",
-    epilog=examples("flexsheet node list"),
-)
-def list_nodes(as_json: JsonOption = False) -> None:
-    """List the node types for launch files, and the nodes of the running graph."""
-    from flexsheet.launch.running.runs import list_live_runs
+@app.command("list", epilog=examples("flexsheet node list"))
+def list_nodes(run: RunOption = None, as_json: JsonOption = False) -> None:
+    """List the nodes of the running graph."""
+    plan, _ = running_graph(run)
+    rows = [
+        {"node": node.name, "type": node.type, "host": node.host} for node in plan.nodes.values()
+    ]
+    print_rows(rows, as_json=as_json)
+
+
+@app.command("types", epilog=examples("flexsheet node types"))
+def list_types(as_json: JsonOption = False) -> None:
+    """List the node types for launch files."""
     from flexsheet.nodes import NODES
 
-    running: dict[str, list[str]] = {}
-    if list_live_runs():
-        plan, _ = running_graph(None)
-        for node in plan.nodes.values():
-            running.setdefault(node.type, []).append(node.name)
-    types = {**NODES, **{name: name for name in running if name not in NODES}}
-    if as_json:
-        print_json(
-            [
-                {"type": name, "class": path, "running": running.get(name, [])}
-                for name, path in types.items()
-            ]
-        )
-    else:
-        print_table(
-            ("type", "class", "running as"),
-            [(name, path, ", ".join(running.get(name, []))) for name, path in types.items()],
-        )
+    print_rows([{"type": name, "class": path} for name, path in NODES.items()], as_json=as_json)
 
 
 @app.command(
     epilog=examples(
-        "flexsheet node describe planner",
-        "flexsheet node describe my_package.my_node:MyNode --json",
+        "flexsheet node info planner",
+        "flexsheet node info my_package.my_node:MyNode --json",
     )
 )
-def describe(
+def info(
     node: Annotated[
         str,
         typer.Argument(
-            help='Node type of the project, or "module:Class".', autocompletion=complete.node_types
+            help='Node of the running graph, or node type: its name, or "module:Class".',
+            autocompletion=complete.nodes,
         ),
     ],
+    run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the ports, timers and parameters of a node type."""
+    """Print the ports, timers and parameters of a node or of a node type.
+
+    For a node of the running graph, prints its topics and the values of its parameters.
+    """
     from flexsheet.nodes import UnknownNodeError, node_class
     from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers
 
     try:
-        class_ = node_class(node)
+        found = running_graph(run)[0].nodes.get(node)
+    except NoGraphError:
+        found = None
+    node_type = node if found is None else found.type
+    try:
+        class_ = node_class(node_type)
     except (UnknownNodeError, ImportError, AttributeError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
     description = {
-        "type": node,
+        **({} if found is None else {"node": node, "host": found.host}),
+        "type": node_type,
         "about": (class_.__doc__ or "").strip(),
         "ports": [
-            {"port": port.name, "direction": port.direction, "message": port.message.__name__}
+            {
+                "port": port.name,
+                "direction": port.direction,
+                "message": port.message.__name__,
+                **({} if found is None else {"topic": _find_topic(found, port.name)}),
+            }
             for port in find_ports(class_).values()
         ],
         "timers": [
@@ -89,19 +98,32 @@ def describe(
             for timer in find_timers(class_)
         ],
         "parameters": [
-            _parameter(name, field)
+            {
+                **_parameter(name, field),
+                **({} if found is None else {"value": found.parameters.get(name)}),
+            }
             for name, field in find_parameters_type(class_).model_fields.items()
         ],
     }
     if as_json:
         print_json(description)
         return
-    print_fields([("type", node), ("about", str(description["about"]).split("\n")[0])])
+    print_fields(
+        (name, str(value).split("\n")[0])
+        for name, value in description.items()
+        if isinstance(value, str)
+    )
     for title in ("ports", "timers", "parameters"):
         rows: Any = description[title]
         if rows:
             print()
-            print_table(tuple(rows[0]), [tuple(row.values()) for row in rows])
+            print_rows(rows, as_json=False)
+
+
+def _find_topic(node: ResolvedNode, port: str) -> str | None:
+    """Return the topic of a port in the running graph; None if it is not connected."""
+    ports = (*node.inputs, *node.outputs)
+    return next((one.topic for one in ports if one.port == port and one.endpoints), None)
 
 
 def _parameter(name: str, field: Any) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -104,6 +104,35 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
         padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         line = "  ".join(padded).rstrip()
         print(f"\x1b[1m{line}\x1b[0m" if in_terminal and number == 0 else line)
+
+
+def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
+    """Print rows with the same keys on stdout, as JSON or as a table; None is shown as "-"."""
+    if as_json:
+        print_json(rows)
+    elif rows:
+        columns = dict.fromkeys(name for row in rows for name in _flatten(row))
+        table = [_flatten(row) for row in rows]
+        print_table(list(columns), [[_show(row.get(name)) for name in columns] for row in table])
+
+
+def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace inner mappings by their values, named "interval_ms p50"."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{name} {inner}": each for inner, each in value.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_show, value))
+    return "-" if value is None else str(value)
 
 
 def _print_folded(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

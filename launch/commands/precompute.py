@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, SchedulerOption
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -28,10 +27,7 @@ app = typer.Typer(add_completion=False)
     )
 )
 def precompute(
-    scene_file: Annotated[
-        Path,
-        typer.Argument(metavar="SCENE", help="Scene file.", autocompletion=complete.yaml_files),
-    ],
+    scene_file: SceneArgument,
     cache: Annotated[
         Path | None,
         typer.Option(
@@ -46,14 +42,7 @@ def precompute(
             help="Node spacing of the soft body's nonlinear table, m; also computes it (minutes).",
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Address of a dask.distributed scheduler whose workers compute the table, such as "
-            "tcp://host:8786; default: compute on this computer.",
-        ),
-    ] = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute the deflection shapes of a scene's sheet, unless the cache contains them.

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, LaunchArgument
 from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
 from flexsheet.messages.files import write_file
 
@@ -24,27 +23,22 @@ def systemd() -> None:
 
 @app.command(
     epilog=examples(
-        "flexsheet systemd install /etc/flexsheet/lab.yaml --host arm_left --dry-run",
-        "sudo flexsheet systemd install /etc/flexsheet/lab.yaml --host arm_left",
+        "flexsheet systemd install /etc/flexsheet/lab.yaml --host left --dry-run",
+        "sudo flexsheet systemd install /etc/flexsheet/lab.yaml --host left",
     )
 )
 def install(
     *,
-    launch_file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LAUNCH_FILE",
-            help="Launch file, the same on every host.",
-            autocompletion=complete.yaml_files,
-        ),
+    launch_file: LaunchArgument,
+    host: Annotated[
+        str, typer.Option(metavar="HOST", help="Host name of this computer in the launch file.")
     ],
-    host: Annotated[str, typer.Option(help="Host name of this computer in the launch file.")],
     user: Annotated[
-        str, typer.Option(help="Existing user account that runs the service.")
+        str, typer.Option(metavar="USER", help="Existing user account that runs the service.")
     ] = "flexsheet",
-    root: Annotated[Path, typer.Option(help="Root folder of the file system to write to.")] = Path(
-        "/"
-    ),
+    root: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Root folder of the file system to write to.")
+    ] = Path("/"),
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the files instead of writing them.")
     ] = False,

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import (
-    JsonOption,
-    RunOption,
-    run_interruptible,
-    running_graph,
-)
+from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -22,13 +19,12 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_json_line,
+    print_rows,
     print_table,
     words,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from flexsheet.messages.base import Header, Message
     from flexsheet.messages.bus import Handler, Subscriber
     from flexsheet.messages.topics import Topic
@@ -39,9 +35,15 @@ app = typer.Typer(
     help="List topics, and read or publish them in the running graph.",
 )
 
-TopicArgument = Annotated[
-    str,
-    typer.Argument(help="Name of the topic, such as twin/finger.", autocompletion=complete.topics),
+CountOption = Annotated[
+    int | None,
+    typer.Option(
+        "-t", "--count", metavar="N", help="Number of messages; default: until Ctrl-C.", min=1
+    ),
+]
+WindowOption = Annotated[
+    float,
+    typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
 """Time without a message after which that is reported."""
@@ -61,21 +63,13 @@ def list_topics(as_json: JsonOption = False) -> None:
     rows = [_describe(topic) for topic in TOPICS.values()]
     if as_json:
         print_json(rows)
-    else:
-        print_table(
-            ("topic", "message", "delivery", "rate_hz", "logged", "about"),
-            [
-                (
-                    row["topic"],
-                    row["message"],
-                    row["delivery"],
-                    "on change" if row["rate_hz"] is None else "{:g}-{:g}".format(*row["rate_hz"]),
-                    "yes" if row["logged"] else "",
-                    row["about"],
-                )
-                for row in rows
-            ],
-        )
+        return
+    for row in rows:
+        rate = row["rate_hz"]
+        row["rate_hz"] = "on change" if rate is None else "{:g}-{:g}".format(*rate)
+        row["logged"] = "yes" if row["logged"] else ""
+    names = ("topic", "message", "delivery", "rate_hz", "logged", "about")
+    print_rows([{name: row[name] for name in names} for row in rows], as_json=False)
 
 
 @app.command(epilog=examples("flexsheet topic info fingertip"))
@@ -121,18 +115,21 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
 def echo(
     *,
     topic: TopicArgument,
-    once: Annotated[bool, typer.Option("--once", help="Print one message and exit.")] = False,
-    count: Annotated[
-        int | None, typer.Option(help="Number of messages after which the command exits.", min=1)
-    ] = None,
+    once: Annotated[bool, typer.Option("-1", "--once", help="Print one message and exit.")] = False,
+    count: CountOption = None,
     timeout: Annotated[
         float | None,
-        typer.Option(help="Maximum time without a message, s; then the command fails."),
+        typer.Option(
+            metavar="SECONDS", help="Maximum time without a message; then the command fails."
+        ),
     ] = None,
     field: Annotated[
-        str | None, typer.Option(help="Field to print instead of the message, such as left.fx_px.")
+        str | None,
+        typer.Option(
+            metavar="FIELD", help="Field to print instead of the message, such as left.fx_px."
+        ),
     ] = None,
-    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
+    full: Annotated[bool, typer.Option("-f", "--full", help="Print long arrays in full.")] = False,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -157,34 +154,44 @@ def echo(
 @app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
 def hz(
     topic: TopicArgument,
-    duration: Annotated[float, typer.Option(help="Duration of the measurement, s.", min=0.1)] = 5.0,
+    duration: WindowOption = 5.0,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the rate of each writer of a topic, from stamps and sequence numbers."""
-    found = _find_topic(topic)
-    headers: list[Header] = []
-    run_interruptible(_collect_headers(found, run, headers, duration))
-    rows = measure_rates(headers)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(
-            ("writer", "rate_hz", "received", "lost", "interval p50 ms", "p99 ms"),
-            [
-                (
-                    row["writer"],
-                    "-" if row["rate_hz"] is None else f"{row['rate_hz']:.2f}",
-                    row["received"],
-                    row["lost"],
-                    "-" if row["interval_ms"] is None else f"{row['interval_ms']['p50']:.2f}",
-                    "-" if row["interval_ms"] is None else f"{row['interval_ms']['p99']:.2f}",
-                )
-                for row in rows
-            ],
-        )
-    if not rows:
-        raise make_silence_error(topic, duration)
+    arrivals = _measure(topic, run, duration)
+    print_rows(measure_rates([one.header for one in arrivals]), as_json=as_json)
+
+
+@app.command(epilog=examples("flexsheet topic bw stereo", "flexsheet topic bw frame --json"))
+def bw(
+    topic: TopicArgument,
+    duration: WindowOption = 5.0,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the bandwidth of each writer of a topic, from the sizes of its messages."""
+    print_rows(measure_bandwidths(_measure(topic, run, duration)), as_json=as_json)
+
+
+@app.command(epilog=examples("flexsheet topic delay fingertip"))
+def delay(
+    topic: TopicArgument,
+    duration: WindowOption = 5.0,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the age of a topic's data, from the source to this command.
+
+    Messages of another computer's clock are not counted, because their age is not known here.
+    """
+    from flexsheet.messages.clock import SystemClock
+
+    own = SystemClock().id
+    arrivals = [one for one in _measure(topic, run, duration) if one.header.clock_id == own]
+    if not arrivals:
+        raise CommandError(f'"{topic}" is published on another computer; run the command there')
+    print_rows(measure_delays(arrivals), as_json=as_json)
 
 
 @app.command(
@@ -201,14 +208,18 @@ def pub(
     ],
     rate: Annotated[
         float | None,
-        typer.Option(help="Rate at which the message is repeated, Hz; default: send it once."),
-    ] = None,
-    count: Annotated[
-        int | None,
         typer.Option(
-            help="Number of messages to send; default: 1, or unlimited with --rate.", min=1
+            "-r",
+            "--rate",
+            metavar="HZ",
+            min=0.01,
+            help="Rate at which the message is repeated; default: send it once.",
         ),
     ] = None,
+    once: Annotated[
+        bool, typer.Option("-1", "--once", help="Send one message, which is the default.")
+    ] = False,
+    count: CountOption = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -219,7 +230,7 @@ def pub(
     """
     found = _find_topic(topic)
     built = _parse_message(found, message)
-    times = count if count is not None else (None if rate else 1)
+    times = 1 if once or (rate is None and count is None) else count
     sent = 0
 
     def on_sent(count: int) -> None:
@@ -243,35 +254,91 @@ def make_silence_error(topic: str, duration_s: float) -> CommandError:
     )
 
 
-def measure_rates(headers: list[Header]) -> list[dict[str, Any]]:
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Message that a measurement received; the stamps are of this computer's clock."""
+
+    header: Header
+    size_bytes: int
+    received_ns: int
+
+
+def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list[list[Any]]:
+    """Group consecutive starts of writers; return one list per writer and start."""
+    groups: dict[tuple[str, int], list[Any]] = {}
+    for one in arrivals:
+        groups.setdefault((header(one).writer, header(one).epoch), []).append(one)
+    return list(groups.values())
+
+
+def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
     """Return the rate, received and lost messages and stamp intervals of each writer."""
     import numpy as np
 
     rows = []
-    for key in dict.fromkeys((header.writer, header.epoch) for header in headers):
-        own = [header for header in headers if (header.writer, header.epoch) == key]
+    for own in _by_writer(headers, lambda header: header):
         sequences = np.array([header.sequence for header in own])
         stamps_s = np.array([header.publish_ns for header in own]) * 1e-9
         span_s = float(stamps_s[-1] - stamps_s[0])
         sent = int(sequences[-1] - sequences[0])
-        steps = np.diff(sequences)
-        intervals_ms = np.diff(stamps_s)[steps == 1] * 1e3
+        steps_ms = np.diff(stamps_s)[np.diff(sequences) == 1] * 1e3
         rows.append(
             {
-                "writer": key[0],
+                "writer": own[0].writer,
                 "rate_hz": sent / span_s if span_s > 0 else None,
                 "received": len(own),
                 "lost": int(sent + 1 - len(own)),
-                "interval_ms": None
-                if intervals_ms.size == 0
-                else {
-                    "p50": float(np.quantile(intervals_ms, 0.5)),
-                    "p99": float(np.quantile(intervals_ms, 0.99)),
-                    "max": float(intervals_ms.max()),
-                },
+                "interval_ms": _summarize(steps_ms.tolist()),
             }
         )
     return rows
+
+
+def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
+    """Return the bandwidth and the message sizes of each writer."""
+    rows = []
+    for own in _by_writer(arrivals, lambda one: one.header):
+        sizes = [one.size_bytes for one in own]
+        span_s = (own[-1].received_ns - own[0].received_ns) * 1e-9
+        rows.append(
+            {
+                "writer": own[0].header.writer,
+                "bytes_per_s": sum(sizes[1:]) / span_s if span_s > 0 else None,
+                "messages": len(own),
+                "mean_bytes": sum(sizes) / len(sizes),
+                "min_bytes": min(sizes),
+                "max_bytes": max(sizes),
+            }
+        )
+    return rows
+
+
+def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
+    """Return the age of the data of each writer at their arrival."""
+    rows = []
+    for own in _by_writer(arrivals, lambda one: one.header):
+        ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
+        rows.append(
+            {
+                "writer": own[0].header.writer,
+                "messages": len(own),
+                "age_ms": _summarize(ages_ms),
+            }
+        )
+    return rows
+
+
+def _summarize(values: list[float]) -> dict[str, float] | None:
+    """Return median, 99 % quantile and maximum; None without a value."""
+    import numpy as np
+
+    if not values:
+        return None
+    return {
+        "p50": float(np.quantile(values, 0.5)),
+        "p99": float(np.quantile(values, 0.99)),
+        "max": float(np.max(values)),
+    }
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
@@ -393,10 +460,27 @@ async def _read(
     return 0
 
 
-async def _collect_headers(
-    topic: Topic, run: Path | None, headers: list[Header], duration_s: float
+def _measure(topic: str, run: Path | None, duration_s: float) -> list[Arrival]:
+    """Return what arrives on a topic within a duration; CommandError if nothing arrives."""
+    arrivals: list[Arrival] = []
+    run_interruptible(_collect(_find_topic(topic), run, arrivals, duration_s))
+    if not arrivals:
+        raise make_silence_error(topic, duration_s)
+    return arrivals
+
+
+async def _collect(
+    topic: Topic, run: Path | None, arrivals: list[Arrival], duration_s: float
 ) -> int:
-    subscriber = make_listener(topic, run, lambda _, header: headers.append(header), raw=True)
+    from flexsheet.messages.clock import SystemClock
+
+    clock = SystemClock()
+
+    def receive(frames: Any, header: Header) -> None:
+        size_bytes = sum(memoryview(frame).nbytes for frame in frames)
+        arrivals.append(Arrival(header, size_bytes, clock.now_ns()))
+
+    subscriber = make_listener(topic, run, receive, raw=True)
     subscriber.start()
     try:
         await asyncio.sleep(duration_s)

@@ -5,14 +5,21 @@ from __future__ import annotations
 import asyncio
 import os
 import webbrowser
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import ApparatusOption, JsonOption
 from flexsheet.launch.commands.launching import describe_run, run_graph
+from flexsheet.launch.commands.options import (
+    DEMO,
+    ApparatusOption,
+    DurationOption,
+    JsonOption,
+    LaunchOption,
+    OtherSceneOption,
+    SettingsOption,
+    with_scene,
+)
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
 from flexsheet.nodes.signals import keyboard_interrupts
 
@@ -21,38 +28,23 @@ if TYPE_CHECKING:
 
 app = typer.Typer(add_completion=False)
 
-DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 
-
-@app.command(epilog=examples("flexsheet try", "flexsheet try --port 9000 --no-browser"))
+@app.command(
+    epilog=examples(
+        "flexsheet try", "flexsheet try --scene organ", "flexsheet try --port 9000 --no-browser"
+    )
+)
 def try_it(
     *,
-    launch_file: Annotated[
-        Path,
-        typer.Option(
-            "--launch",
-            metavar="FILE",
-            help="Launch file of the graph.",
-            autocompletion=complete.yaml_files,
-        ),
-    ] = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     port: Annotated[
         int, typer.Option(help="TCP port of the console page.", min=1, max=65535)
     ] = 8080,
     browser: Annotated[bool, typer.Option(help="Open the console page in the browser.")] = True,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
-        ),
-    ] = None,
+    settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS", help="Time until the graph stops after all nodes are ready, s."
-        ),
-    ] = None,
+    duration: DurationOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Touch a virtual object in the browser, without hardware.
@@ -65,7 +57,10 @@ def try_it(
 
     page = [f"console.page_port={port}"]
     plan = load_graph(
-        launch_file, settings=[*page, *(settings or ())], console=True, apparatus=apparatus
+        launch_file,
+        settings=[*page, *with_scene(settings, scene)],
+        console=True,
+        apparatus=apparatus,
     )
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)

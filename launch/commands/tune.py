@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -39,10 +39,7 @@ app = typer.Typer(add_completion=False)
     )
 )
 def tune(
-    scene_file: Annotated[
-        Path,
-        typer.Argument(metavar="SCENE", help="Scene file.", autocompletion=complete.yaml_files),
-    ],
+    scene_file: SceneArgument,
     *,
     family: Annotated[
         list[str] | None,
@@ -54,10 +51,7 @@ def tune(
         ),
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", metavar="FILE", help="File for the tuned copy; default: change SCENE."
-        ),
+        Path | None, output_file("File for the tuned copy; default: change SCENE.")
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the choices without writing a file.")

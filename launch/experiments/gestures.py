@@ -57,22 +57,21 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
         raise ExperimentError(f'scene "{scene.name}": {error}') from None
 
 
-def select_gestures(names: str | None) -> list[str]:
-    """Parse a comma-separated list of gestures and remove duplicates; None selects all."""
-    if names is None:
-        return list(GESTURES)
-    selected = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+def select_gestures(names: Sequence[str]) -> list[str]:
+    """Check names of gestures and remove duplicates; no name selects all."""
+    selected = list(dict.fromkeys(names)) or list(GESTURES)
     for name in selected:
         if name not in GESTURES:
             raise ExperimentError(f'unknown gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
-    if not selected:
-        raise ExperimentError(f"empty list of gestures; known gestures: {', '.join(GESTURES)}")
     return selected
 
 
-def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
-    """Make the path of a gesture or of a recorded finger in the launch file's scene."""
-    scene = load_graph(launch_file).scene_message()
+def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
+    """Make the path of a gesture or of a recorded finger in the scene of a launch file.
+
+    settings: as for `load_graph`; a "scene=FILE" among them is another scene.
+    """
+    scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
         raise ExperimentError(f'{launch_file}: missing key "scene", which a finger path requires')
     if name_or_file in GESTURES:

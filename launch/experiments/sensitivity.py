@@ -87,18 +87,14 @@ AFFECTED: dict[str, frozenset[Metric]] = {
 """Metrics on which a section of the apparatus has an effect at rest; on the others it has none."""
 
 
-def select_parameters(names: str | None) -> list[str]:
-    """Parse a comma-separated list of rows of the table; None selects all."""
-    if names is None:
-        return list(TOLERANCES)
-    selected = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+def select_parameters(names: Sequence[str]) -> list[str]:
+    """Check names of rows of the table and remove duplicates; no name selects all."""
+    selected = list(dict.fromkeys(names)) or list(TOLERANCES)
     for name in selected:
         if name not in TOLERANCES:
             raise ExperimentError(
                 f'unknown parameter "{name}"; {did_you_mean(name, list(TOLERANCES))}'
             )
-    if not selected:
-        raise ExperimentError("empty list of parameters; omit --parameters to select all")
     return selected
 
 

@@ -120,6 +120,8 @@ class Document:
     lines: dict[Key, int]
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+    extended: dict[Key, Path] = field(default_factory=dict)
+    """Files of the keys that come from an extended file; see `extend`."""
 
     def where(self, key: Key) -> str:
         """Return file and line of `key` or its nearest parent, or the option that overrides it."""
@@ -128,8 +130,28 @@ class Document:
             if part in self.overrides:
                 return self.overrides[part]
             if part in self.lines:
-                return f"{self.path}:{self.lines[part]}"
+                return f"{self.extended.get(part, self.path)}:{self.lines[part]}"
         return str(self.path)
+
+    def folder(self, key: Key) -> Path:
+        """Return the folder to which a path at `key` is relative: of its file or of the command."""
+        if key in self.overrides:
+            return Path.cwd()
+        known = (key[:length] for length in range(len(key), 0, -1) if key[:length] in self.lines)
+        return self.extended.get(next(known, ()), self.path).parent
+
+    def extend(self, base: Document, levels: int) -> None:
+        """Add the values of `base` that this document does not contain.
+
+        Mappings are merged down to `levels`; deeper values replace those of `base` as a whole.
+        """
+        own = self.lines
+        self.lines = {**base.lines, **own}
+        self.extended = {
+            key: base.extended.get(key, base.path) for key in base.lines if key not in own
+        }
+        self.values = _merge(base.values, self.values, levels)
+        self.text = f"# {base.path}\n{base.text}\n# {self.path}\n{self.text}"
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
         """Make a problem of a key of this document."""
@@ -159,6 +181,13 @@ class Document:
             target = target[part]
         target[key[-1]] = value
         self.overrides[key] = origin
+
+
+def _merge(base: Any, own: Any, levels: int) -> Any:
+    if levels == 0 or not (isinstance(base, dict) and isinstance(own, dict)):
+        return own
+    common = {name: _merge(base[name], own[name], levels - 1) for name in own if name in base}
+    return {**base, **own, **common}
 
 
 def parse_value(text: str) -> Any:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from flexsheet.launch.plans.documents import Document, Key, read_document, validate
-from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile
+from flexsheet.launch.plans.documents import Document, Key, validate
+from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile, read_launch_file
 from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN
 from flexsheet.messages.security import is_key
 
@@ -75,7 +75,7 @@ def load_keys(path: Path) -> dict[str, str]:
 
     The file may have changed since the start. Raises BadInputError.
     """
-    document = read_document(path)
+    document = read_launch_file(path)
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
     document.raise_problems()

@@ -8,8 +8,15 @@ from typing import Annotated, Any
 from pydantic import Field
 from ruamel.yaml.error import YAMLError
 
-from flexsheet.launch.plans.documents import BadInputError, Document, did_you_mean, parse_value
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    did_you_mean,
+    parse_value,
+    read_document,
+)
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
+from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file, list_shipped
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
@@ -21,6 +28,12 @@ CONSOLE_NICE = 10
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
 """Path of the bags that the console records, relative to the working folder."""
+
+MERGED_LEVELS = 4
+"""Mappings of an extended launch file are merged down to nodes.NAME.parameters."""
+
+SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
+"""Keys that scenes have and launch files do not have."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
@@ -84,7 +97,15 @@ class ClocksSpec(StrictModel):
 class LaunchFile(StrictModel):
     """Keys of a launch file."""
 
-    scene: str | None = Field(default=None, description="scene file, relative to the launch file")
+    extends: str | None = Field(
+        default=None,
+        description="launch file whose values are used where this file has none: a path relative "
+        "to this file, or the name of a shipped launch file, such as demo",
+    )
+    scene: str | None = Field(
+        default=None,
+        description="scene file, relative to the launch file, or the name of a shipped scene",
+    )
     hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
     nodes: dict[Name, NodeSpec]
     external_topics: list[str] = Field(
@@ -96,10 +117,53 @@ class LaunchFile(StrictModel):
     )
 
 
+def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
+    """Read a launch file and the files that it extends.  Raises BadInputError.
+
+    extending: files that extend this one, directly or through others.
+    """
+    document = read_document(path)
+    if SCENE_KEY_SET & document.values.keys() and "nodes" not in document.values:
+        raise BadInputError.single(
+            str(path),
+            (),
+            "is a scene, not a launch file",
+            f"use it with a launch file: flexsheet launch demo --scene {path}",
+        )
+    name = document.values.get("extends")
+    if not isinstance(name, str):
+        return document
+    base = find_file(name, LAUNCH_FILES, path.parent)
+    if not base.is_file():
+        raise document.error(
+            ("extends",),
+            f'"{name}" does not exist',
+            f"name a file, or a shipped launch file: {', '.join(list_shipped(LAUNCH_FILES))}",
+        )
+    chain = (*extending, path.resolve())
+    if base.resolve() in chain:
+        raise document.error(
+            ("extends",), f"{base} extends this file, too", "remove one of the two `extends`"
+        )
+    document.extend(read_launch_file(base, chain), MERGED_LEVELS)
+    nodes = document.values.get("nodes")
+    if isinstance(nodes, dict):
+        document.values["nodes"] = {node: spec for node, spec in nodes.items() if spec is not None}
+    return document
+
+
+def apply_scene(document: Document, scene: Path) -> None:
+    """Apply an option --scene: use another scene than the launch file's."""
+    document.set(("scene",), str(scene.absolute()), f"--scene {scene}")
+
+
 def apply_setting(document: Document, setting: str) -> None:
-    """Apply an option --set node.parameter=value.  Raises BadInputError."""
+    """Apply an option --set node.parameter=value, or scene=FILE.  Raises BadInputError."""
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")
+    if target == "scene" and text:
+        apply_scene(document, Path(text))
+        return
     node, dot, parameter = target.partition(".")
     if not (equals and dot and node and parameter):
         raise BadInputError.single(

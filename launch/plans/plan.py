@@ -34,6 +34,7 @@ from flexsheet.launch.plans.launch_file import (
     apply_console,
     apply_record,
     apply_setting,
+    read_launch_file,
 )
 from flexsheet.launch.plans.plan_model import (
     MAIN,
@@ -57,6 +58,7 @@ from flexsheet.launch.plans.routing import (
     make_endpoints,
     resolve_further_inputs,
 )
+from flexsheet.launch.plans.shipped import SCENES, find_file, list_shipped
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.node import NodeParameters, find_role
@@ -73,13 +75,14 @@ def load_graph(
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
-    settings: "node.parameter=value" each, with a YAML value; they override the file.
+    settings: "node.parameter=value" each, with a YAML value, or "scene=FILE"; they override the
+        file.
     record: bag to record to; it overrides the file.
     console: add a console and a paused recorder, unless the file has them.
     apparatus: file or "seed:N" of the simulator's true devices; None: those of the scene.
     Raises BadInputError with all errors of the file.
     """
-    document = read_document(path)
+    document = read_launch_file(path)
     if record is not None:
         apply_record(document, record)
     if console:
@@ -95,7 +98,11 @@ def load_graph(
     truth = _load_apparatus(apparatus, scene, document)
     give_apparatus(entries, truth, document)
     writers = list_writers(
-        spec, entries, document, has_scene=scene is not None, has_apparatus=truth is not None
+        spec,
+        entries,
+        document,
+        has_scene=spec.scene is not None,
+        has_apparatus=apparatus is not None,
     )
     resolve_further_inputs(entries, writers, document)
     check_inputs(entries, writers, document)
@@ -143,10 +150,13 @@ def load_graph(
 def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, Scene | None]:
     if spec.scene is None:
         return None, None
-    path = document.path.parent / spec.scene
+    path = find_file(spec.scene, SCENES, document.folder(("scene",)))
     if not path.is_file():
+        names = ", ".join(list_shipped(SCENES))
         document.report(
-            ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
+            ("scene",),
+            f'"{spec.scene}" does not exist',
+            f"create {path}, or name a shipped scene: {names}",
         )
         return None, None
     try:
@@ -159,6 +169,8 @@ def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, 
 
 def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -> Apparatus | None:
     if text is None:
+        return None
+    if scene is None and document.problems:  # the scene has errors, which are reported
         return None
     if scene is None:
         what = "an apparatus differs from a scene, and the launch file has none"

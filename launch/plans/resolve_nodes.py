@@ -135,7 +135,7 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
         document.report(
             (*key, "type"),
             f'"{type_name}" cannot be imported: {error}',
-            "check the Python path and flexsheet doctor",
+            _describe_import_remedy(type_name, error),
         )
         return
     if not (isinstance(class_, type) and issubclass(class_, Node)):
@@ -157,6 +157,22 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
             validate(find_parameters_type(class_), document, at=parameters_key)
         except BadInputError as error:
             document.problems.extend(error.problems)
+
+
+def _describe_import_remedy(type_name: str, error: Exception) -> str:
+    """Return what to do about a node class that cannot be imported."""
+    module, _, name = type_name.partition(":")
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        if module == error.name or module.startswith(f"{error.name}."):
+            file = f"{module.replace('.', '/')}.py"
+            return (
+                f"run the command in the folder that contains {file}, add that folder to "
+                "PYTHONPATH, or install the package"
+            )
+        return f"install the module {error.name}: pip install {error.name.partition('.')[0]}"
+    if isinstance(error, AttributeError):
+        return f"define the class {name} in {module}, or correct its name"
+    return f"correct the module {module}"
 
 
 def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
@@ -254,7 +270,7 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
             continue
         for marked, calibration in find_marked(entry.parameters, mark).items():
             key = (*entry.key, "parameters", *marked)
-            path = Path(_absolute(calibration, _base(document, key)))
+            path = Path(_absolute(calibration, document.folder(key)))
             try:
                 check(path)
             except CalibrationFileError as error:
@@ -274,14 +290,9 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
         return values
     section = entry.key if entry.key in _PARAMETER_SECTIONS else (*entry.key, "parameters")
     for name in entry.parameters.model_fields_set:
-        base = _base(document, (*section, name))
+        base = document.folder((*section, name))
         values[name] = _with_absolute_paths(getattr(entry.parameters, name), values[name], base)
     return values
-
-
-def _base(document: Document, key: Key) -> Path:
-    """Return the folder to which paths at `key` are relative."""
-    return Path.cwd() if key in document.overrides else document.path.parent
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:

@@ -93,7 +93,12 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Check that every input has a writer; disconnect optional inputs without one."""
+    """Check that every input has a writer; disconnect optional inputs without one.
+
+    A topic without a writer is no error beside a node of unknown type, which might write it.
+    """
+    if any(entry.type is None for entry in entries):
+        return
     for entry in entries:
         entry.disconnect_optional(writers)
         for port_name, topic in entry.topics("input"):

@@ -18,14 +18,15 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from flexsheet.launch.plans.documents import BadInputError, Problem, read_document
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
+from flexsheet.launch.plans.launch_file import read_launch_file
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.plans.plan_model import (
     LAUNCHER,
@@ -238,15 +239,21 @@ class Child:
 class RunningGraph:
     """The processes of a graph's nodes.
 
-    host: start only the nodes of this host; None starts all on this computer. report: called with
+    host: start only the nodes of this host; None starts all on this computer. without: names of
+    nodes that are not started. report: called with
     (node, line) for every line of log; `run.logs` contains all lines, too.
     """
 
     def __init__(
-        self, plan: ResolvedGraph, *, host: str | None = None, report: Report | None = None
+        self,
+        plan: ResolvedGraph,
+        *,
+        host: str | None = None,
+        without: Collection[str] = (),
+        report: Report | None = None,
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
-        self.nodes = plan.nodes_on(host)
+        self.nodes = [node for node in plan.nodes_on(host) if node.name not in without]
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
@@ -708,7 +715,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
         if not is_loopback(address) and not plan.keys:
             raise BadInputError(
                 [
-                    read_document(Path(plan.launch_file)).problem(
+                    read_launch_file(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
                         f"{address} is not loopback, and the hosts have no keys",
                         f"create a key on each host (flexsheet keys new {name}) and install all "

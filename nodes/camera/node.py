@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive, Scene, StereoCamera
-from flexsheet.messages.types import StereoPair
+from flexsheet.messages.types import ParameterChange, StereoPair
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.image_pair import (
@@ -51,9 +51,11 @@ class Camera(Node):
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
 
+    live_parameters: ClassVar[frozenset[str]] = frozenset({"max_skew_s"})
     parameters: CameraParameters
     scene: Input[Scene]
     twin__stereo: Input[StereoPair]
+    parameter: Input[ParameterChange]
     stereo: Output[StereoPair]
 
     camera: StereoCamera | None = None

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from html import escape
 
-from flexsheet.messages.types import ArmMode, ArmState, SheetReason, SheetTarget
+from flexsheet.messages.notes import SHEET_REASON_TEXTS
+from flexsheet.messages.types import ArmMode, ArmState, SheetTarget
 from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
@@ -31,23 +32,6 @@ GROUNDS = {
 """Class of the banner's background in page.css."""
 
 FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
-SHEET_REASON_TEXTS: dict[SheetReason, str] = {
-    "ok": "",
-    "fingertip_invalid": "the fingertip is not tracked",
-    "fingertip_not_finite": "the fingertip is not finite",
-    "fingertip_too_old": "the fingertip is too old",
-    "fingertip_in_future": "the fingertip is stamped in the future",
-    "implausible_input": "the finger is too far away or too fast",
-    "ambiguous_side": "the finger is inside the object, and its side is unclear",
-    "through_object": "the finger has passed through the object",
-    "past_object_edge": "the finger is past the object's edge",
-    "beyond_tilt": "the finger is beyond the tilt of the sheet",
-    "beyond_spin": "the sheet has rotated too far about its normal; lift the finger",
-    "past_sheet_width": "the finger is past the sheet's usable width",
-    "past_sheet_height": "the finger is past the sheet's usable height",
-    "concave_contact": "the object is concave there, and the flat sheet touches its rim",
-}
-
 STILL_STOPPED = "the arms are still stopped"
 
 

@@ -6,11 +6,11 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 from threading import Event
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Fingertip, Skin, SoftBody
+from flexsheet.messages.types import Fingertip, ParameterChange, Skin, SoftBody
 from flexsheet.nodes import cache
 from flexsheet.nodes.cache import EtaEstimator
 from flexsheet.nodes.fem_solver import body, precompute
@@ -34,9 +34,13 @@ POLL_S = 0.05
 class FemSolver(Node):
     """Node that publishes the skin at rest and its displacement for each fingertip message."""
 
+    live_parameters: ClassVar[frozenset[str]] = frozenset(
+        {"prediction_horizon_s", "hold_s", "relax_s"}
+    )
     parameters: FemSolverParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
+    parameter: Input[ParameterChange]
     skin: Output[Skin]
     soft_body: Output[SoftBody]
 

@@ -10,7 +10,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, SoftBody
+from flexsheet.messages.types import ArmState, Fingertip, ParameterChange, SheetTarget, SoftBody
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
@@ -44,12 +44,14 @@ class Planner(Node):
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
 
+    live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
     parameters: PlannerParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
     soft_body: Input[SoftBody]
     arm_left: Input[ArmState]
     arm_right: Input[ArmState]
+    parameter: Input[ParameterChange]
     sheet_target: Output[SheetTarget]
 
     async def setup(self) -> None:

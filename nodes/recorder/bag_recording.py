@@ -50,7 +50,7 @@ class BagRecording:
         self._bag: BagWriter | None = None
         self._path = Path()
         self._latched: dict[tuple[str, str], tuple[Topic, Any, Header]] = {}
-        self._retry_ns = 0
+        self._retry_ns = self._bag_started_ns = 0
         self.requested = False
         self.lost = 0
         self.note = "waiting for a request to record"
@@ -87,11 +87,16 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag at a low free space, or start another one at a sufficient free space."""
+        """End the bag at a low free space, or start another one at a sufficient free space.
+
+        Also start another bag at the maximum size or duration.
+        """
         if not self.requested:
             return
         free, minimum = free_bytes(self._path.parent), self._parameters.keep_free_bytes
-        if self._bag is not None and free < minimum:
+        if self._bag is not None and free >= minimum and self._is_full(self._bag):
+            self._split(self._bag)
+        elif self._bag is not None and free < minimum:
             self._end_bag(OSError(f"only {free >> 20} MiB free at {self._path.parent}"))
         elif self._bag is None and free >= 2 * minimum and self._clock.now_ns() >= self._retry_ns:
             lost, self.lost = self.lost, 0
@@ -100,6 +105,22 @@ class BagRecording:
             except (BagError, OSError) as error:
                 self.lost += lost
                 self._end_bag(error)
+
+    def _is_full(self, bag: BagWriter) -> bool:
+        limits, age_s = self._parameters, (self._clock.now_ns() - self._bag_started_ns) * 1e-9
+        size_bytes = bag.path.stat().st_size
+        return (limits.max_bag_bytes is not None and size_bytes >= limits.max_bag_bytes) or (
+            limits.max_bag_duration_s is not None and age_s >= limits.max_bag_duration_s
+        )
+
+    def _split(self, bag: BagWriter) -> None:
+        """Close the bag and start another one, which begins with the latched messages."""
+        self._bag = None
+        try:
+            bag.close()
+            self._start_bag()
+        except (BagError, OSError) as error:
+            self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
         """Write a message, and return whether it is lost because no bag is open.
@@ -127,9 +148,10 @@ class BagRecording:
             self._bag.close()
 
     def _start_bag(self, **more: str) -> None:
+        self._bag_started_ns = self._clock.now_ns()
         recording = {
             "clock_id": self._clock.id,
-            "started_ns": str(self._clock.now_ns()),
+            "started_ns": str(self._bag_started_ns),
             "started": datetime.now(UTC).isoformat(),
             "plan_hash": self._plan_hash,
             **more,

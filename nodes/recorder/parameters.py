@@ -39,7 +39,17 @@ class RecorderParameters(NodeParameters):
         description="minimum free space of the disk, below which the bag is ended; another bag "
         "starts at twice as much",
     )
-    watch_hz: float = Field(default=2.0, gt=0.0, description="rate of the check of the free space")
+    watch_hz: float = Field(
+        default=2.0,
+        gt=0.0,
+        description="rate of the checks of disk, size and duration",
+    )
+    max_bag_bytes: int | None = Field(
+        default=None, ge=1, description="size at which another bag is started; null: no limit"
+    )
+    max_bag_duration_s: float | None = Field(
+        default=None, gt=0.0, description="duration at which another bag is started; null: no limit"
+    )
     attach: tuple[Path, ...] = Field(
         default=RUN_FILES, description="files to store in the bag; @run is the directory of the run"
     )

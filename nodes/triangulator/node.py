@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from flexsheet.messages.marker_calibration import (
 )
 from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
+from flexsheet.messages.types import Fingertip, FingertipReason, ParameterChange, StereoPair
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
@@ -55,9 +56,11 @@ class Triangulator(Node):
     since the cameras do not see how the finger turns.
     """
 
+    live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
     parameters: TriangulatorParameters
     scene: Input[Scene]
     stereo: Input[StereoPair]
+    parameter: Input[ParameterChange]
     fingertip: Output[Fingertip]
 
     calibration: StereoCalibration | None = None

@@ -206,8 +206,8 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
     yield "<h3>Further commands</h3>"
     path = escape(bag["path"])
     yield (
-        f"<pre>flexsheet bag info {path}\nflexsheet bag verify planner {path}\n"
-        f"flexsheet bag export {path} for-foxglove.mcap</pre>"
+        f"<pre>flexsheet bag info {path}\nflexsheet bag verify {path} planner\n"
+        f"flexsheet bag export {path} -o for-foxglove.mcap</pre>"
     )
 
 

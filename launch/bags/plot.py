@@ -1,0 +1,152 @@
+"""Plot fields of recorded topics over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from flexsheet.launch.plans.documents import BadInputError, did_you_mean
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.topics import UnknownTopicError, find_topic
+
+MAX_COMPONENTS = 16
+"""Maximum number of lines in one chart; images and meshes have more components."""
+
+CHART_SIZE_IN = (8.0, 2.4)
+"""Width and height of the chart of one field, inches."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSeries:
+    """Values (n, components) of a field over the times (n,) of its sources, from the bag's start.
+
+    name: "TOPIC.FIELD".
+    """
+
+    name: str
+    times_s: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the series as JSON types."""
+        return {
+            "field": self.name,
+            "times_s": self.times_s.tolist(),
+            "values": self.values.tolist(),
+        }
+
+
+def read_fields(
+    bag: Path, names: Sequence[str], progress: Callable[[float, float], None]
+) -> list[FieldSeries]:
+    """Read fields named "TOPIC.FIELD" from a bag; inner fields are "TOPIC.FIELD.FIELD".
+
+    Raises BadInputError for a topic or field that the bag does not contain, or that has no number.
+    """
+    paths = {name: _parse(name) for name in names}
+    reader = BagReader(bag)
+    recorded = sorted(reader.topics)
+    for name, (topic, _) in paths.items():
+        if topic not in recorded:
+            raise _error(bag, f'{name}: topic "{topic}" is not in the bag', topic, recorded)
+    summary = reader.info()
+    rows: dict[str, list[tuple[float, NDArray[np.float64]]]] = {name: [] for name in names}
+    topics = {topic for topic, _ in paths.values()}
+    for topic, message, header, log_ns in BagReader(bag, sorted(topics)):
+        progress(1e-9 * (log_ns - summary.start_ns), summary.duration_s)
+        for name, (wanted, path) in paths.items():
+            if wanted == topic and (value := _get_number(bag, name, message, path)) is not None:
+                rows[name].append((1e-9 * (header.source_ns - summary.start_ns), value))
+    return [_make_series(bag, name, found) for name, found in rows.items()]
+
+
+def _parse(name: str) -> tuple[str, list[str]]:
+    """Split "TOPIC.FIELD.FIELD" into the topic and the path of the field; check both."""
+    topic, _, path = name.partition(".")
+    try:
+        fields: Any = find_topic(topic).message.model_fields
+    except UnknownTopicError as error:
+        raise BadInputError.single(name, (), str(error)) from error
+    first, *inner = path.split(".")
+    if first not in fields:
+        what = f'topic "{topic}" does not contain the field "{first}"'
+        raise BadInputError.single(name, (), what, did_you_mean(first, list(fields)))
+    return topic, [first, *inner]
+
+
+def _get_number(
+    bag: Path, name: str, message: BaseModel, path: Sequence[str]
+) -> NDArray[np.float64] | None:
+    """Return the numbers (components,) of a field; None if the field is null."""
+    value: Any = message
+    for part in path:
+        fields = type(value).model_fields if isinstance(value, BaseModel) else {}
+        if value is None:
+            return None
+        if part not in fields:
+            raise _error(bag, f'{name}: unknown field "{part}"', part, list(fields))
+        value = getattr(value, part)
+    if value is None:
+        return None
+    if isinstance(value, BaseModel):
+        inner = list(type(value).model_fields)
+        raise _error(bag, f"{name}: is a group of fields; add one of them", "", inner)
+    try:
+        numbers = np.asarray(value, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise BadInputError.single(str(bag), (), f"{name}: is not a number") from error
+    if numbers.size > MAX_COMPONENTS:
+        what = f"{name}: has {numbers.size} numbers; at most {MAX_COMPONENTS} are plotted"
+        raise BadInputError.single(str(bag), (), what, "choose another field")
+    return numbers
+
+
+def _make_series(
+    bag: Path, name: str, rows: list[tuple[float, NDArray[np.float64]]]
+) -> FieldSeries:
+    if not rows:
+        raise BadInputError.single(str(bag), (), f"{name}: the bag contains no value")
+    width = max(values.size for _, values in rows)
+    table = np.full((len(rows), width), np.nan)
+    for row, (_, values) in zip(table, rows, strict=True):
+        row[: values.size] = values
+    return FieldSeries(name, np.array([time_s for time_s, _ in rows]), table)
+
+
+def _error(bag: Path, what: str, name: str, known: list[str]) -> BadInputError:
+    return BadInputError.single(str(bag), (), what, did_you_mean(name, known))
+
+
+def draw_fields(series: Sequence[FieldSeries], image: Path, *, title: str) -> None:
+    """Draw one chart for each field, with a common time axis, into an image file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(
+        figsize=(CHART_SIZE_IN[0], CHART_SIZE_IN[1] * len(series)), layout="constrained"
+    )
+    FigureCanvasAgg(figure)
+    charts = figure.subplots(len(series), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, one in zip(charts, series, strict=True):
+        components = one.values.shape[1]
+        labels = "xyz" if components == 3 else [str(number) for number in range(components)]
+        for label, values in zip(labels, one.values.T, strict=True):
+            axes.plot(one.times_s, values, linewidth=1.0, label=label)
+        axes.set_ylabel(one.name)
+        axes.grid(alpha=0.3)
+        if components > 1:
+            axes.legend(loc="upper right", ncols=min(components, 6), fontsize="small")
+    charts[0].set_title(title)
+    charts[-1].set_xlabel("time from the start of the bag, s")
+    try:
+        figure.savefig(image)
+    except (OSError, ValueError) as error:
+        raise BadInputError.single(
+            str(image), (), f"cannot be written: {error}", "name a .svg or .png file"
+        ) from error

@@ -1,0 +1,87 @@
+"""`flexsheet graph`: print or draw the nodes and topics of a graph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import running_graph
+from flexsheet.launch.commands.options import (
+    JsonOption,
+    OtherSceneOption,
+    RunOption,
+    SettingsOption,
+    find_launch_file,
+    output_file,
+    with_scene,
+)
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    check_folder,
+    examples,
+    print_json,
+    words,
+)
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet graph",
+        "flexsheet graph launch/lab.yaml -o lab.svg",
+        "flexsheet graph demo -o demo.mmd",
+    )
+)
+def graph(
+    *,
+    launch_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LAUNCH_FILE",
+            help="Launch file; default: that of the running graph.",
+            autocompletion=complete.launch_files,
+            callback=find_launch_file,
+        ),
+    ] = None,
+    scene: OtherSceneOption = None,
+    settings: SettingsOption = None,
+    output: Annotated[
+        Path | None, output_file("File to draw the graph to: .svg, or .mmd for Mermaid.")
+    ] = None,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print or draw the nodes of a graph, and the topics between them.
+
+    Topics of which any number of nodes are writers, such as estop and status, are left out.
+    """
+    from flexsheet.launch.plans.drawing import lay_out, list_links, mermaid, svg, text_lines
+    from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.messages.files import write_file
+
+    if launch_file is None:
+        plan, _ = running_graph(run)
+    else:
+        plan = load_graph(launch_file, settings=with_scene(settings, scene))
+    if output is not None:
+        check_folder("--output", output)
+        if output.suffix not in (".svg", ".mmd"):
+            raise CommandError(f"--output {output}: name a .svg or .mmd file", BAD_INPUT)
+        write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))
+        words.print(f"drawn: {output}", markup=False)
+    if as_json:
+        links = [
+            {"from": writer, "to": reader, "topics": topics}
+            for (writer, reader), topics in list_links(plan).items()
+        ]
+        nodes = [
+            {"node": one.name, "type": one.type, "host": one.host} for one in plan.nodes.values()
+        ]
+        print_json({"launch_file": plan.launch_file, "nodes": nodes, "links": links})
+    elif output is None:
+        print("\n".join(text_lines(plan)))

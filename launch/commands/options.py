@@ -1,0 +1,230 @@
+"""Declare the arguments and options that several commands share.
+
+Names of values are capital letters; `name_values` adds them to the options that declare none.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
+
+DEMO, CYLINDER = Path("demo"), Path("cylinder")
+"""Names of the shipped launch file and scene that commands use by default."""
+
+FORMER_NAMES = {
+    "also": "include",
+    "commissioned": "calibrated",
+    "into": "launch",
+    "names": "gesture",
+    "parameters": "parameter",
+    "patience": "timeout",
+    "seconds": "duration",
+    "full-length": "full",
+    "start-offset": "start",
+    "times": "count",
+    "topics": "topic",
+    "describe": "info",
+    "prepare": "precompute",
+    "ready": "enable",
+    "service": "systemd",
+    "stand-down": "disable",
+}
+"""Former names of options and commands with their current names; hidden in the help."""
+
+
+def find_launch_file(given: Path | None) -> Path | None:
+    """Return the path of a launch file that is given by path or by its name in the package."""
+    return None if given is None else find_file(given, LAUNCH_FILES)
+
+
+def find_scene(given: Path | None) -> Path | None:
+    """Return the path of a scene that is given by path or by its name in the package."""
+    return None if given is None else find_file(given, SCENES)
+
+
+LaunchArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LAUNCH_FILE",
+        help="Launch file, or the name of a shipped one such as demo.",
+        autocompletion=complete.launch_files,
+        callback=find_launch_file,
+    ),
+]
+LaunchOption = Annotated[
+    Path,
+    typer.Option(
+        "--launch",
+        metavar="LAUNCH_FILE",
+        help="Launch file of the graph.",
+        autocompletion=complete.launch_files,
+        callback=find_launch_file,
+    ),
+]
+SceneArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SCENE",
+        help="Scene file, or the name of a shipped one such as organ.",
+        autocompletion=complete.scenes,
+        callback=find_scene,
+    ),
+]
+SceneOption = Annotated[
+    Path,
+    typer.Option(
+        "--scene",
+        metavar="SCENE",
+        help="Scene file.",
+        autocompletion=complete.scenes,
+        callback=find_scene,
+    ),
+]
+OtherSceneOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--scene",
+        metavar="SCENE",
+        help="Scene to use instead of that of the launch file.",
+        autocompletion=complete.scenes,
+        callback=find_scene,
+    ),
+]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NODE.PARAM=VALUE",
+        help="Override a parameter of the launch file; repeat for several.",
+    ),
+]
+ApparatusOption = Annotated[
+    str | None,
+    typer.Option(
+        "--apparatus",
+        metavar="FILE|seed:N",
+        help="True parameters of the simulation: a file, or a draw such as seed:7,paper,calibrated; "
+        "default: the scene.",
+    ),
+]
+RunOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--run",
+        metavar="FOLDER",
+        help="Directory of the run; default: the newest running graph.",
+        autocompletion=complete.runs,
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+DurationOption = Annotated[
+    float | None,
+    typer.Option(
+        "--duration",
+        metavar="SECONDS",
+        min=0.0,
+        help="Time after which the command stops; default: when Ctrl-C is pressed.",
+    ),
+]
+TopicArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="TOPIC",
+        help="Name of the topic, such as twin/finger.",
+        autocompletion=complete.topics,
+    ),
+]
+TopicsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        metavar="TOPIC",
+        help="Topic to use; repeat for several; default: all.",
+        autocompletion=complete.topics,
+    ),
+]
+BagArgument = Annotated[
+    Path, typer.Argument(metavar="BAG", help="Bag file.", autocompletion=complete.bags)
+]
+ResultFolderOption = Annotated[
+    Path | None,
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        help="Folder for the bag and results; default: a new folder in runs/.",
+    ),
+]
+WorkersOption = Annotated[
+    int,
+    typer.Option(
+        "--workers",
+        metavar="N",
+        min=1,
+        max=64,
+        help="Number of simultaneous trials on this computer.",
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a dask.distributed scheduler whose workers do the work, such as "
+        "tcp://host:8786; default: this computer.",
+    ),
+]
+ProfileOption = Annotated[
+    Literal["modern", "paper"],
+    typer.Option("--profile", help="Equipment that is drawn; modern: 60 Hz camera; paper: 30 Hz."),
+]
+CalibratedOption = Annotated[
+    bool,
+    typer.Option("--calibrated", help="Draw what remains after the devices' calibration."),
+]
+SeedOption = Annotated[
+    int, typer.Option("--seed", metavar="N", help="Random seed of the simulation.")
+]
+
+
+def output_file(text: str, metavar: str = "FILE") -> Any:
+    """Make the option -o/--output of a file to write."""
+    return typer.Option("-o", "--output", metavar=metavar, help=text)
+
+
+def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
+    """Return the settings of a launch file, with the scene of --scene as the first one."""
+    return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
+
+
+def split_names(given: list[str] | None) -> list[str]:
+    """Return the values of a repeated option; the former form "A,B" is several values, too."""
+    return [name.strip() for one in given or () for name in one.split(",") if name.strip()]
+
+
+_VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "list[str]": "TEXT"}
+
+
+def name_values(command: Any) -> None:
+    """Give each argument and option of a command the name of its value; a flag has none."""
+    help_option = command.get_help_option(SimpleNamespace(help_option_names=["-h", "--help"]))
+    for parameter in (*command.params, help_option):
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+        elif parameter.metavar is None and parameter.param_type_name == "argument":
+            parameter.metavar = parameter.name.upper()
+        elif parameter.metavar is None:
+            choices = parameter.type_descriptor.choices
+            parameter.metavar = (
+                "|".join(str(getattr(one, "value", one)) for one in choices)
+                if choices
+                else _VALUE_NAMES[parameter.bare_type()]
+            )
+    for inner in getattr(command, "commands", {}).values():
+        name_values(inner)

@@ -1,0 +1,209 @@
+"""`flexsheet param`: list, get and set the parameters of the nodes of the running graph."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import receive_until, run_interruptible, running_graph
+from flexsheet.launch.commands.options import JsonOption, RunOption
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_json,
+    print_rows,
+    words,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
+    from flexsheet.launch.running.runs import Run
+    from flexsheet.messages.types import Status
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="List, get and set parameters of the running graph.",
+)
+
+STATUS_TIMEOUT_S = 3.0
+"""Nodes publish their status, with the changed parameters, once a second."""
+
+ParameterArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="NODE.PARAM",
+        help="Node and parameter, such as planner.max_age_s.",
+        autocompletion=complete.node_parameters,
+    ),
+]
+
+
+@app.command("list", epilog=examples("flexsheet param list", "flexsheet param list fem_solver"))
+def list_parameters(
+    node: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NODE", help="Node; default: all nodes.", autocompletion=complete.nodes
+        ),
+    ] = None,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the parameters of the running graph, and whether they may change while it runs."""
+    plan, found = running_graph(run)
+    nodes = [_find_node(plan, node)] if node else list(plan.nodes.values())
+    changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
+    rows = [
+        {
+            "parameter": f"{one.name}.{name}",
+            "value": changed.get(one.name, {}).get(name, value),
+            "live": name in _live(one),
+        }
+        for one in nodes
+        for name, value in one.parameters.items()
+        if name != "apparatus"
+    ]
+    if not as_json:
+        for row in rows:
+            row["live"] = "yes" if row["live"] else ""
+    print_rows(rows, as_json=as_json)
+
+
+@app.command("get", epilog=examples("flexsheet param get fem_solver.prediction_horizon_s"))
+def get_parameter(
+    parameter: ParameterArgument, run: RunOption = None, as_json: JsonOption = False
+) -> None:
+    """Print the value of a parameter of the running graph."""
+    plan, found = running_graph(run)
+    node, name = _find_parameter(plan, parameter)
+    live = {node.name} if name in _live(node) else set()
+    changed = _read_changes(plan, found, live).get(node.name, {})
+    value = changed.get(name, node.parameters[name])
+    if as_json:
+        print_json({"parameter": parameter, "value": value})
+    else:
+        print(json.dumps(value))
+
+
+@app.command(
+    "set",
+    epilog=examples("flexsheet param set fem_solver.prediction_horizon_s 0.02"),
+    context_settings={"ignore_unknown_options": True},
+)
+def set_parameter(
+    parameter: ParameterArgument,
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value in YAML.")],
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Change a parameter of a running node until its next start.
+
+    `flexsheet param list` shows which parameters may change while the graph runs.
+    """
+    from pydantic import ValidationError
+    from ruamel.yaml.error import YAMLError
+
+    from flexsheet.launch.plans.documents import parse_value
+    from flexsheet.nodes import node_class
+    from flexsheet.nodes.node import find_parameters_type
+
+    plan, found = running_graph(run)
+    node, name = _find_parameter(plan, parameter)
+    if name not in _live(node):
+        live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
+        raise CommandError(
+            f"{parameter}: cannot change while the node runs; start the graph again with "
+            f"--set {parameter}={value} (may change: {live})",
+            BAD_INPUT,
+        )
+    try:
+        parsed = parse_value(value)
+        kind = find_parameters_type(node_class(node.type))
+        checked = kind.model_validate({**node.parameters, name: parsed})
+    except YAMLError as error:
+        raise CommandError(f"VALUE {value}: is not YAML: {error}", BAD_INPUT) from error
+    except ValidationError as error:
+        text = "; ".join(one["msg"] for one in error.errors())
+        raise CommandError(f"{parameter}={value}: is invalid: {text}", BAD_INPUT) from error
+    new = checked.model_dump(mode="json")[name]
+    run_interruptible(_set(plan, found, node.name, name, new))
+    if as_json:
+        print_json({"parameter": parameter, "value": new})
+    else:
+        words.print(f"{parameter} = {json.dumps(new)}", markup=False)
+
+
+def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
+    from flexsheet.launch.plans.documents import did_you_mean
+
+    if name not in plan.nodes:
+        raise CommandError(
+            f'"{name}": unknown node; {did_you_mean(name, list(plan.nodes))}', BAD_INPUT
+        )
+    return plan.nodes[name]
+
+
+def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
+    from flexsheet.launch.plans.documents import did_you_mean
+
+    node_name, _, name = text.partition(".")
+    node = _find_node(plan, node_name)
+    if name not in node.parameters:
+        raise CommandError(
+            f'"{text}": unknown parameter; {did_you_mean(name, list(node.parameters))}', BAD_INPUT
+        )
+    return node, name
+
+
+def _live(node: ResolvedNode) -> frozenset[str]:
+    from flexsheet.nodes import node_class
+
+    return node_class(node.type).live_parameters
+
+
+def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
+    """Return the parameters that running nodes have changed since their start."""
+    found: dict[str, dict[str, Any]] = {}
+    if nodes:
+        run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
+    return found
+
+
+async def _await_statuses(
+    plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
+) -> int:
+    """Collect changed parameters from statuses until `done()`; return 1 if it times out."""
+
+    def add(status: Status) -> None:
+        found[status.node] = json.loads(status.changed_parameters)
+
+    return int(not await receive_until(plan, run, {"status": add}, done, STATUS_TIMEOUT_S))
+
+
+async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
+    """Publish a change, and wait until the node's status confirms it."""
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
+    from flexsheet.messages.types import ParameterChange
+
+    writer = GraphWriter(plan, run, ["parameter"])
+    try:
+        await asyncio.sleep(READER_RECONNECT_S)
+        change = ParameterChange(node=node, parameter=name, value=json.dumps(value))
+        writer.publish("parameter", change)
+
+        found: dict[str, dict[str, Any]] = {}
+        if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
+            raise CommandError(
+                f"{node}.{name}: the node has not confirmed the change; see flexsheet logs {node}"
+            )
+    finally:
+        writer.close()
+    return 0

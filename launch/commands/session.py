@@ -1,0 +1,328 @@
+"""`flexsheet status`, `logs`, `stop` and `run`: look into running graphs, and end them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import (
+    NoGraphError,
+    receive_until,
+    run_interruptible,
+    running_graph,
+)
+from flexsheet.launch.commands.launching import format_log_line, run_graph
+from flexsheet.launch.commands.options import (
+    DurationOption,
+    JsonOption,
+    OtherSceneOption,
+    RunOption,
+    SettingsOption,
+    find_launch_file,
+    with_scene,
+)
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    examples,
+    print_json,
+    print_rows,
+    words,
+)
+
+if TYPE_CHECKING:
+    from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
+    from flexsheet.launch.running.runs import Run
+    from flexsheet.messages.types import HostStatus, Status
+
+status_app, logs_app, stop_app, run_app = (typer.Typer(add_completion=False) for _ in range(4))
+
+STATUS_TIMEOUT_S = 3.0
+"""Nodes publish their status once a second."""
+
+STOP_TIMEOUT_S = 20.0
+POLL_PERIOD_S = 0.05
+
+NodeArgument = Annotated[
+    str,
+    typer.Argument(metavar="NODE", help="Node of the graph.", autocompletion=complete.nodes),
+]
+
+
+@status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
+def status(run: RunOption = None, as_json: JsonOption = False) -> None:
+    """Show the nodes of the running graph with rates, losses, notes and suspected causes.
+
+    Exit code 1 if a node does not report, or a self-check suspects a cause.
+    """
+    plan, found = running_graph(run)
+    statuses: dict[str, Status] = {}
+    hosts: dict[str, HostStatus] = {}
+    run_interruptible(_collect_statuses(plan, found, statuses, hosts))
+    rows = [_describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
+    suspicions = _list_suspicions(statuses)
+    estops = {name: one.estop for name, one in hosts.items() if one.estop is not None}
+    if as_json:
+        print_json(
+            {
+                "run": str(found.directory),
+                "launch_file": plan.launch_file,
+                "plan": plan.hash,
+                "nodes": rows,
+                "self_checks": suspicions,
+                "estop": estops,
+            }
+        )
+    else:
+        words.print(f"{plan.launch_file}, run {found.directory}", markup=False)
+        for row in rows:
+            row["publishes"] = [f"{one['topic']} {one['rate_hz']:.0f} Hz" for one in row["outputs"]]
+            for name in ("inputs", "outputs", "errors"):
+                del row[name]
+        print_rows(rows, as_json=False)
+        for host, reason in estops.items():
+            words.print(f"e-stop on {host}: {reason}", markup=False, style="red")
+        for one in suspicions:
+            if one["suspected"]:
+                words.print(f"{one['node']}: {one['text']}", markup=False, style="yellow")
+                words.print(f"  remedy: {one['remedy']}", markup=False)
+    silent = [name for name in plan.nodes if name not in statuses]
+    if silent or any(one["suspected"] for one in suspicions):
+        raise typer.Exit(FAILED)
+
+
+async def _collect_statuses(
+    plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
+) -> int:
+    """Collect the statuses of all nodes and launchers; stop waiting after a time-out."""
+    handlers: dict[str, Callable[[Any], None]] = {
+        "status": lambda message: statuses.update({message.node: message}),
+        "host": lambda message: hosts.update({message.host: message}),
+    }
+
+    def complete() -> bool:
+        return plan.nodes.keys() <= statuses.keys() and plan.hosts.keys() <= hosts.keys()
+
+    await receive_until(plan, run, handlers, complete, STATUS_TIMEOUT_S)
+    return 0
+
+
+def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
+    """Return a row of the table of nodes; null where the node does not report."""
+    row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
+    if status is None:
+        none: dict[str, Any] = {
+            "cpu": None,
+            "memory_mb": None,
+            "lost": None,
+            "inputs": [],
+            "outputs": [],
+        }
+        return row | none | {"errors": None, "note": ""}
+    lost = sum(port.dropped + port.gaps + port.rejected for port in status.inputs)
+    return row | {
+        "state": status.state,
+        "cpu": round(status.cpu_ratio, 3),
+        "memory_mb": round(status.resident_bytes / 1e6),
+        "lost": lost,
+        "inputs": [port.model_dump() for port in status.inputs],
+        "outputs": [port.model_dump() for port in status.outputs if port.messages],
+        "errors": status.errors,
+        "note": status.last_error if status.state == "degraded" else status.note,
+    }
+
+
+def _list_suspicions(statuses: dict[str, Status]) -> list[dict[str, Any]]:
+    from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
+
+    return [
+        {
+            "node": name,
+            **check.model_dump(),
+            "text": describe_self_check(check),
+            "remedy": SELF_CHECK_REMEDIES[check.cause],
+        }
+        for name, status in statuses.items()
+        for check in status.self_checks
+    ]
+
+
+@logs_app.command(
+    epilog=examples("flexsheet logs planner", "flexsheet logs arm_left_bridge --follow -n 20")
+)
+def logs(
+    node: NodeArgument,
+    lines: Annotated[
+        int | None,
+        typer.Option("-n", "--lines", metavar="N", min=0, help="Print the last N lines only."),
+    ] = None,
+    follow: Annotated[
+        bool, typer.Option("-f", "--follow", help="Print further lines until Ctrl-C.")
+    ] = False,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the log of a node of the running graph, or of the newest run if none is running."""
+    from flexsheet.launch.plans.documents import did_you_mean
+
+    found = _newest_run(run)
+    file = found.logs / f"{node}.log"
+    if not file.is_file():
+        known = sorted(one.stem for one in found.logs.glob("*.log"))
+        raise CommandError(
+            f'"{node}": no such log in {found.logs}; {did_you_mean(node, known)}', BAD_INPUT
+        )
+
+    def show(line: str) -> None:
+        print(line if as_json else format_log_line(line)[1], flush=True)
+
+    with file.open(encoding="utf-8", errors="replace") as text:
+        for line in deque(text, maxlen=lines):
+            show(line.rstrip("\n"))
+        if follow:
+            for line in _further_lines(text, found):
+                show(line)
+
+
+def _newest_run(directory: Path | None) -> Run:
+    """Return a run by its directory; default: the newest live one, else the newest one."""
+    from flexsheet.launch.running.runs import Run, list_live_runs, list_runs
+
+    if directory is not None:
+        return Run(directory.resolve().name, directory.resolve())
+    runs = list_live_runs() or list_runs()
+    if not runs:
+        raise NoGraphError("no graph has run on this computer")
+    return runs[0]
+
+
+def _further_lines(text: Any, run: Run) -> Iterator[str]:
+    """Yield the lines that are added to a log while its run is alive."""
+    part = ""
+    while True:
+        alive = run.is_alive()
+        part += text.read()
+        *whole, part = part.split("\n")
+        yield from whole
+        if not alive:
+            return
+        time.sleep(POLL_PERIOD_S)
+
+
+@stop_app.command(epilog=examples("flexsheet stop", "flexsheet stop --all"))
+def stop(
+    run: RunOption = None,
+    stop_all: Annotated[
+        bool, typer.Option("--all", help="Stop all graphs of this user on this computer.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Stop the running graph as Ctrl-C in its terminal does; exit code 1 if it does not end.
+
+    In an emergency use the hard-wired e-stop, then `flexsheet arms stop`.
+    """
+    from flexsheet.launch.running.runs import list_live_runs
+
+    live = list_live_runs()
+    chosen = [one for one in live if run is None or one.directory == run.resolve()]
+    if not chosen:
+        raise NoGraphError("no graph is running")
+    if not stop_all:
+        del chosen[1:]
+    for each in chosen:
+        os.kill(int(each.id.partition(".")[0]), signal.SIGTERM)
+    end_s = time.monotonic() + STOP_TIMEOUT_S
+    while any(one.is_alive() for one in chosen) and time.monotonic() < end_s:
+        time.sleep(POLL_PERIOD_S)
+    rows = [{"run": str(one.directory), "stopped": not one.is_alive()} for one in chosen]
+    print_rows(rows, as_json=as_json)
+    if not all(row["stopped"] for row in rows):
+        raise typer.Exit(FAILED)
+
+
+@run_app.command(
+    epilog=examples(
+        "flexsheet run planner",
+        "flexsheet run camera --launch launch/lab.yaml",
+        "flexsheet run renderer --set renderer.rate_hz=20",
+    )
+)
+def run_node(
+    *,
+    node: NodeArgument,
+    launch_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--launch",
+            metavar="LAUNCH_FILE",
+            help="Launch file of a graph that is not running; only this node is started.",
+            autocompletion=complete.launch_files,
+            callback=find_launch_file,
+        ),
+    ] = None,
+    scene: OtherSceneOption = None,
+    settings: SettingsOption = None,
+    duration: DurationOption = None,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run one node of a launch file in this terminal until Ctrl-C.
+
+    The node joins the running graph, which must be started without it:
+    `flexsheet launch LAUNCH_FILE --without NODE`. With --launch, it runs in a graph of its own.
+    """
+    from flexsheet.launch.plans.documents import did_you_mean
+    from flexsheet.launch.plans.plan import load_graph
+
+    given = with_scene(settings, scene)
+    if launch_file is not None:
+        plan = load_graph(launch_file, settings=given)
+    else:
+        plan, found = running_graph(run)
+        if given:
+            raise CommandError("--set and --scene: need --launch LAUNCH_FILE", BAD_INPUT)
+    if node not in plan.nodes:
+        raise CommandError(
+            f'"{node}": {plan.launch_file} has no such node; '
+            f"{did_you_mean(node, list(plan.nodes))}",
+            BAD_INPUT,
+        )
+    if launch_file is not None:
+        without = [name for name in plan.nodes if name != node]
+        code = asyncio.run(run_graph(plan, None, duration, without=without))
+    else:
+        code = run_interruptible(_join(plan, found, node, duration))
+    if as_json:
+        print_json({"node": node, "exit_code": code})
+    raise typer.Exit(code)
+
+
+async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
+    """Run a node of the plan in this process, connected to the running graph."""
+    from flexsheet.launch.running.supervisor import node_config
+    from flexsheet.nodes.runner import run_node as run_config
+
+    if (run.directory / f"{name}.status").exists():
+        raise CommandError(
+            f'"{name}" runs already in {run.directory}; '
+            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}"
+        )
+    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop", markup=False)
+    stop_event = asyncio.Event()
+    work = asyncio.create_task(run_config(node_config(plan, plan.nodes[name], run), stop_event))
+    try:
+        await asyncio.wait((work,), timeout=duration_s)
+    finally:
+        stop_event.set()
+        await work
+    return 0

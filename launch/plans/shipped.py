@@ -1,0 +1,23 @@
+"""Find launch files and scenes by their path, or by their name in the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+LAUNCH_FILES = Path(__file__).resolve().parent.parent
+SCENES = LAUNCH_FILES / "scenes"
+
+
+def list_shipped(folder: Path) -> list[str]:
+    """Return the names of the launch files or scenes in a folder of the package."""
+    return sorted(file.stem for file in folder.glob("*.yaml"))
+
+
+def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
+    """Return the path of a YAML file that is given by its path or by its name in the package.
+
+    shipped: `LAUNCH_FILES` or `SCENES`. folder: folder to which a path is relative. A file that
+    does not exist is returned as it is given.
+    """
+    path, named = folder / given, shipped / f"{given}.yaml"
+    return named if not (path.exists() or path.suffix) and named.is_file() else path
