@@ -40,6 +40,7 @@ def compliance(
         float,
         typer.Option(
             "--delay-ms",
+            metavar="MS",
             min=0.0,
             max=500.0,
             help="Delay from a measured depth until the sheet has moved by it, ms.",

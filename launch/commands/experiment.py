@@ -488,13 +488,14 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
 )
 def stability(
     *,
-    launch_file: LaunchOption = DEMO_FILE,
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     hands: Annotated[
-        int, typer.Option(min=1, max=100, help="Number of drawn hands of each kind.")
+        int, typer.Option(metavar="N", min=1, max=100, help="Number of drawn hands of each kind.")
     ] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn hands.")] = 100,
-    output: OutputOption = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the drawn hands.")] = 100,
+    output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate whether a hand that touches the sheet oscillates; no graph is started.
@@ -511,14 +512,14 @@ def stability(
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
-    scene = require_scene(load_graph(launch_file, settings=settings or ()))
+    chosen = require_scene(load_graph(launch_file, settings=with_scene(settings, scene)))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
         progress("computing the object's force curve")
         result = experiment.stability_result(
-            scene,
-            make_force_model(scene.sheet),
-            compute_front_curve(scene),
+            chosen,
+            make_force_model(chosen.sheet),
+            compute_front_curve(chosen),
             experiment.StabilitySettings(hands=hands, seed=seed),
             progress,
         )

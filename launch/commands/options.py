@@ -109,8 +109,8 @@ ApparatusOption = Annotated[
     typer.Option(
         "--apparatus",
         metavar="FILE|seed:N",
-        help="True parameters of the simulation: a file, or a draw such as seed:7,paper,calibrated; "
-        "default: the scene.",
+        help="True parameters of the simulation: a file, or a draw such as "
+        "seed:7,paper,calibrated; default: the scene.",
     ),
 ]
 RunOption = Annotated[
