@@ -512,14 +512,14 @@ def stability(
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
-    chosen = require_scene(load_graph(launch_file, settings=with_scene(settings, scene)))
+    loaded = require_scene(load_graph(launch_file, settings=with_scene(settings, scene)))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
         progress("computing the object's force curve")
         result = experiment.stability_result(
-            chosen,
-            make_force_model(chosen.sheet),
-            compute_front_curve(chosen),
+            loaded,
+            make_force_model(loaded.sheet),
+            compute_front_curve(loaded),
             experiment.StabilitySettings(hands=hands, seed=seed),
             progress,
         )
