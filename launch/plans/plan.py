@@ -42,6 +42,7 @@ from flexsheet.launch.plans.plan_model import (
     ResolvedPort,
     Writer,
 )
+from flexsheet.launch.plans.processes import check_processes
 from flexsheet.launch.plans.resolve_nodes import (
     CALIBRATION_MARKS,
     NodeEntry,
@@ -102,6 +103,7 @@ def load_graph(
     refuse_apparatus_readers(entries, document)
     check_calibrations(entries, scene, document)
     check_device_hosts(entries, spec, document)
+    check_processes(entries, document)
     document.raise_problems()
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
@@ -225,6 +227,7 @@ def _make_node(
         start_deadline_s=entry.spec.start_deadline_s,
         liveness_s=entry.spec.liveness_s,
         nice=entry.spec.nice,
+        process=entry.spec.process or entry.name,
     )
 
 

@@ -5,6 +5,7 @@ The module is separate from the resolver (`launch.plans.plan`), so that tools st
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal
 
@@ -120,6 +121,7 @@ class ResolvedNode(StrictModel):
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
     liveness_s: float | None = Field(default=None, description="None in older bags")
     nice: int = Field(default=0, description="0 in older bags")
+    process: str = Field(default="", description="name of its process; the node's in older bags")
 
     @property
     def arm_side(self) -> str | None:
@@ -149,6 +151,23 @@ class ResolvedNode(StrictModel):
                 name: parameters[name] for name in OLD_CALIBRATIONS if parameters.get(name)
             }
         return {**derived, **values}
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedProcess:
+    """A process with its nodes, which share host, niceness, restart policy and liveness."""
+
+    name: str
+    nodes: tuple[ResolvedNode, ...]
+
+    @property
+    def settings(self) -> ResolvedNode:
+        """Return a node, for the settings that all nodes of the process share."""
+        return self.nodes[0]
+
+    @property
+    def start_deadline_s(self) -> float:
+        return max(node.start_deadline_s for node in self.nodes)
 
 
 class ResolvedGraph(StrictModel):
@@ -194,6 +213,13 @@ class ResolvedGraph(StrictModel):
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
         """Return the nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
+
+    def processes_on(self, host: str | None) -> list[ResolvedProcess]:
+        """Return the processes of one host, or of all, in the order of their first nodes."""
+        members: dict[str, list[ResolvedNode]] = {}
+        for node in self.nodes_on(host):
+            members.setdefault(node.process or node.name, []).append(node)
+        return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
         """Return (node, TCP port) for each port on which a node listens."""
