@@ -53,6 +53,9 @@ class NodeSpec(StrictModel):
         "a fault of one of them stops the arm",
     )
     parameters: dict[str, Any] = Field(default={})
+    always: bool = Field(
+        default=False, description="start the node even if neither scene nor graph needs it"
+    )
     topics: dict[str, str | None] = Field(
         default={}, description="topic by port, if the names differ; null disconnects a port"
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from flexsheet.launch.plans.documents import (
     read_document,
     validate,
 )
+from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -35,6 +36,7 @@ from flexsheet.launch.plans.launch_file import (
     apply_record,
     apply_setting,
 )
+from flexsheet.launch.plans.needed_nodes import omit_unneeded, remove_features
 from flexsheet.launch.plans.plan_model import (
     MAIN,
     ResolvedGraph,
@@ -71,6 +73,8 @@ def load_graph(
     record: Path | None = None,
     console: bool = False,
     apparatus: str | None = None,
+    needed: Collection[str] = (),
+    without: Collection[Feature] = (),
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
@@ -78,6 +82,8 @@ def load_graph(
     record: bag to record to; it overrides the file.
     console: add a console and a paused recorder, unless the file has them.
     apparatus: file or "seed:N" of the simulator's true devices; None: those of the scene.
+    needed: topics that the caller reads, so that the nodes which write them are started.
+    without: parts of the scene that are left out.
     Raises BadInputError with all errors of the file.
     """
     document = read_document(path)
@@ -90,11 +96,14 @@ def load_graph(
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
     scene_document, scene = _load_scene(spec, document)
+    if scene is not None:
+        scene = remove_features(scene, without)
     entries = collect_entries(spec, document)
     for entry in entries:
         resolve_entry(entry, document)
     truth = _load_apparatus(apparatus, scene, document)
     give_apparatus(entries, truth, document)
+    entries, omitted = omit_unneeded(entries, scene, needed)
     writers = list_writers(
         spec, entries, document, has_scene=scene is not None, has_apparatus=truth is not None
     )
@@ -135,6 +144,7 @@ def load_graph(
         apparatus=None if truth is None else truth.model_dump(mode="json"),
         hosts=addresses,
         nodes=nodes,
+        omitted=tuple(omitted),
         writers=endpoints,
         keys={name: host.key for name, host in spec.hosts.items() if host.key is not None},
         estop_resetters=resetters,

@@ -15,7 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bus import Source
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import NodeRole
+from flexsheet.nodes import NodeRole, OmissionReason
 
 MAIN = "main"
 """Host of the launcher's own topics, the recorder and the command-line tools."""
@@ -170,6 +170,15 @@ class ResolvedProcess:
         return max(node.start_deadline_s for node in self.nodes)
 
 
+class OmittedNode(StrictModel):
+    """Node of the launch file that is not started."""
+
+    name: str
+    type: str
+    host: str
+    reason: OmissionReason
+
+
 class ResolvedGraph(StrictModel):
     """A resolved launch file: nodes, hosts, and the endpoints of all topics."""
 
@@ -183,6 +192,7 @@ class ResolvedGraph(StrictModel):
     )
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, ResolvedNode]
+    omitted: tuple[OmittedNode, ...] = Field(default=(), description="nodes that are not started")
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
     keys: dict[str, str] = Field(default={}, description="public key by host; not part of the hash")
     estop_resetters: tuple[str, ...] = Field(

@@ -428,6 +428,8 @@ class RunningGraph:
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
+        for omitted in self.plan.omitted:
+            self._report(LAUNCHER, f"{omitted.name} is not started: {omitted.reason}")
         if problem := describe_nice_problem(self.nodes):
             self._report(LAUNCHER, problem)
         for name, process in self._processes.items():

@@ -41,7 +41,7 @@ def _is_finite(fingertip: Fingertip) -> bool:
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_left", "arm_right"})
 
     parameters: PlannerParameters
     scene: Input[Scene]
@@ -50,6 +50,11 @@ class Planner(Node):
     arm_left: Input[ArmState]
     arm_right: Input[ArmState]
     sheet_target: Output[SheetTarget]
+
+    @classmethod
+    def unused_inputs(cls, parameters: PlannerParameters, scene: Scene) -> frozenset[str]:
+        no_force = parameters.choose_compliance(scene) == "none"
+        return frozenset({"soft_body"} if no_force else ())
 
     async def setup(self) -> None:
         self._trajectory: SheetTrajectoryPlanner | None = None
@@ -84,7 +89,7 @@ class Planner(Node):
         self._compliance = ComplianceController(
             scene,
             model,
-            self.parameters.compliance_mode,
+            self.parameters.choose_compliance(scene),
             hysteresis_ratio=None if measured is None else float(measured.value),
         )
         self._first_step_s = 1.0 / scene.camera.rate_hz
