@@ -26,11 +26,12 @@ from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, ge
 class LocalEnvelope(Envelope):
     """Message for the readers in its process, which is copied and validated at most once."""
 
-    __slots__ = ("_error", "_message", "_original")
+    __slots__ = ("_error", "_message")
 
     def __init__(self, codec: Codec, header: Header, original: Message) -> None:
         super().__init__(codec, header, {})
-        self._original, self._message, self._error = original, None, None
+        self._message: Message | None = None
+        self._error: WireError | None = None
         self.fields = {name: _share(value) for name, value in original.__dict__.items()}
 
     def open(self) -> Message:

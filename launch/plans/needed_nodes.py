@@ -48,9 +48,9 @@ def omit_unneeded(
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
         fixed = None
-    kept, omitted = list(entries), []
-    for entry in entries if fixed is not None else ():
-        if entry.type is not None and entry.parameters is not None:
+    kept, omitted = list(entries), list[OmittedNode]()
+    for entry in entries:
+        if fixed is not None and entry.type is not None and entry.parameters is not None:
             entry.disconnect(entry.type.unused_inputs(entry.parameters, fixed))
     while True:
         found = next(_find_unneeded(kept, fixed, needed), None)
