@@ -20,7 +20,7 @@ SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]
-ComplianceMode = Literal["force_curve", "stiffness", "none"]
+ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
 class SoftBodyChoice(BaseModel):
@@ -45,7 +45,7 @@ class Methods(BaseModel):
     correction: Correction | None = None
     soft_body: SoftBodyChoice | None = None
     compliance: ComplianceMode | None = Field(
-        default=None, description="none: the sheet's stretch is constant; no force is rendered"
+        default=None, description="rendering of the object's force; constant_stretch: none"
     )
 
 

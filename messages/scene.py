@@ -162,9 +162,7 @@ class BoxPatchSupport(Part):
         return self
 
 
-Support = Annotated[
-    StripSupport | BaseSupport | SpherePatchSupport | BoxPatchSupport, Field(discriminator="kind")
-]
+Support = StripSupport | BaseSupport | SpherePatchSupport | BoxPatchSupport
 
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -207,7 +205,9 @@ class VirtualObject(Part):
     material: Material | None = Field(default=None, description="null: the object is rigid")
     world_from_object: Pose
     support: Support | None = Field(
-        default=None, description="fixed part of the skin; null only for a rigid object"
+        default=None,
+        discriminator="kind",
+        description="fixed part of the skin; null only for a rigid object",
     )
     appearance: Appearance = Appearance()
 

@@ -121,7 +121,7 @@ def test_a_rigid_object_is_presented_by_a_constant_stretch() -> None:
     curve = np.column_stack([np.linspace(0.0, 0.01, 8), np.linspace(0.0, 2.0, 8)])
     body = SoftBody.model_construct(stiffness_n_per_m=200.0, force_curve=curve)
     controller.update(body, in_contact=False)
-    assert mode == "none"
+    assert mode == "constant_stretch"
     assert controller.stretch_ratio == scene.sheet.min_stretch_ratio
     assert controller.normal_offset(0.01, (0.0, 0.0)) == (0.0, 0.0)
 

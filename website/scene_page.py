@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -30,7 +31,8 @@ Lengths are in metres and angles in radians.  The world frame has its origin at 
 imaginary screen: x to the right, y up, z towards the user.  Names `a_from_b` are poses of frame b
 in frame a.  Unknown keys are errors.  Numbers also have the limits of their unit
 ([limits](launch-files.md#limits)).  `object.support_angle_rad: A` is short for
-`object.support: {kind: strip, angle_rad: A}`.  To check a scene and the reach of the arms:
+`object.support: {kind: strip, angle_rad: A}`.  Without `object.material` the object is rigid, without `projector` there is no
+image ([which nodes start](launch-files.md#which-nodes-start)).  To check a scene and the reach of the arms:
 
 ```bash
 flexsheet doctor scene launch/scenes/cylinder.yaml
@@ -130,6 +132,8 @@ def _variants(key: str, kind: type[BaseModel]) -> list[str]:
     field = kind.model_fields[key]
     sections = []
     for variant in get_args(field.annotation):
+        if variant is NoneType:
+            continue
         model = MeshFile if variant is Mesh else variant
         tag = next(iter(get_args(model.model_fields[str(field.discriminator)].annotation)))
         sections += [

@@ -31,7 +31,7 @@ def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
     if Feature.IMAGE in features:
         changes["projector"] = None
     if Feature.FORCE in features:
-        changes["methods"] = scene.methods.model_copy(update={"compliance": "none"})
+        changes["methods"] = scene.methods.model_copy(update={"compliance": "constant_stretch"})
     return scene.model_copy(update=changes)
 
 

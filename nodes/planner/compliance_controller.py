@@ -37,7 +37,7 @@ class ComplianceController:
     hysteresis_ratio: share of the loading's energy that the rubber loses in a cycle; None: the
         scene's.
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
-        small pushes by the stretch only, like the paper.  "none" keeps the minimum stretch.
+        small pushes by the stretch only, like the paper.  "constant_stretch" keeps the minimum.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ComplianceController:
 
         Raises UnfitCurveError for an invalid force curve; the last fit then stays in use.
         """
-        if self._mode == "none":
+        if self._mode == "constant_stretch":
             return
         if self._mode == "stiffness":
             if soft_body.stiffness_n_per_m > 0.0:

@@ -53,7 +53,7 @@ class Planner(Node):
 
     @classmethod
     def unused_inputs(cls, parameters: PlannerParameters, scene: Scene) -> frozenset[str]:
-        no_force = parameters.choose_compliance(scene) == "none"
+        no_force = parameters.choose_compliance(scene) == "constant_stretch"
         return frozenset({"soft_body"} if no_force else ())
 
     async def setup(self) -> None:

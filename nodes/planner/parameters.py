@@ -38,15 +38,15 @@ class PlannerParameters(NodeParameters):
     compliance_mode: ComplianceMode | Literal["auto"] = Field(
         default="auto",
         description="force_curve: render the object's force over depth, by stretch and normal "
-        "offset; stiffness: render its stiffness by the stretch alone, as the paper does; none: "
-        "constant stretch; auto: that of the scene's methods, else none for a rigid object and "
-        "force_curve for a soft one",
+        "offset; stiffness: render its stiffness by the stretch alone, as the paper does; "
+        "constant_stretch: render no force; auto: that of the scene's methods, else force_curve; a "
+        "rigid object always has a constant stretch",
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
-        """Return the mode for a scene; without a material only `none` is possible."""
+        """Return the mode for a scene; a rigid object needs a constant stretch."""
         if scene.object.material is None:
-            return "none"
+            return "constant_stretch"
         return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
 
     sheet_calibration: SheetCalibrationFile | None = Field(
