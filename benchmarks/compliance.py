@@ -28,7 +28,7 @@ from flexsheet.launch.health.compliance import (
     compute_front_curve,
 )
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
@@ -62,7 +62,7 @@ PLACES_MODULUS_PA = 3000.0
 
 def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
     """Compute the force-depth curve of the scene's object, divided by its Young's modulus."""
-    rows, modulus = compute_front_curve(scene), scene.object.material.young_modulus_pa
+    rows, modulus = compute_front_curve(scene), require_material(scene).young_modulus_pa
     return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
 
 

@@ -23,7 +23,7 @@ import structlog
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.fem_solver.benchmarks import (
     LINEAR_DEPTH_M,
     MAX_DEPTH_M,
@@ -129,7 +129,7 @@ def scikit_fem(body: SceneBody, scene: Scene) -> ExternalSolver | None:
     mesh = build_mesh(body.spec.mesh)
     loads = ContactLoads(body, mesh)
     basis, order = _scikit_basis(skfem, mesh)
-    material = scene.object.material
+    material = require_material(scene)
     law = linear_elasticity(*lame_parameters(material.young_modulus_pa, material.poisson_ratio))
     matrix = skfem.asm(law, basis)
     fixed = np.flatnonzero(np.repeat(mesh.fixed, 3)[order])
@@ -146,7 +146,7 @@ def scikit_fem(body: SceneBody, scene: Scene) -> ExternalSolver | None:
 
 
 def _stiffness(mesh: SolidMesh, scene: Scene) -> Any:
-    material = scene.object.material
+    material = require_material(scene)
     return stiffness_matrix(
         mesh.nodes,
         mesh.elements,
@@ -188,7 +188,7 @@ def mujoco_flex(
     mujoco = import_optional("mujoco")
     if mujoco is None:
         return None
-    mesh, material = build_mesh(body.spec.mesh), scene.object.material
+    mesh, material = build_mesh(body.spec.mesh), require_material(scene)
     corners = np.unique(mesh.elements[:, :4])
     points, fixed = mesh.nodes[corners], np.flatnonzero(mesh.fixed[corners])
     elements = np.searchsorted(corners, mesh.elements[:, :4])

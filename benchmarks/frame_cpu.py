@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody
 from flexsheet.nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
 from flexsheet.nodes.models.rigid import apply
@@ -107,7 +107,7 @@ def gl_apart(clock: Clock) -> Iterator[None]:
 
 def with_fewer_pixels(scene: Scene, fraction: float) -> Scene:
     """Return the scene with fewer projector pixels."""
-    projector, lens = scene.projector, scene.projector.lens
+    projector, lens = require_projector(scene), require_projector(scene).lens
     sizes = {name: fraction * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
     changes = {
         "lens": lens.model_copy(update=sizes),
@@ -231,7 +231,11 @@ def main() -> None:
         say(name, [name], rows)
     say("CPU side, all", names, rows)
     for name in ("GL calls", "GL finish"):
-        say(f"{name}, {scene.projector.width_px}x{scene.projector.height_px}", [name], full)
+        say(
+            f"{name}, {require_projector(scene).width_px}x{require_projector(scene).height_px}",
+            [name],
+            full,
+        )
 
 
 if __name__ == "__main__":

@@ -2,11 +2,12 @@
 
 python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--json FILE] [--markdown FILE]
 
-One process publishes at a constant rate, and one process per design receives. The latency is the
-one-way time on the shared clock, from before a typed message is constructed to the handler of the
-validated message. Raw designs transfer as many bytes in as many frames without decoding. The
-designs run in random order in every round. The result is the ratio to blocking ZeroMQ within the
-round, because absolute times on a shared machine vary by a factor of two.
+One process publishes at a constant rate, and one process per design receives; one design is within
+a single process. The latency is the one-way time on the shared clock, from before a typed message
+is constructed to the handler of the validated message. Raw designs transfer as many bytes in as
+many frames without decoding. The designs run in random order in every round. The result is the
+ratio to blocking ZeroMQ within the round, because absolute times on a shared machine vary by a
+factor of two.
 """
 
 from __future__ import annotations
@@ -40,11 +41,13 @@ from rich.table import Table
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Subscriber
+from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import Fingertip, StereoPair
 from flexsheet.messages.wire import INLINE_BYTES, count_bytes, decode, encode
 
 FLOOR = "blocking"
+ONE_PROCESS = "flexsheet, one process"
 NODES_USE = "flexsheet uvloop"
 EPOCH = 1
 
@@ -197,6 +200,14 @@ DESIGNS = (
         "flexsheet, all frames", "the same, each array its own frame", True, flexsheet_uvloop, 0
     ),
 )
+
+
+def refuse_receiver(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    """Stand in for the receiver of a design without a second process."""
+    raise RuntimeError(f'"{ONE_PROCESS}" has no receiving process')
+
+
+LOCAL = Design(ONE_PROCESS, "between nodes of one process, validated", True, refuse_receiver)
 
 
 IMAGES = np.random.default_rng(0).integers(0, 255, (2, 480, 640), np.uint8)
@@ -378,11 +389,51 @@ class Sender:
         self._line.close()
 
 
-def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sender]:
+class LocalSender:
+    """Publisher and subscriber in one loop; the counterpart of `Sender`."""
+
+    def __init__(self, payload: Payload, endpoint: str) -> None:
+        self.design, self._payload, self._endpoint = LOCAL, payload, endpoint
+
+    def round(self, count: int) -> list[int]:
+        """Send `count` messages at the payload's rate; return the latencies, ns."""
+        return uvloop.run(self._round(count))
+
+    async def _round(self, count: int) -> list[int]:
+        local, latencies = LocalBus([self._endpoint]), list[int]()
+        topic = self._payload.topic
+        publisher = Publisher(topic, [self._endpoint], local=local)
+
+        def on_message(message: Message, header: Header) -> None:
+            latencies.append(time.monotonic_ns() - header.publish_ns)
+
+        subscriber = Subscriber(topic, [self._endpoint], on_message, Counts(), local=local)
+        subscriber.start()
+        next_s = time.monotonic()
+        for number in range(1, count + LOCAL_WARM_UP + 1):
+            next_s += 1.0 / self._payload.rate_hz
+            await asyncio.sleep(max(0.0, next_s - time.monotonic()))
+            stamp_ns = time.monotonic_ns()
+            publisher.send(self._payload.make(number), make_header(number, stamp_ns))
+        await asyncio.sleep(0.05)
+        subscriber.close()
+        publisher.close()
+        return latencies[LOCAL_WARM_UP:]
+
+    def close(self) -> None:
+        pass
+
+
+LOCAL_WARM_UP = 20
+
+
+def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sender | LocalSender]:
     """Return a function that opens senders for the transport "ipc" or "tcp"."""
 
-    def open_sender(design: Design, payload: Payload, number: int) -> Sender:
+    def open_sender(design: Design, payload: Payload, number: int) -> Sender | LocalSender:
         place = f"ipc://{folder}/{payload.topic.name}-{number}"
+        if design is LOCAL:
+            return LocalSender(payload, place)
         endpoint = place if transport == "ipc" else "tcp://127.0.0.1:*"
         return Sender(design, payload, BusLine(design, payload, endpoint))
 
@@ -402,7 +453,7 @@ def measure(
     *,
     rounds: int,
     seconds: float,
-    open_sender: Callable[[Design, Payload, int], Sender],
+    open_sender: Callable[[Design, Payload, int], Sender | LocalSender],
     step: Callable[[], object],
 ) -> list[dict[str, Any]]:
     """Return one row per design: p50, p99, and their ratios to the floor, medians over rounds.
@@ -410,7 +461,7 @@ def measure(
     open_sender: its third argument is the design's index.
     """
     count = round(seconds * payload.rate_hz)
-    senders: list[Sender] = []
+    senders: list[Sender | LocalSender] = []
     by_design: dict[str, list[tuple[float, float]]] = {design.name: [] for design in designs}
     missing = dict.fromkeys(by_design, 0)
     try:
@@ -537,12 +588,12 @@ def print_tables(report: dict[str, Any], console: Console) -> None:
         console.print(table)
 
 
-def format_ratios(report: dict[str, Any]) -> str:
-    """Format the ratios of the design that nodes use."""
+def format_ratios(report: dict[str, Any], design: str = NODES_USE) -> str:
+    """Format the ratios of a design, by default of the one that nodes use."""
     return "; ".join(
         f"{row['payload']} {row['p50_ratio']:.2f} at p50, {row['p99_ratio']:.2f} at p99"
         for row in report["latency"]
-        if row["design"] == NODES_USE
+        if row["design"] == design
     )
 
 
@@ -563,7 +614,8 @@ def markdown(report: dict[str, Any]) -> str:
         "and p99 is then mostly its doing.",
         "",
         "To reach (a typed, validated message against raw blocking ZeroMQ): fingertip 1.50 at p50, "
-        f"1.30 at p99; stereo pair 1.20.  Reached in this run: {format_ratios(report)}.",
+        f"1.30 at p99; stereo pair 1.20.  Reached in this run: {format_ratios(report)}.  Within "
+        f"one process, to reach 0.20: {format_ratios(report, ONE_PROCESS)}.",
     ]
     for title, heads, rows in tables(report):
         lines += ["", f"## {title}", ""]
@@ -585,12 +637,13 @@ def main() -> None:
     words = Console(stderr=True)
     load_before = os.getloadavg()[0]
     with Progress(console=words) as progress, tempfile.TemporaryDirectory() as folder:
-        task = progress.add_task("measuring", total=rounds * len(DESIGNS) * len(PAYLOADS))
+        designs = (*DESIGNS, LOCAL)
+        task = progress.add_task("measuring", total=rounds * len(designs) * len(PAYLOADS))
         latency = []
         for payload in PAYLOADS:
             latency += measure(
                 payload,
-                DESIGNS,
+                designs,
                 rounds=rounds,
                 seconds=seconds,
                 open_sender=opener(options.transport, Path(folder)),

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene, require_cylinder
+from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import body, precompute, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
@@ -129,7 +129,7 @@ def evaluate_push(
     for level in range(solved.reached):
         depth_m = float(solved.depths_m[level])
         wanted = np.einsum("qa,qai->qi", weights, solved.moved[level][nodes])
-        modulus = scene.object.material.young_modulus_pa
+        modulus = require_material(scene).young_modulus_pa
         force_n = modulus * float(solved.force_n[level] @ sample.normal)
         texts = []
         for one in (best, linear):
@@ -166,7 +166,7 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
     """Return Hertz's force of a sphere on a half-space with the cylinder's curvature, N."""
-    modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
+    modulus, nu = require_material(scene).young_modulus_pa, require_material(scene).poisson_ratio
     finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / require_cylinder(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
     return float(4.0 / 3.0 * modulus / (1.0 - nu**2) * np.sqrt(radius) * depth_m**1.5)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody
@@ -142,7 +142,7 @@ def linear_inversion_mm(body: Body, sample: SamplePoint) -> float:
         contact = method.contact.solve(ContactQuery(sample.point, sample.normal, depth), depth)
         assert contact is not None
         loads = np.zeros_like(mesh.nodes)
-        forces = contact.forces / body.scene.object.material.young_modulus_pa
+        forces = contact.forces / require_material(body.scene).young_modulus_pa
         loads[mesh.contact_nodes[contact.nodes]] = (
             -forces[:, None] * mesh.contact_normals[contact.nodes]
         )
@@ -328,7 +328,7 @@ def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
     """Return the force of a finger 3 mm deep by Newton's method; NaN if it does not converge."""
     mesh = replace(body.mesh, nodes=nodes)
     answer = newton(replace(body, mesh=mesh), sample, (0.003,))
-    modulus = body.scene.object.material.young_modulus_pa
+    modulus = require_material(body.scene).young_modulus_pa
     return modulus * float(answer.force_n[0] @ sample.normal) if answer.reached else np.nan
 
 
@@ -366,7 +366,7 @@ def small_tip() -> None:
     for radius in (0.007, 0.003, 0.0015, 0.0007, 0.0003):
         body = make_body(cylinder(finger_m=radius), meshed_for=cylinder())
         sample, depth = make_sample(body), 0.5 * radius
-        modulus = body.scene.object.material.young_modulus_pa
+        modulus = require_material(body.scene).young_modulus_pa
         bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / RADIUS_M))
         hertz = 4.0 / 3.0 * modulus / (1.0 - 0.45**2) * np.sqrt(1.0 / bend) * depth**1.5
         force = float(

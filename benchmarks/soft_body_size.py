@@ -31,7 +31,7 @@ from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.code_state import read_git_state
-from flexsheet.messages.scene import Scene, require_cylinder
+from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, SkinResponse
@@ -116,7 +116,7 @@ def make_synthetic_body(
     # the half-space under a load, blunt below the spacing: positive definite, right in size
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)
     blunt = 0.5 * float(np.median(np.partition(apart, 1, axis=1)[:, 1]))
-    nu = scene.object.material.poisson_ratio
+    nu = require_material(scene).poisson_ratio
     compliance = (1.0 - nu**2) / (np.pi * np.sqrt(apart**2 + blunt**2))
     made_up = np.random.default_rng(0).random(3 * len(rest), dtype=np.float32)
     linear_rows = len(contact_nodes) if rows_per_place == 1 else 1
@@ -175,7 +175,7 @@ def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) ->
         body.response,
         shape,
         np.empty((0, 3)),
-        young_modulus_pa=scene.object.material.young_modulus_pa,
+        young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=LINEAR_RANGE_M[0],
         max_depth_m=LINEAR_RANGE_M[1],
@@ -211,7 +211,7 @@ def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> 
         body.response,
         np.empty((0, 3)),
         table,
-        young_modulus_pa=scene.object.material.young_modulus_pa,
+        young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         push_depth_m=LINEAR_RANGE_M[1],
         linear_depth_m=0.006,

@@ -1,4 +1,4 @@
-"""Entry point of the `flexsheet` command and, with `--node CONFIG`, of a node's process.
+"""Entry point of the `flexsheet` command and, with `--node CONFIG`, of a process with nodes.
 
 The first statements give SIGINT its default action, which ends a process without a traceback.
 Python's own handler raises an exception wherever the code is: in an import it prints a traceback,
@@ -34,7 +34,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 def main() -> None:
-    """Run the command, or with `--node CONFIG` one node, as the launcher does."""
+    """Run the command, or with `--node CONFIG` nodes, as the launcher does."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
         from flexsheet.launch.running.child import apply_niceness, exit_with_parent
 

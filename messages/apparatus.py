@@ -206,7 +206,7 @@ class Devices(Part):
     camera: StereoCamera
     arms: Arms
     sheet: SheetSpec
-    projector: Projector
+    projector: Projector | None = None
     eyes: Eyes
     finger: Finger
 
@@ -241,7 +241,9 @@ def identify_scene(scene: Scene) -> str:
         "geometry": scene.object.geometry.model_dump(mode="json"),
         "world_from_object": scene.object.world_from_object.model_dump(mode="json"),
         "camera": [scene.camera.device, scene.camera.width_px, scene.camera.height_px],
-        "projector": [scene.projector.width_px, scene.projector.height_px],
+        "projector": None
+        if scene.projector is None
+        else [scene.projector.width_px, scene.projector.height_px],
         "sheet_height_m": scene.sheet.height_m,
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]

@@ -36,6 +36,7 @@ from zmq.utils.monitor import parse_monitor_message
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.local_bus import LocalBus, LocalConnection
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyChange, KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
@@ -150,6 +151,8 @@ class Publisher:
     keys: only hosts of this ring may connect by tcp; None: tcp is bound to loopback only.
     on_refused: called with a text for each connection that was refused or closed; without a
         running loop, on a separate thread.
+    local: the process's bus.  Its readers get messages without serialization, and the socket is
+        used only while another process has subscribed; needs a running loop.
     """
 
     def __init__(
@@ -159,9 +162,12 @@ class Publisher:
         *,
         keys: KeyRing | None = None,
         on_refused: Problem = _log.warning,
+        local: LocalBus | None = None,
     ) -> None:
         self.topic = topic
         self.endpoints: list[str] = []
+        self._channel = None if local is None else local.find(bind)
+        self._has_remote_readers = False
         self._last: list[Any] | None = None
         self._latched = topic.delivery is Delivery.LATCHED
         self._by_tcp = any(one.startswith("tcp:") for one in bind)
@@ -179,7 +185,7 @@ class Publisher:
     def _open(self, bind: Sequence[str]) -> None:
         # Only an XPUB socket can be read.  Reading it lets ZeroMQ free the memory of ended
         # connections even if nothing is sent.
-        is_read = self._latched or self._keys is not None
+        is_read = self._latched or self._keys is not None or self._channel is not None
         self._loop = asyncio.get_running_loop() if is_read else None
         self._socket = _open_socket(zmq.XPUB if is_read else zmq.PUB, self.topic)
         endpoints = []
@@ -217,6 +223,10 @@ class Publisher:
         Large arrays are not copied and must not be changed afterwards.  Raises WireError for a
         message that is larger than the topic allows.
         """
+        if self._channel is not None:
+            self._channel.send(self.topic, message, header)
+            if not (self._latched or self._find_remote_readers()):
+                return
         frames = encode(message, header, max_bytes=self.topic.max_bytes)
         self._send(frames)
         if self._latched:
@@ -233,14 +243,25 @@ class Publisher:
                 send(frame, NOBLOCK_MORE, copy=False)
             send(frames[-1], NOBLOCK, copy=False)
 
+    def _find_remote_readers(self) -> bool:
+        """Return whether another process has subscribed."""
+        events: Any = self._socket.getsockopt(EVENTS)
+        if events & POLLIN:
+            self._serve_late_subscribers()
+        return self._has_remote_readers
+
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions; resend the last message if one of them is new."""
+        """Read a batch of subscriptions; resend the last message if one of them is new.
+
+        XPUB reports the first subscription and the end of the last one.
+        """
         if self._socket.closed or self._loop is None:
             return
         found = drained = False
         for _ in range(BATCH):
             try:
-                found |= self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
+                self._has_remote_readers = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
+                found |= self._has_remote_readers
             except zmq.Again:
                 drained = True
                 break
@@ -264,6 +285,8 @@ class Publisher:
     def forget(self) -> None:
         """Discard the stored message for late subscribers, until the next `send`."""
         self._last = None
+        if self._channel is not None:
+            self._channel.forget()
 
     def close(self) -> None:
         """Release the endpoints; messages sent before are still delivered for half a second."""
@@ -306,6 +329,7 @@ class Subscriber:
     keys: keys of this host and the others; None: tcp connects to loopback only.
     plan: accept only messages of this plan; None: of any plan.
     message_filter: called with each valid message before `on_message`.
+    local: the process's bus, by which writers of the same process are read; not with `raw`.
     """
 
     def __init__(
@@ -321,6 +345,7 @@ class Subscriber:
         keys: KeyRing | None = None,
         plan: str | None = None,
         message_filter: MessageFilter | None = None,
+        local: LocalBus | None = None,
     ) -> None:
         self.topic, self.counts, self.on_problem = topic, counts, on_problem
         self.on_handshake_failed = on_handshake_failed or on_problem
@@ -331,14 +356,30 @@ class Subscriber:
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
         self._started = False
+        sources = [one if isinstance(one, Source) else Source(one) for one in connect]
+        bus = None if raw else local
+        channels = {
+            one: channel
+            for one in sources
+            if bus is not None and (channel := bus.find([one.endpoint])) is not None
+        }
         by_host: dict[str | None, list[Source]] = {}
-        for one in connect:
-            source = one if isinstance(one, Source) else Source(one)
-            by_host.setdefault(source.host, []).append(source)
-        self._connections = [
-            _HostConnection(self, host, sources, keys, latest_only=latest_only, raw=raw)
-            for host, sources in (by_host or {None: []}).items()
+        for source in sources:
+            if source not in channels:
+                by_host.setdefault(source.host, []).append(source)
+        self._connections: list[_HostConnection | LocalConnection] = [
+            _HostConnection(self, host, remote, keys, latest_only=latest_only, raw=raw)
+            for host, remote in by_host.items()
         ]
+        if channels or not connect:
+            self._connections.append(
+                LocalConnection(
+                    self,
+                    tuple(channels.values()),
+                    _list_writers(list(channels)),
+                    max_waiting=compute_queue_length(topic),
+                )
+            )
 
     def start(self) -> None:
         """Connect and start to deliver; needs a running loop."""
@@ -361,7 +402,8 @@ class Subscriber:
         """Reconnect to hosts whose key has changed, or to all if this host's key has changed."""
         for connection in self._connections:
             if (
-                connection.secured
+                isinstance(connection, _HostConnection)
+                and connection.secured
                 and not connection.closed
                 and (change.own or connection.host in change.hosts)
             ):
@@ -369,13 +411,20 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Read the envelope and count lost messages; None if it is rejected or a repetition.
+        """Read the envelope and count lost messages; None if it is rejected or a repetition."""
+        try:
+            envelope = read_envelope(frames, self.topic)
+        except WireError as error:
+            self.reject(error)
+            return None
+        return envelope if self.accept_header(envelope.header, writers) else None
+
+    def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool:
+        """Check a message's header and count lost messages; False for a rejected or repeated one.
 
         writers: the writers expected at the endpoint; None: any.
         """
         try:
-            envelope = read_envelope(frames, self.topic)
-            header = envelope.header
             if writers is not None and header.writer not in writers:
                 raise WireError(
                     "writer",
@@ -391,11 +440,11 @@ class Subscriber:
             known = self._writers_seen.get(header.writer)
             if known is None:
                 self._writers_seen[header.writer] = _Writer(header)
-                return envelope
+                return True
             lost = known.update(header)
         except WireError as error:
             self.reject(error)
-            return None
+            return False
         if lost > 0:
             self._count_gap(lost, header.writer)
         elif lost < 0:
@@ -403,8 +452,8 @@ class Subscriber:
                 self.reject(
                     WireError("replayed", f"message {header.sequence} of {header.writer} repeated")
                 )
-            return None
-        return envelope
+            return False
+        return True
 
     def deliver(self, envelope: Envelope) -> None:
         """Validate the message and call the handler."""
@@ -484,6 +533,12 @@ class _Writer:
         return 0
 
 
+def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
+    """Return the writers expected at these endpoints; None if one of them is unknown."""
+    known = [one.writer for one in sources if one.writer is not None]
+    return frozenset(known) if len(known) == len(sources) > 0 else None
+
+
 class _HostConnection:
     """Socket of a subscriber that receives the messages of one host."""
 
@@ -501,8 +556,7 @@ class _HostConnection:
         self._latest_only, self._raw = latest_only, raw
         rate_hz = subscriber.topic.rate_hz
         self._fresh_ns = 0 if rate_hz is None else int(0.5e9 / rate_hz[1])
-        known = [one.writer for one in sources if one.writer is not None]
-        self._writers = frozenset(known) if len(known) == len(sources) > 0 else None
+        self._writers = _list_writers(sources)
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None

@@ -20,6 +20,7 @@ SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]
+ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
 class SoftBodyChoice(BaseModel):
@@ -43,6 +44,9 @@ class Methods(BaseModel):
     sheet_shape: SheetShapeMethod | None = None
     correction: Correction | None = None
     soft_body: SoftBodyChoice | None = None
+    compliance: ComplianceMode | None = Field(
+        default=None, description="rendering of the object's force; constant_stretch: none"
+    )
 
 
 def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:

@@ -162,9 +162,7 @@ class BoxPatchSupport(Part):
         return self
 
 
-Support = Annotated[
-    StripSupport | BaseSupport | SpherePatchSupport | BoxPatchSupport, Field(discriminator="kind")
-]
+Support = StripSupport | BaseSupport | SpherePatchSupport | BoxPatchSupport
 
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -198,16 +196,26 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """Soft virtual object.
+    """Virtual object, which is rigid without a material.
 
     `support_angle_rad: x` in a scene file means `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
-    material: Material
+    material: Material | None = Field(default=None, description="null: the object is rigid")
     world_from_object: Pose
-    support: Support = Field(description="fixed part of the skin")
+    support: Support | None = Field(
+        default=None,
+        discriminator="kind",
+        description="fixed part of the skin; null only for a rigid object",
+    )
     appearance: Appearance = Appearance()
+
+    @model_validator(mode="after")
+    def _check_support(self) -> Self:
+        if self.material is not None and self.support is None:
+            raise ValueError("support is missing: a soft object needs a fixed part of its skin")
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -227,7 +235,8 @@ class VirtualObject(Part):
         """Return the angle of the fixed strip; raises UnfitGeometryError for another support."""
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
-                f'object.support.kind: expected "strip", found "{self.support.kind}"'
+                'object.support.kind: expected "strip", found '
+                f'"{None if self.support is None else self.support.kind}"'
             )
         return self.support.angle_rad
 
@@ -393,7 +402,7 @@ class Scene(Message):
     sheet: SheetSpec
     arms: Arms
     camera: StereoCamera
-    projector: Projector
+    projector: Projector | None = Field(default=None, description="null: no image is drawn")
     eyes: Eyes
     finger: Finger
     working_range: WorkingRange
@@ -418,3 +427,33 @@ def require_cylinder(scene: Scene) -> Cylinder:
             f'object.geometry.shape: expected "cylinder", found "{geometry.shape}"'
         )
     return geometry
+
+
+class MissingPartError(FlexsheetError, ValueError):
+    """A scene without a part that is needed."""
+
+    code = "missing-part"
+    remedy = "Add the part to the scene file, or leave out the node or command that needs it."
+
+
+def require_projector(scene: Scene) -> Projector:
+    """Return the scene's projector; raises MissingPartError for a scene without image."""
+    if scene.projector is None:
+        raise MissingPartError(f'scene "{scene.name}": projector is missing, so it has no image')
+    return scene.projector
+
+
+def require_material(scene: Scene) -> Material:
+    """Return the object's material; raises MissingPartError for a rigid object."""
+    if scene.object.material is None:
+        raise MissingPartError(
+            f'scene "{scene.name}": object.material is missing, so the object is rigid'
+        )
+    return scene.object.material
+
+
+def require_support(scene: Scene) -> Support:
+    """Return the fixed part of the object's skin; raises MissingPartError without one."""
+    if scene.object.support is None:
+        raise MissingPartError(f'scene "{scene.name}": object.support is missing')
+    return scene.object.support

@@ -473,6 +473,16 @@ class NodeProcess(MessagePart):
     hangs: int = Field(ge=0, description="restarts because of a missing heartbeat")
 
 
+class NodeOmission(MessagePart):
+    """Node of the launch file that is not started."""
+
+    name: str
+    reason: Literal["rigid_object", "no_image", "no_reader", "no_writer"] = Field(
+        description="rigid_object, no_image: the scene has no material or no projector; no_reader, "
+        "no_writer: no node of the graph reads its topics or writes its inputs"
+    )
+
+
 class HostKey(MessagePart):
     """Public key of a host, as another host has it."""
 
@@ -515,6 +525,9 @@ class HostStatus(Message):
     disk_free_bytes: int = Field(ge=0, description="free space for bags, or in the working folder")
     memory_free_bytes: int = Field(ge=0)
     nodes: tuple[NodeProcess, ...]
+    omitted: tuple[NodeOmission, ...] = Field(
+        default=(), description="nodes of the launch file that are not started"
+    )
     missing_devices: tuple[str, ...] = Field(description="missing devices of its nodes")
     software: str = Field(
         default="", description="versions of software that must agree between hosts"

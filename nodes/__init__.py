@@ -32,6 +32,19 @@ class NodeRole(StrEnum):
     RENDERER = "renderer"
 
 
+class OmissionReason(StrEnum):
+    """Reason why the node of a launch file is not started.
+
+    rigid_object: the scene's object has no material. no_image: the scene has no projector.
+    no_reader: no node reads its topics. no_writer: the nodes that write its inputs are left out.
+    """
+
+    RIGID_OBJECT = "rigid_object"
+    NO_IMAGE = "no_image"
+    NO_READER = "no_reader"
+    NO_WRITER = "no_writer"
+
+
 NODES: dict[str, str] = {
     "camera": "flexsheet.nodes.camera.node:Camera",
     "triangulator": "flexsheet.nodes.triangulator.node:Triangulator",

@@ -44,9 +44,10 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import ArmState, ParameterChange, PortStatus, SelfCheck, Status
-from flexsheet.nodes import NodeRole
+from flexsheet.nodes import NodeRole, OmissionReason
 
 M = TypeVar("M", bound=Message)
 Send = Callable[[Topic, Message, Header], None]
@@ -274,6 +275,8 @@ class Node:
     live_parameters: ClassVar[frozenset[str]] = frozenset()
     """Parameters that may change while the node runs, because each use reads them from
     `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
+    on_demand: ClassVar[bool] = False
+    """Whether it is left out of a graph in which no node reads its topics."""
     opens_devices: ClassVar[bool] = False
     """Whether it opens devices, ports or files, so that a replay must not start it."""
 
@@ -286,6 +289,16 @@ class Node:
         if cls.opens_devices:
             return "it reads devices, whose data are not in the bag"
         return ""
+
+    @classmethod
+    def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
+        """Return why a graph with this scene does not need the node; None if it may."""
+        return None
+
+    @classmethod
+    def unused_inputs(cls, parameters: Any, scene: Scene) -> frozenset[str]:
+        """Return the ports that the node does not use with this scene."""
+        return frozenset()
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:

@@ -1,7 +1,8 @@
-"""Run one node live: connect its ports to sockets, run its timers and publish its status.
+"""Run nodes live: connect their ports, run their timers and publish their status.
 
-The launcher writes a `NodeConfig` to a file and starts one process per node with it; a test can
-call `run_node` in its own loop.
+The launcher writes a `ProcessConfig` to a file and starts a process with it, which runs one or
+several nodes in one loop.  Nodes of one process exchange messages without serialization.  If one of
+them fails, the process ends.  A test can call `run_node` in its own loop.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pydantic import BaseModel, ConfigDict
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import Delivery, Topic, find_topic
@@ -55,7 +57,7 @@ class PortConfig(BaseModel):
 
 
 class NodeConfig(BaseModel):
-    """Configuration of one node's process.
+    """Configuration of one node.
 
     keys_file: file of a `KeyRing`; None for no encryption.
     estop_resetters: writers that may reset an e-stop; None for all.
@@ -74,14 +76,29 @@ class NodeConfig(BaseModel):
     keys_file: Path | None = None
     estop_resetters: tuple[str, ...] | None = None
     clocks: PortConfig | None = None
+
+
+class ProcessConfig(BaseModel):
+    """Configuration of a process with its nodes.
+
+    ready_fd: pipe to the launcher; None without a launcher.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    nodes: tuple[NodeConfig, ...]
     ready_fd: int | None = None
 
 
 class NodeTransport:
-    """Sockets of one node, by topic (outputs) and by port (inputs)."""
+    """Sockets of one node, by topic (outputs) and by port (inputs).
 
-    def __init__(self, config: NodeConfig, log: Any) -> None:
-        self._config, self._log = config, log
+    local: bus of a process with several nodes.
+    """
+
+    def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
+        self._config, self._log, self._local = config, log, local
         self.keys = None if config.keys_file is None else KeyRing(config.keys_file)
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: list[Subscriber] = []
@@ -95,7 +112,11 @@ class NodeTransport:
                 endpoints = [str(one) for one in output.endpoints]
                 on_refused = self._make_refusal_handler(node.outputs[output.port].counts, topic)
                 self._publishers[topic.name] = Publisher(
-                    topic, endpoints, keys=self.keys, on_refused=on_refused
+                    topic,
+                    endpoints,
+                    keys=self.keys,
+                    on_refused=on_refused,
+                    local=self._local,
                 )
 
     def _make_refusal_handler(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
@@ -116,6 +137,7 @@ class NodeTransport:
                 PortCounts(),
                 on_problem=partial(self._report_problem, node),
                 plan=self._config.plan_hash,
+                local=self._local,
             )
             subscriber.start()
             self._subscribers.append(subscriber)
@@ -138,6 +160,7 @@ class NodeTransport:
                 if node_input.topic.message in (Status, HostStatus)
                 else self._config.plan_hash,
                 message_filter=self._message_filter(node_input.topic),
+                local=self._local,
             )
             subscriber.start()
             self._subscribers.append(subscriber)
@@ -270,11 +293,21 @@ def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
     )
 
 
-async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
-    """Build and connect a node, and run it until `stop` is set or one of its tasks fails."""
+async def run_node(
+    config: NodeConfig,
+    stop: asyncio.Event,
+    *,
+    heartbeat: Heartbeat | None = None,
+    local: LocalBus | None = None,
+) -> None:
+    """Build and connect a node, and run it until `stop` is set or one of its tasks fails.
+
+    heartbeat: pipe to the launcher; None without one. local: as of `NodeTransport`.
+    """
+    heartbeat = heartbeat or Heartbeat(None)
     class_ = node_class(config.type)
     log = structlog.get_logger().bind(node=config.name)
-    transport = NodeTransport(config, log)
+    transport = NodeTransport(config, log, local)
     node = class_(
         find_parameters_type(class_).model_validate(config.parameters),
         name=config.name,
@@ -297,7 +330,6 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
             asyncio.create_task(run_timer(node, number, timer))
             for number, timer in enumerate(find_timers(class_))
         ]
-        heartbeat = Heartbeat(config.ready_fd)
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
         if transport.keys is not None:
@@ -305,7 +337,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         # This excludes the objects made by `setup` from garbage collection while the node runs.
         gc.collect()
         gc.freeze()
-        heartbeat.beat()
+        heartbeat.report_ready()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
@@ -332,35 +364,70 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """Pipe to the launcher: the first byte reports that the node is ready, others that it runs.
+    """Pipe to the launcher: the first byte reports that all nodes are ready, others that they run.
 
     fd: write end of the pipe; None without a launcher.  Writing never blocks.
+    nodes: number of nodes in the process.
     """
 
-    def __init__(self, fd: int | None) -> None:
-        self._fd = fd
+    def __init__(self, fd: int | None, nodes: int = 1) -> None:
+        self._fd, self._starting = fd, nodes
         if fd is not None:
             os.set_blocking(fd, False)
 
+    def report_ready(self) -> None:
+        """Count a node that is set up; the last one causes the first byte."""
+        self._starting -= 1
+        self.beat()
+
     def beat(self) -> None:
-        if self._fd is not None:
+        if self._fd is not None and self._starting <= 0:
             # A full pipe contains enough bytes.  If the launcher has ended, its lifeline ends this
             # process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
 
-async def run_until_signal(config: NodeConfig) -> None:
-    """Run the node until SIGINT or SIGTERM."""
+async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
+    """Run all nodes of a process until `stop` is set; if one fails, stop the others.
+
+    Raises the first error of a node, which is logged with the node's name.
+    """
+    heartbeat = Heartbeat(config.ready_fd, len(config.nodes))
+    local = None
+    if len(config.nodes) > 1:
+        outputs = (output for node in config.nodes for output in node.outputs)
+        local = LocalBus(str(one) for output in outputs for one in output.endpoints)
+
+    async def run_one(node: NodeConfig) -> None:
+        try:
+            await run_node(node, stop, heartbeat=heartbeat, local=local)
+        except Exception as error:
+            # Nothing else logs why the process ends; the launcher reads the exit code.
+            structlog.get_logger().error(
+                "node failed", node=node.name, error=str(error), exc_info=True
+            )
+            raise
+        finally:
+            stop.set()
+
+    results = await asyncio.gather(*map(run_one, config.nodes), return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+
+
+async def run_until_signal(config: ProcessConfig) -> None:
+    """Run the nodes until SIGINT or SIGTERM."""
     stop = asyncio.Event()
     # If the launcher ends, the kernel and the lifeline each send a signal.
     with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
-        await run_node(config, stop)
+        await run_nodes(config, stop)
 
 
 def main(config_path: str) -> int:
-    """Run a node from its configuration file, and return the exit code of the process."""
-    config = NodeConfig.model_validate_json(Path(config_path).read_text())
+    """Run the nodes of a configuration file, and return the exit code of the process."""
+    config = ProcessConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[
             RepeatLimiter(),
@@ -373,10 +440,6 @@ def main(config_path: str) -> int:
     )
     try:
         uvloop.run(run_until_signal(config))
-    except Exception as error:
-        # Nothing else logs why the process ends; the launcher reads the exit code.
-        structlog.get_logger().error(
-            "node failed", node=config.name, error=str(error), exc_info=True
-        )
-        return 1
+    except Exception:
+        return 1  # `run_nodes` has logged the error
     return 0

@@ -147,3 +147,20 @@ class StandInBridge(Node):
         self.arm.publish(
             arm_state(side, mode=mode, faults=faults, estop_engaged=stopped is not None)
         )
+
+
+class CrashParameters(NodeParameters):
+    fails: bool = False
+
+
+class Crash(Node):
+    """Log a line, and fail on request: a task of the runner ends with an error."""
+
+    parameters: CrashParameters
+    twin__finger: Input[TwinFinger]
+
+    async def setup(self) -> None:
+        self.log.info("crash is set up")
+        print("a line without a node", flush=True)
+        if self.parameters.fails:
+            raise RuntimeError("the setup fails")

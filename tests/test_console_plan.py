@@ -78,5 +78,5 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
 
 def test_a_requested_image_has_the_priority_of_a_frame() -> None:
     """On two busy cores the first image of the Eye tab took a minute and a half."""
-    nodes = load_graph(ROOT / "launch" / "demo.yaml").nodes
+    nodes = load_graph(ROOT / "launch" / "demo.yaml", console=True).nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice

@@ -369,3 +369,51 @@ def test_another_scene_is_a_setting(tmp_path: Path) -> None:
     assert plan.scene["object"]["geometry"]["shape"] == "plane"
     wrong = complaint(tmp_path, "extends: demo\n", settings=["scene=none.yaml"])
     assert wrong.splitlines()[0].startswith("--scene none.yaml: scene: ")
+
+
+BRIDGE = "type: arm_bridge, topics: {arm: arm_left, other_arm: null}"
+IN_ONE_PROCESS = f"""
+scene: {ROOT / "launch" / "scenes" / "cylinder.yaml"}
+hosts:
+  main: {{address: 127.0.0.1}}
+  left: {{address: 127.0.0.2}}
+external_topics: [sheet_target]
+nodes:
+  twin_arms: {{type: twin_arms, process: arm}}
+  bridge:
+    {{{BRIDGE}, process: arm, parameters: {{side: left, host: 127.0.0.1, port: 5020}}}}
+  beacon: {{type: "{BEACON}"}}
+  listener: {{type: "{LISTENER}"}}
+"""
+
+
+def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> None:
+    plan = load_graph(write(tmp_path, IN_ONE_PROCESS))
+    names = [[node.name for node in one.nodes] for one in plan.processes_on("main")]
+    assert ["twin_arms", "bridge"] in names
+    assert ["beacon"] in names
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (f'"{BEACON}"}}', f'"{BEACON}", process: arm}}', 'fault of "beacon" would stop the arm'),
+        ("port: 5020", "port: 5022", 'fault of "twin_arms" would stop the arm of "bridge"'),
+        ("process: arm}", "process: arm, nice: 3}", "give both the same nice"),
+        ("process: arm}", "process: arm, host: left}", "give both the same host"),
+        ("process: arm", "process: beacon", "is the name of another node"),
+        ("process: arm", "process: plan", "or reserved"),
+        ("process: arm", "process: 3", "process"),
+    ],
+)
+def test_a_process_that_cannot_be_shared_is_rejected(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    assert said in complaint(tmp_path, IN_ONE_PROCESS.replace(old, new))
+
+
+def test_the_launch_file_can_let_others_into_the_process_of_a_bridge(tmp_path: Path) -> None:
+    text = IN_ONE_PROCESS.replace(f'"{BEACON}"}}', f'"{BEACON}", process: arm}}')
+    plan = load_graph(write(tmp_path, text.replace(BRIDGE, f"{BRIDGE}, shares_arm_process: true")))
+    [shared] = [one for one in plan.processes_on("main") if one.name == "arm"]
+    assert [node.name for node in shared.nodes] == ["twin_arms", "bridge", "beacon"]

@@ -30,7 +30,7 @@ from flexsheet.launch.running.priority import min_nice_step
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
-from tests.waiting import DEADLINE_S, wait_until
+from tests.waiting import DEADLINE_S, until, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, "-m", "flexsheet"]
@@ -135,6 +135,53 @@ async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Pa
     wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors, "ZeroMQ's descriptors")
     assert threading.active_count() == threads
     assert (graph.run.logs / "launch.log").read_text().startswith(f"run {graph.run.id}")
+
+
+async def test_nodes_of_one_process_share_its_fate(tmp_path: Path, runs_root: Path) -> None:
+    shared: dict[str, Any] = {"process": "chain", "restart": {"delay_s": 0.01}}
+    crash = {"type": "tests.launch_nodes:Crash", **shared}
+    bag = tmp_path / "run.mcap"
+    path = write(tmp_path, {"beacon": beacon(**shared), "ear": LISTENER | shared, "crash": crash})
+    async with RunningGraph(load_graph(path, record=bag)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        before = graph.pids
+        assert before["beacon"] == before["ear"] == before["crash"] != before["recorder"]
+        assert (graph.run.directory / "chain.json").exists()
+        graph.kill("ear")
+        async with asyncio.timeout(DEADLINE_S):
+            await graph.wait_ready_again("beacon", 1)
+        assert graph.restarts == {"beacon": 1, "ear": 1, "crash": 1, "recorder": 0}
+        assert graph.pids["beacon"] == graph.pids["crash"] != before["beacon"]
+        assert graph.pids["recorder"] == before["recorder"]
+
+        def read_log(name: str) -> str:
+            return (graph.run.logs / f"{name}.log").read_text()
+
+        assert read_log("crash").count("crash is set up") == 2
+        assert read_log("chain").count("a line without a node") == 2
+        assert "set up" not in read_log("ear") + read_log("chain")
+        # The listener publishes after ten fingers, which come from its own process.
+        await until_stopped(graph)
+    assert graph.exit_codes == dict.fromkeys(("beacon", "ear", "crash", "recorder"), 0)
+    recorded = [(topic, header.writer) for topic, _, header, _ in BagReader(bag)]
+    assert {("twin/finger", "beacon"), ("estop", "ear"), ("status", "crash")} <= set(recorded)
+    assert_nothing_left(runs_root)
+
+
+async def until_stopped(graph: RunningGraph) -> None:
+    """Wait until the launcher has latched an e-stop of the graph."""
+    log = graph.run.logs / "launch.log"
+    await until(lambda: "e-stop of ear" in log.read_text(), "the listener's e-stop")
+
+
+async def test_a_node_that_fails_at_the_start_ends_its_process(tmp_path: Path) -> None:
+    shared: dict[str, Any] = {"process": "chain", "restart": {"policy": "never"}}
+    crash = {"type": "tests.launch_nodes:Crash", "parameters": {"fails": True}, **shared}
+    plan = plan_of(tmp_path, beacon=beacon(**shared), crash=crash)
+    async with RunningGraph(plan) as graph:
+        with pytest.raises(NodeFailedError, match="chain ended with exit code 1"):
+            await graph.wait_ready(DEADLINE_S)
+        assert "the setup fails" in (graph.run.logs / "crash.log").read_text()
 
 
 async def test_a_killed_node_comes_back_and_the_others_stay(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from tests.waiting import until
 
 Floats = NDArray[np.float64]
 SCENES = Path(__file__).resolve().parent.parent / "launch" / "scenes"
-NAMES = ("cylinder", "sphere", "ellipsoid", "plane", "box", "organ")
+NAMES = ("cylinder", "sphere", "ellipsoid", "plane", "box", "organ", "rigid-plane")
 TUNED = ("light-touch", "palpation", "demanding")
 """One of the above each, with another working range, other tolerances, or methods chosen."""
 ROUND = ("sphere", "ellipsoid", "box", "organ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -110,6 +111,8 @@ def _variants(key: str, kind: type[BaseModel]) -> list[str]:
     field = kind.model_fields[key]
     sections = []
     for variant in get_args(field.annotation):
+        if variant is NoneType:
+            continue
         model = MeshFile if variant is Mesh else variant
         tag = next(iter(get_args(model.model_fields[str(field.discriminator)].annotation)))
         sections += [

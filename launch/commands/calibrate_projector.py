@@ -24,7 +24,7 @@ from flexsheet.messages.files import write_file
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.gray_code import Image
     from flexsheet.launch.calibration.projector import ProjectorFit
-    from flexsheet.messages.scene import Projector, Scene, StereoCamera
+    from flexsheet.messages.scene import Projector, Scene, StereoCamera, require_projector
 
     Views = tuple[list[Image], list[Image]]
 
@@ -109,7 +109,7 @@ def projector(
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
-    size = scene.projector.width_px, scene.projector.height_px
+    size = require_projector(scene).width_px, require_projector(scene).height_px
     if write_patterns is not None:
         shown = gray_code.make_patterns(*size)
         _write_patterns(shown, write_patterns)
@@ -132,14 +132,14 @@ def projector(
             if twin:
                 from flexsheet.nodes.twin.projector import make_true_projector
 
-                true = make_true_projector(scene.projector, seed=seed)
+                true = make_true_projector(require_projector(scene), seed=seed)
                 views = list(_simulate_views(scene, true, poses, seed))
             else:
                 assert pictures is not None
                 views = list(_read_views(pictures, len(gray_code.make_patterns(*size))))
             camera = _load_camera(scene, calibration)
             fit = calibrate_projector(
-                measure_points(views, camera, scene.projector), scene.projector
+                measure_points(views, camera, require_projector(scene)), require_projector(scene)
             )
     except ProjectorError as error:
         raise CommandError(str(error), BAD_INPUT) from error
@@ -193,7 +193,7 @@ def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Ite
     from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
     from flexsheet.nodes.twin.rig import make_true_camera
 
-    shown = make_patterns(scene.projector.width_px, scene.projector.height_px)
+    shown = make_patterns(require_projector(scene).width_px, require_projector(scene).height_px)
     lit = LitSheet(scene, make_true_camera(scene.camera), true, seed=seed)
     tracked = track(sheet_poses(poses), "simulating images", console=words.console, transient=True)
     for world_from_sheet in tracked:
@@ -230,7 +230,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
             "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200",
             BAD_INPUT,
         ) from error
-    return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, scene.projector)
+    return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 
 
 def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
@@ -312,7 +312,7 @@ def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
     result = {}
-    for when, predicted in (("before", scene.projector), ("after", fitted)):
+    for when, predicted in (("before", require_projector(scene)), ("after", fitted)):
         errors = 1e3 * errors_at_eye(predicted, true, eye, planes, VOLUME_HALF_M)
         result[when] = {"mean": float(errors.mean()), "max": float(errors.max())}
     return result

@@ -30,8 +30,11 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
+from flexsheet.launch.plans.features import Feature
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from flexsheet.launch.experiments.image import Series
     from flexsheet.launch.experiments.run import Procedure, Progress
 
@@ -83,10 +86,21 @@ def _record(
     progress: Progress,
     *,
     apparatus: str | None,
+    needed: Sequence[str] = (),
+    without: Sequence[Feature] = (),
 ) -> None:
     from flexsheet.launch.experiments.run import run_experiment
 
-    run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+    run_experiment(
+        launch_file,
+        settings,
+        bag,
+        procedure,
+        progress,
+        apparatus=apparatus,
+        needed=needed,
+        without=without,
+    )
     progress("reading the bag")
 
 
@@ -126,6 +140,14 @@ def stroke(
     scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
+    without: Annotated[
+        list[Feature] | None,
+        typer.Option(
+            "--without",
+            help="Leave out the image, or the rendered force; both start no soft body. Without "
+            "image, the latencies of frames are null. Not for several strokes or variants.",
+        ),
+    ] = None,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -165,7 +187,15 @@ def stroke(
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = make_stroke_procedure([seconds], progress)
-        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
+        _record(
+            launch_file,
+            given,
+            bag,
+            procedure,
+            progress,
+            apparatus=apparatus,
+            without=without or (),
+        )
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
         result = experiment.stroke_result(recording, errors, seconds, bag)
@@ -330,7 +360,15 @@ def _measure_images(
             with_maps=mapped,
             with_eyes=both_eyes,
         )
-        _record(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+        _record(
+            launch_file,
+            settings,
+            bag,
+            procedure,
+            progress,
+            apparatus=apparatus,
+            needed=["twin/eye"],
+        )
         pictures = image.read_images(bag)
         rows = image.make_rows(pictures, series, with_maps=mapped, with_eyes=both_eyes)
         if map_file is not None:

@@ -121,7 +121,17 @@ def launch(
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
     """Return the run directory, plan hash and node names of a ready graph, for scripts."""
     nodes = [node.name for node in plan.nodes_on(host)]
-    return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes}
+    omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
+    return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
+
+
+def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
+    """Print the nodes of the launch file that are not started, with the reasons."""
+    from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
+
+    for one in plan.omitted:
+        if host in (None, one.host):
+            words.print(f"not started: {one.name}; {REASON_TEXTS[one.reason]}", markup=False)
 
 
 async def run_graph(
@@ -253,18 +263,20 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
     if plan.apparatus is not None:
         words.print(f"apparatus {plan.apparatus['origin']}: differs from the scene")
     print_table(
-        ("node", "type", "host", "restart", "parameters"),
+        ("node", "type", "host", "process", "restart", "parameters"),
         [
             (
                 node.name,
                 node.type,
                 f"{node.host} ({plan.hosts[node.host]})",
+                node.process,
                 node.restart.policy,
                 _format_settings(node),
             )
             for node in plan.nodes_on(host)
         ],
     )
+    print_omitted(plan, host)
     words.print("for parameters with default values: flexsheet node info TYPE", style="dim")
     print()
     print_table(

@@ -64,7 +64,9 @@ def run_demo(
     )
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     given = [*coarse, *settings]
-    run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
+    run_experiment(
+        launch_file, given, bag, procedure, progress, apparatus=apparatus, needed=["twin/eye"]
+    )
     progress("reading the bag and drawing")
     if path is None:
         return summarize(bag, folder, strokes=SECONDS)

@@ -148,14 +148,16 @@ class Driver:
         return self._newest.get(topic)
 
     async def wait_ready(self) -> None:
-        """Wait until the soft body is published and both arms are in the mode "follow"."""
+        """Wait until both arms are in the mode "follow", and a soft body is published if needed."""
+        needs_body = bool(self._plan.writers.get("soft_body"))
 
         def ready() -> bool:
             arms = [self._newest.get(name) for name in ("arm_left", "arm_right")]
             following = all(isinstance(arm, ArmState) and arm.mode == "follow" for arm in arms)
-            return following and "soft_body" in self._newest
+            return following and (not needs_body or "soft_body" in self._newest)
 
-        await self.wait_for(ready, "both arms in mode follow and a soft body", 3 * WAIT_S)
+        what = " and a soft body" if needs_body else ""
+        await self.wait_for(ready, f"both arms in mode follow{what}", 3 * WAIT_S)
 
     def move_finger(self, path: FingerPath) -> None:
         self._publish("twin/finger_path", path)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.experiments import ExperimentError, image, stroke
 from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Correction, FingerPath, Shading
 from flexsheet.nodes import node_class
 from flexsheet.nodes.signals import handle_signals
@@ -94,12 +96,21 @@ def run_experiment(
     progress: Progress,
     *,
     apparatus: str | None = None,
+    needed: Collection[str] = (),
+    without: Collection[Feature] = (),
 ) -> None:
     """Run a procedure on a launch file's graph, and record it to `bag`.
 
-    apparatus: file or seed of the true devices of the simulator; see `load_apparatus`.
+    apparatus, needed, without: as of `load_graph`.
     """
-    plan = load_graph(launch_file, settings=settings, record=bag, apparatus=apparatus)
+    plan = load_graph(
+        launch_file,
+        settings=settings,
+        record=bag,
+        apparatus=apparatus,
+        needed=needed,
+        without=without,
+    )
     precompute_graph(plan, progress)
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
@@ -124,7 +135,7 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
     base = node_class(node_type)
     return [
         f"{node.name}.{setting}"
-        for node in load_graph(launch_file).nodes.values()
+        for node in load_graph(launch_file, needed=tuple(TOPICS)).nodes.values()
         if issubclass(node_class(node.type), base)
     ]
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.hand_simulation import Cases, simulate_release
 from flexsheet.launch.experiments.run import Progress
 from flexsheet.messages.scene import Scene
@@ -204,6 +205,11 @@ def measure_map(
     Kinds: "bounded" as the planner runs; "unbounded" without bounds and filter; "predicted" without
     them and with the depth predicted over the delay.
     """
+    material = scene.object.material
+    if material is None:
+        raise ExperimentError(
+            f"scene {scene.name}: the object is rigid; give a scene with object.material"
+        )
     hands = draw_hands(settings.hands, settings.seed + 1)
     table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     period_s = 1.0 / scene.camera.rate_hz
@@ -211,7 +217,7 @@ def measure_map(
     for ratio in settings.object_ratios:
         # At equal Poisson ratio the force is proportional to the modulus.
         scaled = ObjectCurve.from_rows(curve * np.array([1.0, ratio]))
-        object_pa = ratio * scene.object.material.young_modulus_pa
+        object_pa = ratio * material.young_modulus_pa
         progress(f"object of {object_pa:.3g} Pa")
         for delay_s in settings.delays_s:
             fitted = _fit(scene, model, scaled, table.at_delay(delay_s))

@@ -56,7 +56,19 @@ class NodeSpec(StrictModel):
 
     type: str = Field(description='name of a node type, or "module:Class"')
     host: str = MAIN
+    process: Name | None = Field(
+        default=None,
+        description="process that runs the node with all others that name it; null: its own",
+    )
+    shares_arm_process: bool = Field(
+        default=False,
+        description="for an arm bridge: allow nodes in its process that are not its simulator; "
+        "a fault of one of them stops the arm",
+    )
     parameters: dict[str, Any] = Field(default={})
+    always: bool = Field(
+        default=False, description="start the node even if neither scene nor graph needs it"
+    )
     topics: dict[str, str | None] = Field(
         default={}, description="topic by port, if the names differ; null disconnects a port"
     )

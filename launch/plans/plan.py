@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from flexsheet.launch.plans.documents import (
     read_document,
     validate,
 )
+from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -36,6 +37,7 @@ from flexsheet.launch.plans.launch_file import (
     apply_setting,
     read_launch_file,
 )
+from flexsheet.launch.plans.needed_nodes import omit_unneeded, remove_features
 from flexsheet.launch.plans.plan_model import (
     MAIN,
     ResolvedGraph,
@@ -43,6 +45,7 @@ from flexsheet.launch.plans.plan_model import (
     ResolvedPort,
     Writer,
 )
+from flexsheet.launch.plans.processes import check_processes
 from flexsheet.launch.plans.resolve_nodes import (
     CALIBRATION_MARKS,
     NodeEntry,
@@ -72,6 +75,8 @@ def load_graph(
     record: Path | None = None,
     console: bool = False,
     apparatus: str | None = None,
+    needed: Collection[str] = (),
+    without: Collection[Feature] = (),
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
@@ -80,6 +85,8 @@ def load_graph(
     record: bag to record to; it overrides the file.
     console: add a console and a paused recorder, unless the file has them.
     apparatus: file or "seed:N" of the simulator's true devices; None: those of the scene.
+    needed: topics that the caller reads, so that the nodes which write them are started.
+    without: parts of the scene that are left out.
     Raises BadInputError with all errors of the file.
     """
     document = read_launch_file(path)
@@ -92,11 +99,14 @@ def load_graph(
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
     scene_document, scene = _load_scene(spec, document)
+    if scene is not None:
+        scene = remove_features(scene, without)
     entries = collect_entries(spec, document)
     for entry in entries:
         resolve_entry(entry, document)
     truth = _load_apparatus(apparatus, scene, document)
     give_apparatus(entries, truth, document)
+    entries, omitted = omit_unneeded(entries, scene, needed)
     writers = list_writers(
         spec,
         entries,
@@ -109,6 +119,7 @@ def load_graph(
     refuse_apparatus_readers(entries, document)
     check_calibrations(entries, scene, document)
     check_device_hosts(entries, spec, document)
+    check_processes(entries, document)
     document.raise_problems()
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
@@ -140,6 +151,7 @@ def load_graph(
         apparatus=None if truth is None else truth.model_dump(mode="json"),
         hosts=addresses,
         nodes=nodes,
+        omitted=tuple(omitted),
         writers=endpoints,
         keys={name: host.key for name, host in spec.hosts.items() if host.key is not None},
         estop_resetters=resetters,
@@ -237,6 +249,7 @@ def _make_node(
         start_deadline_s=entry.spec.start_deadline_s,
         liveness_s=entry.spec.liveness_s,
         nice=entry.spec.nice,
+        process=entry.spec.process or entry.name,
     )
 
 

@@ -5,6 +5,7 @@ The module is separate from the resolver (`launch.plans.plan`), so that tools st
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bus import Source
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import NodeRole
+from flexsheet.nodes import NodeRole, OmissionReason
 
 MAIN = "main"
 """Host of the launcher's own topics, the recorder and the command-line tools."""
@@ -120,6 +121,7 @@ class ResolvedNode(StrictModel):
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
     liveness_s: float | None = Field(default=None, description="None in older bags")
     nice: int = Field(default=0, description="0 in older bags")
+    process: str = Field(default="", description="name of its process; the node's in older bags")
 
     @property
     def arm_side(self) -> str | None:
@@ -151,6 +153,32 @@ class ResolvedNode(StrictModel):
         return {**derived, **values}
 
 
+@dataclass(frozen=True, slots=True)
+class ResolvedProcess:
+    """A process with its nodes, which share host, niceness, restart policy and liveness."""
+
+    name: str
+    nodes: tuple[ResolvedNode, ...]
+
+    @property
+    def settings(self) -> ResolvedNode:
+        """Return a node, for the settings that all nodes of the process share."""
+        return self.nodes[0]
+
+    @property
+    def start_deadline_s(self) -> float:
+        return max(node.start_deadline_s for node in self.nodes)
+
+
+class OmittedNode(StrictModel):
+    """Node of the launch file that is not started."""
+
+    name: str
+    type: str
+    host: str
+    reason: OmissionReason
+
+
 class ResolvedGraph(StrictModel):
     """A resolved launch file: nodes, hosts, and the endpoints of all topics."""
 
@@ -164,6 +192,7 @@ class ResolvedGraph(StrictModel):
     )
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, ResolvedNode]
+    omitted: tuple[OmittedNode, ...] = Field(default=(), description="nodes that are not started")
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
     keys: dict[str, str] = Field(default={}, description="public key by host; not part of the hash")
     estop_resetters: tuple[str, ...] = Field(
@@ -194,6 +223,13 @@ class ResolvedGraph(StrictModel):
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
         """Return the nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
+
+    def processes_on(self, host: str | None) -> list[ResolvedProcess]:
+        """Return the processes of one host, or of all, in the order of their first nodes."""
+        members: dict[str, list[ResolvedNode]] = {}
+        for node in self.nodes_on(host):
+            members.setdefault(node.process or node.name, []).append(node)
+        return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
         """Return (node, TCP port) for each port on which a node listens."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -62,9 +62,17 @@ class NodeEntry:
         """Disconnect optional inputs whose topics no node writes, unless the file names them."""
         if self.type is None:
             return
+        self.disconnect(
+            port.name
+            for port, topic in self.ports
+            if port.name in self.type.optional_inputs and topic.name not in written
+        )
+
+    def disconnect(self, ports: Iterable[str]) -> None:
+        """Disconnect inputs, unless the file names their topics."""
+        names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
-            optional = port.name in self.type.optional_inputs and port.name not in self.spec.topics
-            if optional and topic.name not in written:
+            if port.name in names:
                 self.ports.remove((port, topic))
                 self.unconnected.append((port, topic))
 

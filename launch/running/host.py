@@ -30,7 +30,14 @@ from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import find_topic
-from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
+from flexsheet.messages.types import (
+    ArmState,
+    EStop,
+    HostKey,
+    HostStatus,
+    NodeOmission,
+    NodeProcess,
+)
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
@@ -322,6 +329,11 @@ class HostAgent:
             disk_free_bytes=disk.f_bavail * disk.f_frsize,
             memory_free_bytes=psutil.virtual_memory().available,
             nodes=processes,
+            omitted=tuple(
+                NodeOmission(name=one.name, reason=one.reason.value)
+                for one in self._plan.omitted
+                if one.host == self._host
+            ),
             missing_devices=tuple(one for one in self._devices if not os.path.exists(one)),
             software=software(),
             keys=()

@@ -4,9 +4,10 @@
         await graph.wait_ready()
         ...
 
-Every node is a process in a separate session, and reports through a pipe that it is set up. When it
-exits, its restart policy applies. To stop, it gets SIGINT, SIGTERM, then SIGKILL. The launcher uses
-no threads: exits arrive as readable pidfds, logs and readiness through pipes.
+Every process is a separate session, and reports through a pipe that its nodes are set up. It
+contains one node, or those that name it. When it exits, its restart policy applies. To stop, it
+gets SIGINT, SIGTERM, then SIGKILL. The launcher uses no threads: exits arrive as readable pidfds,
+logs and readiness through pipes.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from flexsheet.launch.plans.plan_model import (
     ResolvedGraph,
     ResolvedNode,
     ResolvedPort,
+    ResolvedProcess,
 )
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.code_state import read_git_state
@@ -62,7 +64,7 @@ from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
-from flexsheet.nodes.runner import NodeConfig, PortConfig
+from flexsheet.nodes.runner import NodeConfig, PortConfig, ProcessConfig
 
 SOFTWARE = Path(__file__).resolve().parents[2]
 STOP_GRACE_S = 3.0
@@ -88,23 +90,27 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """The process of a node, from its start to its exit."""
+    """A process with its nodes, from its start to its exit."""
 
     def __init__(
         self,
-        config: NodeConfig,
+        config: ProcessConfig,
         run: Run,
         environment: dict[str, str],
         lifeline: int,
         report: Report,
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._node, self._report = config.name, report
-        config_file = run.directory / f"{config.name}.json"
+        self._name, self._report = config.name, report
+        name = config.name
+        config_file = run.directory / f"{name}.json"
         self.ready: asyncio.Future[None] = self._loop.create_future()
         self.exited: asyncio.Future[int] = self._loop.create_future()
         self._partial = b""
-        self._log = (run.logs / f"{config.name}.log").open("ab", buffering=0)
+        self._logs = {
+            one: (run.logs / f"{one}.log").open("ab", buffering=0)
+            for one in {name, *(node.name for node in config.nodes)}
+        }
         self._output, output_write = os.pipe()
         self._ready_fd, ready_write = os.pipe()
         self._beats = 0
@@ -129,7 +135,7 @@ class Child:
         except BaseException:
             os.close(self._output)
             os.close(self._ready_fd)
-            self._log.close()
+            self._close_logs()
             raise
         finally:
             os.close(output_write)
@@ -206,15 +212,30 @@ class Child:
         if not piece:
             self._loop.remove_reader(self._output)
             return False
-        self._log.write(piece)
         *lines, self._partial = (self._partial + piece).split(b"\n")
         for line in lines:
-            self._report_line(line)
+            self._handle_line(line)
         return True
 
-    def _report_line(self, line: bytes) -> None:
+    def _handle_line(self, line: bytes) -> None:
+        """Write a line to the log of its node, or of the process if it names none; report it."""
+        node = self._find_node(line)
+        self._logs[node].write(line + b"\n")
         if self._reports:
-            self._report(self._node, line.decode(errors="replace"))
+            self._report(node, line.decode(errors="replace"))
+
+    def _find_node(self, line: bytes) -> str:
+        if len(self._logs) == 1 or not line.startswith(b"{"):
+            return self._name
+        try:
+            node = json.loads(line).get("node")
+        except ValueError:
+            return self._name
+        return node if node in self._logs else self._name
+
+    def _close_logs(self) -> None:
+        for log in self._logs.values():
+            log.close()
 
     def _reap(self) -> None:
         """Handle the exit: kill child processes, read the last output, close pipes."""
@@ -229,10 +250,10 @@ class Child:
         while self._read_output():
             pass
         if self._partial:
-            self._report_line(self._partial)
+            self._handle_line(self._partial)
         for fd in (self._pidfd, self._output, self._ready_fd):
             os.close(fd)
-        self._log.close()
+        self._close_logs()
         self.exited.set_result(self._process.returncode)
 
 
@@ -254,6 +275,7 @@ class RunningGraph:
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
         self.nodes = [node for node in plan.nodes_on(host) if node.name not in without]
+        self._processes = {one.name: one for one in plan.processes_on(host)}
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
@@ -278,9 +300,12 @@ class RunningGraph:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Return the process ids of the running nodes."""
+        """Return the process ids of the running nodes; nodes of one process have the same."""
         return {
-            name: child.pid for name, child in self._children.items() if not child.exited.done()
+            node.name: child.pid
+            for name, child in self._children.items()
+            if not child.exited.done()
+            for node in self._processes[name].nodes
         }
 
     def is_ready(self, node: str) -> bool:
@@ -327,9 +352,14 @@ class RunningGraph:
 
     async def wait_ready_again(self, node: str, restarts: int) -> None:
         """Wait until the node was restarted `restarts` times in total and is ready."""
+        supervisor = next(
+            self._supervisors[name]
+            for name, process in self._processes.items()
+            if any(one.name == node for one in process.nodes)
+        )
         while self.restarts[node] < restarts or not self._ready[node].is_set():
-            if self._supervisors[node].done():
-                self._supervisors[node].result()
+            if supervisor.done():
+                supervisor.result()
                 raise NodeFailedError(f"{node} has ended")
             await asyncio.sleep(0.02)
 
@@ -364,7 +394,7 @@ class RunningGraph:
             for child in self._children.values():
                 child.kill_now()
             for name, child in self._children.items():
-                self.exit_codes[name] = child.exited.result()
+                self._set_exit_code(self._processes[name], child.exited.result())
             for publisher in self._publishers:
                 publisher.close()
             self._publishers.clear()
@@ -378,11 +408,11 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        """End the nodes; nodes that only read end last, to receive the final messages."""
+        """End the processes; those that only read end last, to receive the final messages."""
         readers = {
-            node.name
-            for node in self.nodes
-            if all(port.topic == "status" for port in node.outputs) and node.inputs
+            name
+            for name, process in self._processes.items()
+            if all(_only_reads(node) for node in process.nodes)
         }
         writers = self._children.keys() - readers
         for names in (writers, readers):
@@ -406,12 +436,12 @@ class RunningGraph:
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
+        for omitted in self.plan.omitted:
+            self._report(LAUNCHER, f"{omitted.name} is not started: {omitted.reason}")
         if problem := describe_nice_problem(self.nodes):
             self._report(LAUNCHER, problem)
-        for node in self.nodes:
-            self._supervisors[node.name] = asyncio.create_task(
-                self._supervise(node), name=node.name
-            )
+        for name, process in self._processes.items():
+            self._supervisors[name] = asyncio.create_task(self._supervise(process), name=name)
 
     def _publish_latched(self, topic: str, message: Message | None) -> None:
         """Publish a message that all later subscribers get too."""
@@ -447,7 +477,7 @@ class RunningGraph:
             host,
             run_id=self.run.id,
             code=f"{(git['commit'] or 'unknown')[:12]}{'+' if git['changed'] else ''}",
-            processes=partial(self._processes, host),
+            processes=partial(self._list_states, host),
             pids=lambda: self.pids,
             endpoints=partial(local_endpoints, self.run),
             sources=partial(local_sources, self.run),
@@ -458,14 +488,15 @@ class RunningGraph:
         self._agents[host] = agent
         agent.start()
 
-    def _processes(self, host: str) -> tuple[NodeProcess, ...]:
+    def _list_states(self, host: str) -> tuple[NodeProcess, ...]:
+        pids = self.pids
         return tuple(
             NodeProcess(
                 name=node.name,
                 state="ready"
                 if self._ready[node.name].is_set()
                 else "starting"
-                if node.name in self.pids
+                if node.name in pids
                 else "exited",
                 restarts=self.restarts[node.name],
                 hangs=self.hangs[node.name],
@@ -496,72 +527,81 @@ class RunningGraph:
                 if host in self._agents:
                     self._agents[host].renew_keys(change)
 
-    async def _supervise(self, node: ResolvedNode) -> None:
-        """Run the node and restart it according to its policy.  Raises NodeFailedError."""
-        policy = node.restart
+    async def _supervise(self, process: ResolvedProcess) -> None:
+        """Run a process and restart it according to its policy.  Raises NodeFailedError."""
+        policy, name = process.settings.restart, process.name
         recent: deque[float] = deque()
         loop = asyncio.get_running_loop()
         while True:
-            problem = await self._run_once(node)
+            problem = await self._run_once(process)
             if policy.policy == "never" or (policy.policy == "on_failure" and problem is None):
                 if problem is not None:
-                    raise self._fail(f"{node.name} {problem}")
-                self._ready[node.name].set()
-                self._report(LAUNCHER, f"{node.name} finished")
+                    raise self._fail(f"{name} {problem}")
+                for node in process.nodes:
+                    self._ready[node.name].set()
+                self._report(LAUNCHER, f"{name} finished")
                 return
             while recent and recent[0] < loop.time() - policy.window_s:
                 recent.popleft()
             if len(recent) >= policy.max_restarts:
                 raise self._fail(
-                    f"{node.name} {problem or 'ended'}, after {len(recent)} restarts "
+                    f"{name} {problem or 'ended'}, after {len(recent)} restarts "
                     f"in {policy.window_s:g} s"
                 )
             delay_s = min(policy.delay_s * 2 ** len(recent), policy.max_delay_s)
             recent.append(loop.time())
-            self._report(LAUNCHER, f"{node.name} {problem or 'ended'}; next start in {delay_s:g} s")
+            self._report(LAUNCHER, f"{name} {problem or 'ended'}; next start in {delay_s:g} s")
             await asyncio.sleep(delay_s)
-            self.restarts[node.name] += 1
+            for node in process.nodes:
+                self.restarts[node.name] += 1
 
-    async def _run_once(self, node: ResolvedNode) -> str | None:
-        """Run a node once and return why it failed; None if it ended without error."""
-        child = self._spawn(node)
+    async def _run_once(self, process: ResolvedProcess) -> str | None:
+        """Run a process once and return why it failed; None if it ended without error."""
+        child = self._spawn(process)
         await asyncio.wait(
             (child.ready, child.exited),
-            timeout=node.start_deadline_s,
+            timeout=process.start_deadline_s,
             return_when=asyncio.FIRST_COMPLETED,
         )
         late = not child.ready.done() and not child.exited.done()
         if late:
             child.signal(signal.SIGKILL)
         elif child.ready.done():
-            self._ready[node.name].set()
-            self._report(LAUNCHER, f"{node.name} is ready, pid {child.pid}")
-        hangs = not late and await self._detect_hang(child, node)
+            for node in process.nodes:
+                self._ready[node.name].set()
+            self._report(LAUNCHER, f"{_describe_process(process)} ready, pid {child.pid}")
+        hangs = not late and await self._detect_hang(child, process)
         # `stop` awaits the future too, so a cancelled task must not cancel it.
         code = await asyncio.shield(child.exited)
-        self._ready[node.name].clear()
-        self.exit_codes[node.name] = code
+        for node in process.nodes:
+            self._ready[node.name].clear()
+            self.hangs[node.name] += hangs
+        self._set_exit_code(process, code)
         if late:
-            return f"was not ready within {node.start_deadline_s:g} s"
+            return f"was not ready within {process.start_deadline_s:g} s"
         if hangs:
-            self.hangs[node.name] += 1
-            missing = f"{NodeNote.NODE_HUNG.phrase} for {node.liveness_s:g} s"
+            seconds = process.settings.liveness_s
+            missing = f"{NodeNote.NODE_HUNG.phrase} for {seconds:g} s"
             return f"{missing}; its log contains the stacks"
         return describe_exit(code)
 
-    async def _detect_hang(self, child: Child, node: ResolvedNode) -> bool:
+    def _set_exit_code(self, process: ResolvedProcess, code: int) -> None:
+        self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
+
+    async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
         """Return True and end the process if it hangs; return False when it exits."""
-        if node.liveness_s is None:
+        liveness_s = process.settings.liveness_s
+        if liveness_s is None:
             return False
 
         def on_starved(waited_s: float) -> None:
             self._report(
                 LAUNCHER,
-                f"{node.name} is starved, not hung: it waited {waited_s:.1f} s for a processor; "
+                f"{process.name} is starved, not hung: it waited {waited_s:.1f} s for a processor; "
                 "this computer is overloaded",
             )
 
-        silence = asyncio.ensure_future(child.wait_until_silent(node.liveness_s, on_starved))
+        silence = asyncio.ensure_future(child.wait_until_silent(liveness_s, on_starved))
         try:
             await asyncio.wait((silence, child.exited), return_when=asyncio.FIRST_COMPLETED)
             hangs = silence.done() and not child.exited.done()
@@ -571,23 +611,26 @@ class RunningGraph:
             child.end_hanging()
         return hangs
 
-    def _spawn(self, node: ResolvedNode) -> Child:
+    def _spawn(self, process: ResolvedProcess) -> Child:
         assert self._lifeline is not None  # made before any supervisor
         environment = {
             **os.environ,
             RUN_VARIABLE: self.run.id,
             PARENT_VARIABLE: str(os.getpid()),
             LIFELINE_VARIABLE: str(self._lifeline[0]),
-            NICE_VARIABLE: str(max(node.nice, min_nice_step())),
+            NICE_VARIABLE: str(max(process.settings.nice, min_nice_step())),
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
-        # One process per node uses the cores already; BLAS threads would compete with them.
+        # The processes of the graph use the cores already; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
-        config = node_config(self.plan, node, self.run)
+        config = ProcessConfig(
+            name=process.name,
+            nodes=tuple(node_config(self.plan, node, self.run) for node in process.nodes),
+        )
         child = Child(config, self.run, environment, self._lifeline[0], self._report)
-        self._children[node.name] = child
+        self._children[process.name] = child
         return child
 
     def _write_run_files(self) -> None:
@@ -627,6 +670,17 @@ class RunningGraph:
             self._report_to(node, line)
 
 
+def _only_reads(node: ResolvedNode) -> bool:
+    return bool(node.inputs) and all(port.topic == "status" for port in node.outputs)
+
+
+def _describe_process(process: ResolvedProcess) -> str:
+    names = [node.name for node in process.nodes]
+    if names == [process.name]:
+        return f"{process.name} is"
+    return f"{process.name} ({', '.join(names)}) is"
+
+
 async def _terminate(children: list[Child]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         alive = [child for child in children if not child.exited.done()]
@@ -638,7 +692,7 @@ async def _terminate(children: list[Child]) -> None:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """Return the configuration of a node's process, with the run's directory filled in."""
+    """Return the configuration of a node, with the run's directory filled in."""
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(

@@ -50,17 +50,18 @@ MAX_LABELS = 64
 
 @dataclass(frozen=True, slots=True)
 class Sliders:
-    """Values of the page's sliders."""
+    """Values of the page's sliders; a rigid object has no modulus."""
 
-    young_modulus_pa: float
+    young_modulus_pa: float | None
     stretch_ratio: float
     size_ratio: float
 
     @staticmethod
     def from_scene(scene: Scene) -> Sliders:
         """Return the slider values of an unchanged scene."""
+        material = scene.object.material
         return Sliders(
-            scene.object.material.young_modulus_pa,
+            None if material is None else material.young_modulus_pa,
             max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
             1.0,
         )

@@ -269,13 +269,14 @@ class SceneView:
             [(0.0, 0.0, 0.0), (baseline_m, 0.0, 0.0)],
             0.011,
         )
-        self._add_device(
-            "/devices/projector",
-            transform_from_pose(scene.projector.world_from_projector),
-            ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
-            [(0.0, 0.0, -0.005)],
-            0.02,
-        )
+        if scene.projector is not None:
+            self._add_device(
+                "/devices/projector",
+                transform_from_pose(scene.projector.world_from_projector),
+                ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
+                [(0.0, 0.0, -0.005)],
+                0.02,
+            )
         half = 0.5 * scene.eyes.interocular_m
         for name, offset in (("left", -half), ("right", half)):
             eye = self._scene.add_icosphere(
@@ -291,18 +292,20 @@ class SceneView:
 
     def _add_names(self, scene: Scene) -> None:
         """Add labels above the bodies."""
-        camera, projector = scene.camera, scene.projector.world_from_projector
+        camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
         centre = apply(
             transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
         )
         positions = {
             "stereo camera": centre + NAME_ABOVE_M,
-            "projector": np.asarray(projector.position_m) + NAME_ABOVE_M,
             "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
             "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
             "right arm": np.asarray(scene.arms.right.world_from_base.position_m),
         }
+        if scene.projector is not None:
+            pose = scene.projector.world_from_projector
+            positions["projector"] = np.asarray(pose.position_m) + NAME_ABOVE_M
         for i, (text, position) in enumerate(positions.items()):
             label = self._scene.add_label(
                 f"/names/{i}",

@@ -51,12 +51,12 @@ def load(folder: Path, name: str) -> Scene:
 
 
 def edit_scene(
-    scene: Scene, *, young_modulus_pa: float, stretch_ratio: float, size_ratio: float
+    scene: Scene, *, young_modulus_pa: float | None, stretch_ratio: float, size_ratio: float
 ) -> Scene:
     """Change the stiffness, the minimum stretch of the sheet and the size of the object.
 
-    The front of the object is fixed; it grows away from the user. Raises SceneChoiceError for
-    invalid values.
+    The front of the object is fixed; it grows away from the user. A rigid object stays rigid.
+    Raises SceneChoiceError for invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -66,7 +66,9 @@ def edit_scene(
         rotation = rotation_from_rpy(pose.rpy_rad)
         back_m = front_m(solid.geometry, rotation) * (size_ratio - 1.0)
         position_m = pose.position_m - np.array([0.0, 0.0, back_m])
-        material = _with(solid.material, young_modulus_pa=young_modulus_pa)
+        material = solid.material
+        if material is not None and young_modulus_pa is not None:
+            material = _with(material, young_modulus_pa=young_modulus_pa)
         pose = _with(pose, position_m=position_m)
         values["object"] = _with(
             solid, geometry=geometry, material=material, world_from_object=pose

@@ -105,8 +105,10 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Compute the light rays of points (n, 3) of the deformed skin.
 
     Return segments (m, 2, 3) from the eye to the sheet, and (m, 2, 3) from the sheet to the
-    projector. Points whose ray misses the sheet have none.
+    projector. Points whose ray misses the sheet have none; a scene without projector has none.
     """
+    if scene.projector is None:
+        return np.empty((0, 2, 3)), np.empty((0, 2, 3))
     eye = scene.eyes.centre_world_m
     projector = transform_from_pose(scene.projector.world_from_projector)[:3, 3]
     hits = intersect_sheet(sheet, eye, points)

@@ -106,7 +106,9 @@ class TouchTab:
             self._scene.options = tuple(names)
             if scene.name in names:
                 self._scene.value = scene.name
-        self._stiffness.value = 1e-3 * sliders.young_modulus_pa
+        self._stiffness.disabled = sliders.young_modulus_pa is None
+        if sliders.young_modulus_pa is not None:
+            self._stiffness.value = 1e-3 * sliders.young_modulus_pa
         self._tension.max = _percent(max_stretch_ratio(base))
         self._tension.value = _percent(sliders.stretch_ratio)
         self._size.value = round(100.0 * sliders.size_ratio)

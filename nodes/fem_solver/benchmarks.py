@@ -18,7 +18,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
@@ -192,7 +192,7 @@ class SoftBodyBenchmark:
         job = make_focused_job(
             self.coarsest(), self.scene, references.sample, NEWTON_RATIO, self.newton_m
         )
-        modulus = self.scene.object.material.young_modulus_pa
+        modulus = require_material(self.scene).young_modulus_pa
         solver = NeoHookeanBody(
             job.nodes,
             job.elements,
@@ -230,7 +230,7 @@ class ReferenceSet:
         self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene
     ) -> None:
         self._references, self.sample = references, sample
-        self._modulus = scene.object.material.young_modulus_pa
+        self._modulus = require_material(scene).young_modulus_pa
         self._rim_m = RIM_RATIO * scene.finger.radius_m
 
     def trial(

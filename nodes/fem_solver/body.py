@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.fem_solver.closest_contact import (
     ContactAnchor,
@@ -43,7 +43,7 @@ def make_soft_body_spec(
             "skin_spacing_m to the radius or less"
         )
     mesh = mesh_spec(scene, skin_spacing_m)
-    return SoftBodySpec(mesh, scene.object.material.poisson_ratio, sticking)
+    return SoftBodySpec(mesh, require_material(scene).poisson_ratio, sticking)
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
@@ -157,7 +157,7 @@ def build_scene_body(
         model.response,
         shape,
         rest[model.bounds],
-        young_modulus_pa=scene.object.material.young_modulus_pa,
+        young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=linear_depth_m,
         max_depth_m=max_depth_m,
@@ -189,7 +189,7 @@ def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Tab
         model.response,
         model.response.rest[model.bounds],
         table,
-        young_modulus_pa=scene.object.material.young_modulus_pa,
+        young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         push_depth_m=scene.working_range.push_depth_m,
         linear_depth_m=body.linear_depth_m,

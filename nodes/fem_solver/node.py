@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 from threading import Event
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, ParameterChange, Skin, SoftBody
-from flexsheet.nodes import cache
+from flexsheet.nodes import OmissionReason, cache
 from flexsheet.nodes.cache import EtaEstimator
 from flexsheet.nodes.fem_solver import body, precompute
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor
@@ -37,12 +37,17 @@ class FemSolver(Node):
     live_parameters: ClassVar[frozenset[str]] = frozenset(
         {"prediction_horizon_s", "hold_s", "relax_s"}
     )
+    on_demand: ClassVar[bool] = True
     parameters: FemSolverParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
     parameter: Input[ParameterChange]
     skin: Output[Skin]
     soft_body: Output[SoftBody]
+
+    @classmethod
+    def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
+        return OmissionReason.RIGID_OBJECT if scene.object.material is None else None
 
     async def setup(self) -> None:
         self._stop = Event()
@@ -83,8 +88,14 @@ class FemSolver(Node):
         self._set_bodies([])
         self._reset_contact()
         await self._stop_table_task()
+        if scene.object.material is None:
+            self.note = "no soft body: the object is rigid"
+            return
         p, factory = self.parameters, self._factory
         method, factory.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
+        choice = scene.methods.soft_body
+        if p.compute_table and method == "auto" and choice is not None:
+            method = choice.method
         try:
             bodies = await run_unless_superseded(
                 partial(factory.bodies, scene, method),

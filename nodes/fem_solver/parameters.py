@@ -23,6 +23,11 @@ class FemSolverParameters(NodeParameters):
         default="auto",
         description="Distance between touchable skin nodes. auto: the scene's, else 0.003.",
     )
+    compute_table: bool = Field(
+        default=False,
+        description="Compute the nonlinear table in the background if the scene chooses it and it "
+        "is not cached.",
+    )
     linear_depth_m: Positive = Field(
         default=0.006,
         description="Maximum depth of the linear method; deeper pushes are reported out of range.",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.methods import ComplianceMode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
@@ -25,8 +25,6 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 Floats = NDArray[np.float64]
-
-ComplianceMode = Literal["force_curve", "stiffness"]
 
 EQUAL_RATIO = 0.02
 """Relative difference below which two curves count as equal: a seventh of the noticeable one."""
@@ -50,7 +48,7 @@ class ComplianceController:
     delay_s: from a measured depth until the sheet has moved by it.
     filter_s: time constant of the depth from which the offset follows; None without bounds.
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
-        small pushes by the stretch only, like the paper.
+        small pushes by the stretch only, like the paper.  "constant_stretch" keeps the minimum.
     """
 
     def __init__(
@@ -83,6 +81,8 @@ class ComplianceController:
 
         Raises UnfitCurveError for an invalid force curve; the last fit then stays in use.
         """
+        if self._mode == "constant_stretch":
+            return
         if self._mode == "stiffness":
             if soft_body.stiffness_n_per_m > 0.0:
                 choice = choose_stretch(soft_body.stiffness_n_per_m, self._scene.sheet)

@@ -42,7 +42,7 @@ def _is_finite(fingertip: Fingertip) -> bool:
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_left", "arm_right"})
 
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
     parameters: PlannerParameters
@@ -53,6 +53,11 @@ class Planner(Node):
     arm_right: Input[ArmState]
     parameter: Input[ParameterChange]
     sheet_target: Output[SheetTarget]
+
+    @classmethod
+    def unused_inputs(cls, parameters: PlannerParameters, scene: Scene) -> frozenset[str]:
+        no_force = parameters.choose_compliance(scene) == "constant_stretch"
+        return frozenset({"soft_body"} if no_force else ())
 
     async def setup(self) -> None:
         self._trajectory: SheetTrajectoryPlanner | None = None
@@ -88,7 +93,7 @@ class Planner(Node):
         self._compliance = ComplianceController(
             scene,
             model,
-            self.parameters.compliance_mode,
+            self.parameters.choose_compliance(scene),
             hysteresis_ratio=None if measured is None else float(measured.value),
             bounds=load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir),
             delay_s=self._horizon_s,

@@ -7,12 +7,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexsheet.messages.methods import SheetForceMethod
-from flexsheet.messages.scene import NonNegative, Positive
+from flexsheet.messages.methods import ComplianceMode, SheetForceMethod, resolve_method
+from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import SheetCalibrationFile
-from flexsheet.nodes.planner.compliance_controller import ComplianceMode
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds
 from flexsheet.nodes.planner.trajectory import TrajectorySettings
 
@@ -36,11 +35,20 @@ class PlannerParameters(NodeParameters):
     max_actuation_delay_s: Positive = Field(
         default=0.15, description="maximum delay that is measured and used"
     )
-    compliance_mode: ComplianceMode = Field(
-        default="force_curve",
+    compliance_mode: ComplianceMode | Literal["auto"] = Field(
+        default="auto",
         description="force_curve: render the object's force over depth, by stretch and normal "
-        "offset; stiffness: render its stiffness by the stretch alone, as the paper does",
+        "offset; stiffness: render its stiffness by the stretch alone, as the paper does; "
+        "constant_stretch: render no force; auto: that of the scene's methods, else force_curve; a "
+        "rigid object always has a constant stretch",
     )
+
+    def choose_compliance(self, scene: Scene) -> ComplianceMode:
+        """Return the mode for a scene; a rigid object needs a constant stretch."""
+        if scene.object.material is None:
+            return "constant_stretch"
+        return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
+
     sheet_calibration: SheetCalibrationFile | None = Field(
         default=None,
         description="file of `calibrate sheet`; null: ideal rubber with the scene's modulus",

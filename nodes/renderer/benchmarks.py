@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Cylinder, Scene, require_cylinder
+from flexsheet.messages.scene import Cylinder, Scene, require_cylinder, require_projector
 from flexsheet.messages.types import Correction, Display, Pattern
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
@@ -134,7 +134,7 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
     """Return the scene with another projector resolution and the same illuminated width."""
-    projector = scene.projector
+    projector = require_projector(scene)
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
     lens = lens.model_copy(

@@ -18,7 +18,7 @@ from flexsheet.messages.types import (
     Skin,
     SoftBody,
 )
-from flexsheet.nodes import NodeRole
+from flexsheet.nodes import NodeRole, OmissionReason
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.renderer import deflection_cache
@@ -37,6 +37,7 @@ class Renderer(Node):
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"skin", "soft_body"})
     parameters: RendererParameters
     scene: Input[Scene]
     skin: Input[Skin]
@@ -50,6 +51,10 @@ class Renderer(Node):
     frame: Output[Frame]
 
     @classmethod
+    def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
+        return OmissionReason.NO_IMAGE if scene.projector is None else None
+
+    @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.output == "window":
             return "its frames are shown in a window; record a run with output: headless instead"
@@ -59,7 +64,7 @@ class Renderer(Node):
         self._loop = asyncio.get_running_loop()
         self._output = self._new_output()
         self._frame_renderer: FrameRenderer | None = None
-        self._shown = Display(correction="two_pass", stereo=self.parameters.stereo)
+        self._shown = Display(correction="two_pass", stereo="side_by_side")
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
         self._idle_period_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
@@ -71,11 +76,18 @@ class Renderer(Node):
         if self._frame_renderer is not None:
             self._frame_renderer.scene_renderer.release()
             self._frame_renderer = None
+        if scene.projector is None:
+            self.note = "no image: the scene has no projector"
+            return
         self._output.open((scene.projector.width_px, scene.projector.height_px))
         given = self.parameters
         if self.display.message is None:
             correction = resolve_method(given.correction, scene.methods.correction, "two_pass")
-            self._shown = self._shown.model_copy(update={"correction": correction})
+            one_view = given.stereo == "auto" and scene.eyes.interocular_m == 0.0
+            stereo = "side_by_side" if given.stereo == "auto" else given.stereo
+            self._shown = self._shown.model_copy(
+                update={"correction": correction, "stereo": "mono" if one_view else stereo}
+            )
         scene_renderer = SceneRenderer(
             scene,
             self._output.context,

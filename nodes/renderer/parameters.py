@@ -63,6 +63,8 @@ class RendererParameters(NodeParameters):
     cache_dir: Path | None = Field(
         default=None, description="Folder of the sheet's deflection shapes. null: the user's cache."
     )
-    stereo: StereoMode = Field(
-        default="side_by_side", description="Stereo mode before a display message."
+    stereo: StereoMode | Literal["auto"] = Field(
+        default="auto",
+        description="Stereo mode before a display message. auto: mono if the scene's eyes have the "
+        "same position, else side_by_side.",
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.methods import SheetShapeMethod
-from flexsheet.messages.scene import Mesh, Pose, Scene
+from flexsheet.messages.scene import Mesh, Pose, Scene, require_projector
 from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
 from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from flexsheet.nodes.models.shapes import make_shape
@@ -73,13 +73,13 @@ def pose_matrix(pose: Pose) -> Floats:
 
 def projector_homography(scene: Scene) -> Floats:
     """Return the homography (3, 3) from the imaginary screen, m, to undistorted pixels."""
-    lens = scene.projector.lens
+    lens = require_projector(scene).lens
     return pixel_from_screen(
         fx_px=lens.fx_px,
         fy_px=lens.fy_px,
         cx_px=lens.cx_px,
         cy_px=lens.cy_px,
-        world_from_projector=pose_matrix(scene.projector.world_from_projector),
+        world_from_projector=pose_matrix(require_projector(scene).world_from_projector),
     )
 
 
@@ -101,7 +101,7 @@ class SceneRenderer:
         basis: deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles.
         Raises ValueError for a lens that folds the projector's image.
         """
-        projector, geometry = scene.projector, scene.object.geometry
+        projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
         self._world_from_projector = pose_matrix(projector.world_from_projector)
         self._world_from_object = pose_matrix(scene.object.world_from_object)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.scene import Projector, Scene
+from flexsheet.messages.scene import Projector, Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
@@ -249,7 +249,7 @@ def seen(
     The image is black where there is no sheet, and where a fold blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
-    projector = TrueProjector(scene.projector, vertices, triangles)
+    projector = TrueProjector(require_projector(scene), vertices, triangles)
     size = round(2.0 * half_window_m / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
     # Only the lit part is traced, since nothing else is visible.

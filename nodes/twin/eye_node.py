@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +23,7 @@ from flexsheet.messages.types import (
     TwinFinger,
     Viewpoint,
 )
+from flexsheet.nodes import OmissionReason
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
 from flexsheet.nodes.twin.head import HeadSway
@@ -66,6 +68,8 @@ class TwinEyeNode(Node):
     exposure before, the body the solver's newest.
     """
 
+    on_demand: ClassVar[bool] = True
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"skin", "soft_body"})
     parameters: TwinEyeParameters
     scene: Input[Scene]
     frame: Input[Frame]
@@ -76,6 +80,10 @@ class TwinEyeNode(Node):
     soft_body: Input[SoftBody]
     skin: Input[Skin]
     twin__eye: Output[TwinEye]
+
+    @classmethod
+    def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
+        return OmissionReason.NO_IMAGE if scene.projector is None else None
 
     async def setup(self) -> None:
         self._camera = EyeCamera()

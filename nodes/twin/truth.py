@@ -74,7 +74,9 @@ def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
                     "interocular_m": base.eyes.interocular_m + eyes.interocular_offset_m,
                 }
             ),
-            "projector": base.projector.model_copy(
+            "projector": None
+            if base.projector is None
+            else base.projector.model_copy(
                 update={
                     "lens": _true_lens(base.projector.lens, projector.lens),
                     "world_from_projector": _shifted_pose(

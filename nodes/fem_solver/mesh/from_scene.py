@@ -18,6 +18,7 @@ from flexsheet.messages.scene import (
     Scene,
     StripSupport,
     Support,
+    require_support,
 )
 from flexsheet.nodes.fem_solver.mesh.cylinder import cylinder_mesh
 from flexsheet.nodes.fem_solver.mesh.fitted import fit_mesh, limit_sizes_by_curvature
@@ -110,14 +111,14 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
-    cylinder = isinstance(body.geometry, Cylinder)
+    cylinder, support = isinstance(body.geometry, Cylinder), require_support(scene)
     touch_angle = scene.working_range.tilt_rad + TOUCH_MARGIN_RAD
-    if cylinder and isinstance(body.support, StripSupport):
-        touch_angle = min(touch_angle, np.pi - 0.5 * body.support.angle_rad)
-    down = body.support.down_world if isinstance(body.support, BaseSupport) else (0.0, 0.0, 0.0)
+    if cylinder and isinstance(support, StripSupport):
+        touch_angle = min(touch_angle, np.pi - 0.5 * support.angle_rad)
+    down = support.down_world if isinstance(support, BaseSupport) else (0.0, 0.0, 0.0)
     return MeshSpec(
         geometry=body.geometry,
-        support=body.support,
+        support=support,
         touch_angle_rad=float(touch_angle),
         skin_spacing_m=skin_spacing_m,
         towards_user=_rounded(mesh_from_world @ np.array([0.0, 0.0, 1.0])),

@@ -1,0 +1,105 @@
+"""Leave out the nodes of a graph that its scene and its other nodes do not need.
+
+A scene without material needs no soft body, and one without projector needs no image.  A node that
+works for others only (`Node.on_demand`) needs a reader.  A recorder is a reader of the topics that
+its parameters name, and not of those that it records by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+from flexsheet.launch.plans.features import Feature
+from flexsheet.launch.plans.plan_model import OmittedNode
+from flexsheet.launch.plans.resolve_nodes import NodeEntry
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.nodes import OmissionReason
+from flexsheet.nodes.recorder.parameters import RecorderParameters
+
+REASON_TEXTS = {
+    OmissionReason.RIGID_OBJECT: "the scene's object is rigid: it has no material",
+    OmissionReason.NO_IMAGE: "the scene has no image: it has no projector",
+    OmissionReason.NO_READER: "no node of the graph reads its topics",
+    OmissionReason.NO_WRITER: "no node of the graph writes its inputs",
+}
+
+
+def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
+    """Return the scene without these features."""
+    changes: dict[str, object] = {}
+    if Feature.IMAGE in features:
+        changes["projector"] = None
+    if Feature.FORCE in features:
+        changes["methods"] = scene.methods.model_copy(update={"compliance": "constant_stretch"})
+    return scene.model_copy(update=changes)
+
+
+def omit_unneeded(
+    entries: list[NodeEntry], scene: Scene | None, needed: Collection[str]
+) -> tuple[list[NodeEntry], list[OmittedNode]]:
+    """Return the entries that are started, and the others with the reasons.
+
+    The inputs that a node does not use with the scene are disconnected.  A node of the graph that
+    publishes scenes may change to one that says more; the scene then decides nothing.
+
+    needed: topics that tools read.
+    """
+    fixed = scene
+    if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
+        fixed = None
+    kept, omitted = list(entries), list[OmittedNode]()
+    for entry in entries:
+        if fixed is not None and entry.type is not None and entry.parameters is not None:
+            entry.disconnect(entry.type.unused_inputs(entry.parameters, fixed))
+    while True:
+        found = next(_find_unneeded(kept, fixed, needed), None)
+        if found is None:
+            return kept, omitted
+        entry, reason = found
+        kept.remove(entry)
+        omitted.append(
+            OmittedNode(name=entry.name, type=entry.spec.type, host=entry.spec.host, reason=reason)
+        )
+
+
+def _find_unneeded(
+    entries: list[NodeEntry], scene: Scene | None, needed: Collection[str]
+) -> Iterator[tuple[NodeEntry, OmissionReason]]:
+    writers = {topic.name for entry in entries for _, topic in entry.topics("output")}
+    for entry in entries:
+        if entry.type is None or entry.parameters is None or entry.spec.always:
+            continue
+        reason = None if scene is None else entry.type.omission_reason(entry.parameters, scene)
+        if reason is not None:
+            yield entry, reason
+        elif entry.type.on_demand:
+            outputs = {topic.name for _, topic in entry.topics("output")} - {"status"}
+            readers = (_list_read_topics(other) for other in entries if other is not entry)
+            if not outputs & set(needed).union(*readers):
+                yield entry, OmissionReason.NO_READER
+            elif not _required_inputs(entry) <= writers | EXTERNAL_TOPICS:
+                yield entry, OmissionReason.NO_WRITER
+
+
+EXTERNAL_TOPICS = frozenset(name for name, topic in TOPICS.items() if topic.many_writers) | {
+    "scene",
+    "twin/apparatus",
+}
+"""Topics that the launcher or tools may write."""
+
+
+def _required_inputs(entry: NodeEntry) -> set[str]:
+    assert entry.type is not None
+    optional = entry.type.optional_inputs
+    return {topic.name for port, topic in entry.topics("input") if port not in optional}
+
+
+def _list_read_topics(entry: NodeEntry) -> set[str]:
+    """Return the topics that a node asks for."""
+    if entry.type is None or entry.parameters is None:
+        return set()
+    if isinstance(entry.parameters, RecorderParameters):
+        return {*entry.parameters.topics, *entry.parameters.include}
+    further = entry.type.further_inputs(entry.parameters, tuple(TOPICS.values()))
+    return {topic.name for _, topic in entry.topics("input")} | set(further)

@@ -1,0 +1,202 @@
+"""Deliver messages between the nodes of one process without serialization.
+
+A publisher passes each message to the readers in its process, and sends it on its socket only while
+another process has subscribed.  Readers apply the same checks as to messages from sockets: writer,
+plan, order, types, shapes and ranges.  As on the wire, arrays of at most `INLINE_BYTES` are copied,
+since a sender may reuse them; larger arrays are shared, and all are read-only for the readers.
+
+A handler runs in a callback of the loop after that of the sender, never inside `send`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from pydantic import BaseModel
+
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.topics import Delivery, Topic
+from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, get_codec
+
+
+class LocalEnvelope(Envelope):
+    """Message for the readers in its process, which is copied and validated at most once."""
+
+    __slots__ = ("_error", "_message")
+
+    def __init__(self, codec: Codec, header: Header, original: Message) -> None:
+        super().__init__(codec, header, {})
+        self._message: Message | None = None
+        self._error: WireError | None = None
+        self.fields = {name: _share(value) for name, value in original.__dict__.items()}
+
+    def open(self) -> Message:
+        """Return the validated message, the same object for all readers; raises WireError."""
+        if self._error is not None:
+            raise self._error
+        if self._message is None:
+            try:
+                self._message = super().open()
+            except WireError as error:
+                self._error = error
+                raise
+        return self._message
+
+
+def _share(value: Any) -> Any:
+    """Return a field's value with read-only arrays, and with message parts as maps."""
+    if isinstance(value, np.ndarray):
+        array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
+        array.flags.writeable = False
+        return array
+    if isinstance(value, BaseModel):
+        return {name: _share(part) for name, part in value.__dict__.items()}
+    if isinstance(value, tuple | list):
+        return tuple(map(_share, value))
+    if isinstance(value, dict):
+        return {key: _share(part) for key, part in value.items()}
+    return value
+
+
+def _count_array_bytes(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, dict):
+        return sum(map(_count_array_bytes, value.values()))
+    if isinstance(value, tuple):
+        return sum(map(_count_array_bytes, value))
+    return 0
+
+
+class LocalReceiver(Protocol):
+    """Checks and handler of a subscriber, which are the same for messages from sockets."""
+
+    topic: Topic
+    counts: Any
+
+    def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool: ...
+    def deliver(self, envelope: Envelope) -> None: ...
+
+
+class LocalChannel:
+    """Messages of one writer on one topic within its process."""
+
+    def __init__(self) -> None:
+        self._readers: list[LocalConnection] = []
+        self._last: LocalEnvelope | None = None
+
+    def send(self, topic: Topic, message: Message, header: Header) -> None:
+        """Pass a message to all readers.
+
+        Raises WireError if the arrays are larger than the topic allows.
+        """
+        latched = topic.delivery is Delivery.LATCHED
+        if not (self._readers or latched):
+            return
+        envelope = LocalEnvelope(get_codec(type(message)), header, message)
+        size = _count_array_bytes(envelope.fields)
+        if size > topic.max_bytes:
+            raise WireError(
+                "size",
+                f"{envelope.codec.name}: arrays of {size} bytes, at most {topic.max_bytes} "
+                "are allowed",
+            )
+        if latched:
+            self._last = envelope
+        for reader in self._readers:
+            reader.put(envelope)
+
+    def forget(self) -> None:
+        """Discard the stored message for late readers."""
+        self._last = None
+
+    def add(self, reader: LocalConnection) -> None:
+        self._readers.append(reader)
+        if self._last is not None:
+            reader.put(self._last)
+
+    def remove(self, reader: LocalConnection) -> None:
+        if reader in self._readers:
+            self._readers.remove(reader)
+
+
+class LocalBus:
+    """Channels of a process, by the endpoints at which its publishers bind."""
+
+    def __init__(self, endpoints: Iterable[str]) -> None:
+        self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
+
+    def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
+        """Return the channel of the first of these endpoints that has one."""
+        return next((self._channels[one] for one in endpoints if one in self._channels), None)
+
+
+class LocalConnection:
+    """Connection of a subscriber to the writers of its own process.
+
+    writers: the names that these writers may have; None: any.
+    max_waiting: length of the queue.  A full queue refuses the newest message, like a socket's; the
+        subscriber counts it as a gap.
+    """
+
+    def __init__(
+        self,
+        receiver: LocalReceiver,
+        channels: Sequence[LocalChannel],
+        writers: frozenset[str] | None,
+        *,
+        max_waiting: int,
+    ) -> None:
+        self._receiver, self._channels, self._writers = receiver, channels, writers
+        self._latest_only = receiver.topic.delivery is Delivery.LATEST
+        self._waiting: deque[LocalEnvelope] = deque()
+        self._max_waiting, self._scheduled = max_waiting, False
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    @property
+    def closed(self) -> bool:
+        return self._loop is None
+
+    def open(self) -> None:
+        """Start to receive; needs a running loop."""
+        self._loop = asyncio.get_running_loop()
+        for channel in self._channels:
+            channel.add(self)
+
+    def close(self) -> None:
+        """Stop to receive; messages in the queue are discarded."""
+        for channel in self._channels:
+            channel.remove(self)
+        self._waiting.clear()
+        self._loop = None
+
+    def put(self, envelope: LocalEnvelope) -> None:
+        """Queue a message and schedule its delivery."""
+        if len(self._waiting) < self._max_waiting:
+            self._waiting.append(envelope)
+        if not self._scheduled and self._loop is not None:
+            self._scheduled = True
+            self._loop.call_soon(self._read)
+
+    def _read(self) -> None:
+        """Deliver the messages that waited when the callback began."""
+        self._scheduled = False
+        accepted: list[LocalEnvelope] = []
+        while self._waiting:
+            envelope = self._waiting.popleft()
+            if not self._receiver.accept_header(envelope.header, self._writers):
+                continue
+            if self._latest_only:
+                writer = envelope.header.writer
+                older = [one for one in accepted if one.header.writer == writer]
+                self._receiver.counts.dropped += len(older)
+                accepted = [one for one in accepted if one.header.writer != writer]
+            accepted.append(envelope)
+        for envelope in accepted:
+            if self.closed:
+                return
+            self._receiver.deliver(envelope)
