@@ -10,7 +10,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, SoftBody
+from flexsheet.messages.types import ArmLatency, Fingertip, SheetTarget, SoftBody
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
@@ -41,14 +41,13 @@ def _is_finite(fingertip: Fingertip) -> bool:
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_left", "arm_right"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"arm_latency"})
 
     parameters: PlannerParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
     soft_body: Input[SoftBody]
-    arm_left: Input[ArmState]
-    arm_right: Input[ArmState]
+    arm_latency: Input[ArmLatency]
     sheet_target: Output[SheetTarget]
 
     async def setup(self) -> None:
@@ -95,11 +94,9 @@ class Planner(Node):
             self._compliance.update(soft_body, in_contact=self._trajectory.in_contact)
             self._update_note()
 
-    def on_arm_left(self, arm: ArmState, header: Header) -> None:
+    def on_arm_latency(self, arm: ArmLatency, header: Header) -> None:
         if self.parameters.measure_actuation_delay:
-            self._actuation.on_arm(arm)
-
-    on_arm_right = on_arm_left
+            self._actuation.on_latency(arm.side, arm.latency_s)
 
     def _update_note(self) -> None:
         late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
@@ -121,7 +118,6 @@ class Planner(Node):
             self._late_count += 1
             self._update_note()
             return
-        self._actuation.on_fingertip(source_ns, header.publish_ns)
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = trajectory.hold("fingertip_invalid", step_s)
@@ -141,6 +137,7 @@ class Planner(Node):
 
     def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:
         """Update the prediction horizon and return its change (s)."""
+        self._actuation.on_fingertip(age_s)
         if self.parameters.prediction_horizon_s is not None:
             return 0.0
         before_s = self._horizon_s
@@ -159,6 +156,7 @@ class Planner(Node):
                 world_from_sheet=planned.motion.world_from_sheet,
                 twist_world=planned.motion.twist_world,
                 stretch_ratio=planned.motion.stretch_ratio,
+                trajectory=planned.trajectory,
                 contact_world_m=planned.contact_world_m,
                 normal_world=planned.normal_world,
                 contact_sheet_m=planned.contact_sheet_m,
