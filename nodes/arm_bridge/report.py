@@ -9,7 +9,6 @@ from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
-from flexsheet.nodes.arm_bridge.state_machine import TRACKING
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 REPORTED_TARGETS = 12
@@ -91,7 +90,7 @@ def make_arm_state(
         world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
         command_age_s=None if target is None else (now_ns - exchange.received_ns) * 1e-9,
         target_source_ns=0 if target is None else target.source_ns,
-        trajectory_ends_ns=exchange.trajectory_ends_ns if control.state in TRACKING else 0,
+        trajectory_ends_ns=exchange.trajectory_ends_ns if control.ready else 0,
         command_sent_ns=exchange.sent_ns,
         edge_distance_m=distance_m,
         edge_force_n=force_n,
