@@ -63,6 +63,8 @@ _ROWS = (
     Topic("sheet_target", types.SheetTarget, _LATEST, (30, 150), True, "target pose of the sheet"),
     Topic("arm_left", types.ArmState, _LATEST, (40, 150), True, "state of the left arm"),
     Topic("arm_right", types.ArmState, _LATEST, (40, 150), True, "state of the right arm"),
+    Topic("arm_latency", types.ArmLatency, _EVERY, None, True, "measured latency of each arm",
+          many_writers=True, open_to_tools=False),
     Topic("skin", types.Skin, _LATCHED, None, True, "skin of the soft body at rest",
           max_bytes=16 << 20),
     Topic("soft_body", types.SoftBody, _LATEST, (20, 1000), True,

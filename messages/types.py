@@ -122,11 +122,21 @@ SheetReason = Literal[
 """Why the sheet does not follow the finger; with "concave_contact" it follows at a distance."""
 
 
+class SheetTrajectory(MessagePart):
+    """Motion of the sheet after its target, while no newer target arrives.
+
+    The sheet keeps the target's twist, and then decelerates evenly to rest.
+    """
+
+    keep_s: float = Field(ge=0.0, le=0.2, description="time for which the twist is kept")
+    brake_s: float = Field(gt=0.0, le=0.2, description="duration of the deceleration after it")
+
+
 class SheetTarget(Message):
     """Target pose and velocity of the sheet at `valid_at_ns`.
 
     The sheet frame is at the sheet's centre: x from the left edge to the right, z towards the user.
-    For another time, a consumer extrapolates by the twist.
+    For another time, a consumer extrapolates by the twist, or follows the trajectory.
     """
 
     phase: Phase
@@ -139,6 +149,10 @@ class SheetTarget(Message):
         description="linear velocity (m/s) of the centre, then angular velocity (rad/s)"
     )
     stretch_ratio: Positive = Field(description="distance of the edges over the slack width")
+    trajectory: SheetTrajectory | None = Field(
+        default=None,
+        description="motion that both arms may follow from valid_at_ns; None: they extrapolate",
+    )
     contact_world_m: Vector3 = Field(description="contact point on the undeformed object")
     normal_world: Vector3
     contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
@@ -189,6 +203,10 @@ class ArmState(Message):
         description="age of the sheet target in use; None: no target"
     )
     target_source_ns: Stamp = Field(description="exposure of the image behind that target; 0: none")
+    trajectory_ends_ns: Stamp = Field(
+        default=0,
+        description="time until which the arm may follow that target's trajectory; 0: not at all",
+    )
     command_sent_ns: Stamp = Field(description="time of the newest command; 0: never")
     edge_distance_m: NonNegative | None = Field(
         description="distance between both edges; None: unknown"
@@ -201,6 +219,16 @@ class ArmState(Message):
     servo_lag_uncertainty_s: NonNegative | None = Field(
         default=None,
         description="standard deviation of the measured lag; None: the lag is not measured",
+    )
+
+
+class ArmLatency(Message):
+    """Mean latency of one arm over its last sheet targets, while it follows them."""
+
+    side: Side
+    latency_s: Finite = Field(
+        description="time from the exposure until the first command with its target, plus the "
+        "arm's measured lag"
     )
 
 

@@ -252,7 +252,8 @@ async def test_an_arm_whose_state_comes_late_makes_the_other_hold() -> None:
         (told,) = listeners
 
         def later(message: Message, header: Header) -> None:
-            loop.call_later(0.3, told, message, header)
+            # Longer than any trajectory, shorter than the time after which the arm stops.
+            loop.call_later(0.5, told, message, header)
 
         listeners[:] = [later]
         await until(lambda: stroke.mode("right") == "hold")

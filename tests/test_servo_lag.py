@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 
+from flexsheet.messages.base import Header
 from flexsheet.messages.types import SheetTarget
 from flexsheet.nodes.arm_bridge.goal import GoalTiming, make_goal
+from flexsheet.nodes.arm_bridge.report import REPORTED_TARGETS, LastExchange, LatencyMean
 from flexsheet.nodes.models.servo_lag import (
     MAX_SLEW_S_PER_S,
     LagBounds,
@@ -19,7 +20,6 @@ from flexsheet.nodes.models.servo_lag import (
 )
 from flexsheet.nodes.planner.timing import ActuationDelayEstimator
 from flexsheet.nodes.twin.arms import Floats, Servo
-from tests.arm_states import arm_state
 
 BOUNDS = LagBounds(0.005, 0.1)
 PERIOD_S = 1.0 / 140.0
@@ -154,47 +154,35 @@ def test_the_tracking_error_of_a_servo_is_the_expected_one() -> None:
     assert found.tracking_error_rad < 2.0 * found.expected_error_rad + 1e-4
 
 
-def feed(
-    delay: ActuationDelayEstimator, sent_ms: float, lag_s: float | None, **fields: Any
-) -> None:
-    """Pass 600 fingertips, 16 ms apart, and the arm's first and second command with each."""
+def feed(delay: ActuationDelayEstimator, sent_ms: float, *, is_measured: bool = True) -> None:
+    """Pass 600 fingertips of age 10 ms, and the reports of an arm with a lag of 60 ms."""
+    lag, latency, last = ServoLagEstimator(0.06, BOUNDS), LatencyMean(), LastExchange()
+    lag.estimate = LagEstimate(0.06, 0.001, 0.0, 0.0) if is_measured else None
     for number in range(1, 601):
         source_ns = 16_000_000 * number
-        delay.on_fingertip(source_ns, source_ns + 10_000_000)
+        delay.on_fingertip(0.01)
+        last.target = Header(number, source_ns, source_ns, "clock", "planner", 1)
         for late_ms in (0.0, 7.0):
-            delay.on_arm(
-                arm_state(
-                    "left",
-                    target_source_ns=source_ns,
-                    command_sent_ns=source_ns + round(1e6 * (10.0 + sent_ms + late_ms)),
-                    servo_lag_s=lag_s,
-                    servo_lag_uncertainty_s=lag_s and 0.001,
-                    **{"mode": "follow"} | fields,
-                )
-            )
+            last.sent_ns = source_ns + round(1e6 * (10.0 + sent_ms + late_ms))
+            if (latency_s := latency.add(last, lag)) is not None:
+                assert number % REPORTED_TARGETS == 0
+                delay.on_latency("left", latency_s)
 
 
 def test_the_actuation_delay_is_the_first_commands_delay_and_the_lag() -> None:
     delay = ActuationDelayEstimator(0.036, 0.15)
-    feed(delay, 5.0, 0.06)
+    feed(delay, 5.0)
     assert delay.delay_s == pytest.approx(0.065, abs=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("sent_ms", "lag_s", "fields"),
-    [
-        (5.0, None, {}),
-        (-500.0, 0.03, {}),
-        (1e6, 0.03, {}),
-        (5.0, 0.06, {"mode": "hold"}),
-    ],
-    ids=["no lag", "sent before", "too late", "at rest"],
+    ("sent_ms", "is_measured"),
+    [(5.0, False), (-500.0, True), (1e6, True)],
+    ids=["no lag", "sent before", "too late"],
 )
-def test_an_implausible_actuation_delay_is_not_used(
-    sent_ms: float, lag_s: float | None, fields: dict[str, Any]
-) -> None:
+def test_an_implausible_actuation_delay_is_not_used(sent_ms: float, is_measured: bool) -> None:
     delay = ActuationDelayEstimator(0.036, 0.15)
-    feed(delay, sent_ms, lag_s, **fields)
+    feed(delay, sent_ms, is_measured=is_measured)
     assert delay.delay_s == 0.036
 
 

@@ -63,12 +63,16 @@ LAB = GraphDrawing(
         ),
         _arrow("arm_right_bridge", "renderer", "arm_right", "646,388 820,388 820,182", (780, 381)),
         _arrow(
-            "arm_left_bridge", "planner", "arm_left", "660,322 660,112 590,112 590,92", (660, 245)
+            "arm_left_bridge",
+            "planner",
+            "arm_latency",
+            "660,322 660,112 590,112 590,92",
+            (660, 245),
         ),
         _arrow(
             "arm_right_bridge",
             "planner",
-            "arm_right",
+            "arm_latency",
             "640,378 640,336 706,336 706,122 600,122 600,92",
             (712, 205),
         ),

@@ -17,7 +17,12 @@ from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, scale_speeds
+from flexsheet.nodes.arm_bridge.goal import (
+    FOLLOW_BOUNDS,
+    Goal,
+    compute_sync_factor,
+    scale_speeds,
+)
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
@@ -58,7 +63,6 @@ from flexsheet.nodes.arm_bridge.state_machine import (
 )
 from flexsheet.nodes.models.motion import (
     EdgeBound,
-    SheetBounds,
     SheetMotion,
     coast_sheet,
     follow_sheet,
@@ -70,16 +74,6 @@ Floats = NDArray[np.float64]
 MAX_REST_RAD_PER_S = 1e-6
 """Joint speed below which an arm is at rest."""
 
-# Accelerations that the joints can follow (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger ones the
-# joints would overshoot a target that reverses, and each arm by a different amount.
-FOLLOW_BOUNDS = SheetBounds(
-    speed_m_per_s=0.22,
-    acceleration_m_per_s2=2.6,
-    turn_rad_per_s=2.5,
-    turn_acceleration_rad_per_s2=16.0,
-    stretch_rate_per_s=0.1,
-    stretch_acceleration_per_s2=1.0,
-)
 # The sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 

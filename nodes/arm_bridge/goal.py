@@ -11,11 +11,28 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.types import SheetTarget
-from flexsheet.nodes.models.motion import SheetBounds, SheetMotion, extrapolate
+from flexsheet.messages.types import SheetTarget, SheetTrajectory
+from flexsheet.nodes.models.motion import (
+    SheetBounds,
+    SheetMotion,
+    extrapolate,
+    follow_trajectory,
+    measure_length,
+)
 from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
+
+# Accelerations that the joints can follow (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger ones the
+# joints would overshoot a target that reverses, and each arm by a different amount.
+FOLLOW_BOUNDS = SheetBounds(
+    speed_m_per_s=0.22,
+    acceleration_m_per_s2=2.6,
+    turn_rad_per_s=2.5,
+    turn_acceleration_rad_per_s2=16.0,
+    stretch_rate_per_s=0.1,
+    stretch_acceleration_per_s2=1.0,
+)
 
 SLOW_FROM_RAD = 0.05
 """Difference of the edges from which the leading arm slows."""
@@ -25,6 +42,9 @@ WAIT_FROM_RAD = 0.12
 
 MAX_PREDICTION_S = 0.15
 """Largest time of a target ahead of now: the horizon of fingertip predictions and a margin."""
+
+MAX_TRAJECTORY_S = 0.4
+"""Longest trajectory that is followed.  An arm then moves this long without a message."""
 
 SKEW_LENGTH_M = 0.25
 """Skew of an edge to the other one that counts as 1 rad of difference."""
@@ -69,19 +89,45 @@ class GoalTiming:
     max_extrapolation_s: float
 
 
+def find_trajectory(target: SheetTarget) -> SheetTrajectory | None:
+    """Return the target's trajectory if its speeds and decelerations are within FOLLOW_BOUNDS."""
+    trajectory, bounds = target.trajectory, FOLLOW_BOUNDS
+    if trajectory is None or not trajectory.brake_s > 0.0 <= trajectory.keep_s:
+        return None
+    speed, turn = measure_length(target.twist_world[:3]), measure_length(target.twist_world[3:])
+    is_allowed = (
+        trajectory.keep_s + trajectory.brake_s <= MAX_TRAJECTORY_S
+        and speed <= min(bounds.speed_m_per_s, bounds.acceleration_m_per_s2 * trajectory.brake_s)
+        and turn
+        <= min(bounds.turn_rad_per_s, bounds.turn_acceleration_rad_per_s2 * trajectory.brake_s)
+    )
+    return trajectory if is_allowed else None
+
+
 def make_goal(
     target: SheetTarget,
     *,
     received_ns: int,
     now_ns: int,
     timing: GoalTiming,
+    trajectory: SheetTrajectory | None = None,
 ) -> Goal:
     """Return a target's goal for a command that is sent now.
+
+    trajectory: from `find_trajectory`, if the other arm agrees; the target is then overdue from its
+        end, whenever it has arrived.  None: the target is extrapolated by its twist.
 
     A target has no rate of stretch, so the arms follow a changing stretch with a lag.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
+    if trajectory is not None:
+        keep_s, brake_s = trajectory.keep_s, trajectory.brake_s
+        at_s = max(ahead_s, -timing.max_extrapolation_s)
+        return Goal(
+            follow_trajectory(motion, at_s, keep_s=keep_s, brake_s=brake_s),
+            max(ahead_s - keep_s - brake_s, -ahead_s - MAX_PREDICTION_S),
+        )
     overdue_s = (now_ns - received_ns) * 1e-9 - timing.target_period_s
     return extrapolate_goal(
         motion, ahead_s, overdue_s, max_extrapolation_s=timing.max_extrapolation_s

@@ -8,17 +8,25 @@ from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Arming, ArmState, EStop, SheetTarget, Side
+from flexsheet.messages.types import (
+    Arming,
+    ArmLatency,
+    ArmState,
+    EStop,
+    SheetTarget,
+    SheetTrajectory,
+    Side,
+)
 from flexsheet.nodes.arm_bridge.command_scheduler import CommandScheduler
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, GoalTiming, make_goal
+from flexsheet.nodes.arm_bridge.goal import Goal, GoalTiming, find_trajectory, make_goal
 from flexsheet.nodes.arm_bridge.link import ArmLinkError, ArmSilentError, ArmStatus, Freshness
 from flexsheet.nodes.arm_bridge.link_drivers import make_link
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.path_check import PathChecker
-from flexsheet.nodes.arm_bridge.report import LastExchange, make_arm_state
+from flexsheet.nodes.arm_bridge.report import LastExchange, LatencyMean, make_arm_state
 from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
@@ -26,6 +34,9 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 
 MIN_SERVO_LAG_S = 0.002
 """Minimum lag that is measured; no arm's servo is faster."""
+
+CHECK_PERIOD_NS = 100_000_000
+"""Period of the self-checks of the arm, whose results are published once per second."""
 
 
 class ArmBridge(Node):
@@ -39,6 +50,7 @@ class ArmBridge(Node):
     estop: Input[EStop]
     arming: Input[Arming]
     arm: Output[ArmState]
+    arm_latency: Output[ArmLatency]
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
@@ -66,6 +78,7 @@ class ArmBridge(Node):
         self._servo_check = ServoCheck(given.side, given.servo_lag_s)
         self._geometry: ArmGeometry | None = None
         self._last, self._cycle_ns, self._failures = LastExchange(), 0, 0
+        self._latency, self._checked_ns = LatencyMean(), 0
         self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
@@ -154,11 +167,18 @@ class ArmBridge(Node):
     async def _exchange(self, geometry: ArmGeometry, other: OtherArm | None, step_s: float) -> None:
         control, last = self._control, self._last
         clock_problem = self.sheet_target.clock_problem or self.other_arm.clock_problem
-        command = control.step(geometry, self._read_goal(), other, step_s, clock_problem)
+        target = self.sheet_target.message
+        trajectory = None if target is None else find_trajectory(target)
+        goal = self._read_goal(trajectory if other is not None and other.agrees else None)
+        command = control.step(geometry, goal, other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
             control.on_path_result(*result)
         # A target that arrives during the exchange is not the one behind this command.
         last.target, last.received_ns = self.sheet_target.header, self.sheet_target.received_ns
+        last.trajectory_ends_ns = 0
+        if target is not None and trajectory is not None:
+            duration_s = trajectory.keep_s + trajectory.brake_s - self._lag.lag_s
+            last.trajectory_ends_ns = max(1, target.valid_at_ns + round(1e9 * duration_s))
         mode, joints_rad, now_ns = command.mode, command.joints_rad, self.clock.now_ns()
         last.sent_ns = now_ns
         try:
@@ -183,10 +203,17 @@ class ArmBridge(Node):
         if status.freshness is Freshness.FRESH:
             # The arm reads its joints between the command and the arrival of its answer.
             self._lag.on_measurement(0.5e-9 * (last.sent_ns + last.measured_ns), status.joints_rad)
-            self.self_checks = self._servo_check.update(self._lag.estimate, last.measured_ns)
+            if last.measured_ns - self._checked_ns >= CHECK_PERIOD_NS:
+                self._checked_ns = last.measured_ns
+                self.self_checks = self._servo_check.update(self._lag.estimate, last.measured_ns)
+        if self._control.mode == "follow" and (latency_s := self._latency.add(last, self._lag)):
+            self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
-    def _read_goal(self) -> Goal | None:
-        """Return the newest sheet target, extrapolated to the time when this command acts."""
+    def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
+        """Return the newest sheet target at the time when this command acts.
+
+        trajectory: that of the target, if the other arm agrees.
+        """
         target = self.sheet_target.message
         if target is None:
             return None
@@ -195,8 +222,17 @@ class ArmBridge(Node):
             received_ns=self.sheet_target.received_ns,
             now_ns=self.clock.now_ns(),
             timing=replace(self._timing, servo_lag_s=self._lag.lag_s),
+            trajectory=trajectory,
         )
 
     def _read_other(self) -> OtherArm | None:
         state = self.other_arm.message
-        return None if state is None else OtherArm.from_state(state, self.other_arm.age_s())
+        if state is None:
+            return None
+        header = self.sheet_target.header
+        return OtherArm.from_state(
+            state,
+            self.other_arm.age_s(),
+            target_source_ns=0 if header is None else header.source_ns,
+            now_ns=self.clock.now_ns(),
+        )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import ArmMode, ArmState
+from flexsheet.nodes.arm_bridge.goal import MAX_PREDICTION_S, MAX_TRAJECTORY_S
 from flexsheet.nodes.models.rigid import is_rigid
 
 Floats = NDArray[np.float64]
@@ -17,12 +18,20 @@ MAX_FUTURE_S = 0.02
 """Maximum time of a state in the future.  Measured clock offsets are smaller.  Without this limit,
 a future state would count as fresh until its time."""
 
+MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
+"""Largest time between the exposures behind adjacent targets, whose trajectories overlap."""
+
+MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
+"""Latest end of a trajectory after the exposure behind its target."""
+
 
 @dataclass(frozen=True)
 class OtherArm:
     """State of the other arm: joints (6,) rad, world poses (4, 4), mode, faults, and its age.
 
     ready: whether it may move.  estop_engaged: whether its bridge has latched an e-stop.
+    agrees: whether it may follow the trajectory of the same or an adjacent target.  Its age then
+        counts from the end of that trajectory.
     """
 
     joints_rad: Floats
@@ -33,10 +42,24 @@ class OtherArm:
     age_s: float
     ready: bool
     estop_engaged: bool
+    agrees: bool = False
 
     @classmethod
-    def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
-        """Convert the other bridge's message, received `age_s` ago."""
+    def from_state(
+        cls, state: ArmState, age_s: float, *, target_source_ns: int = 0, now_ns: int = 0
+    ) -> OtherArm:
+        """Convert the other bridge's message, which is `age_s` old.
+
+        target_source_ns: exposure behind this arm's own target.
+        """
+        other_ns = state.target_source_ns
+        ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
+        is_adjacent = bool(
+            state.trajectory_ends_ns
+            and abs(other_ns - target_source_ns) <= MAX_TARGET_DIFFERENCE_NS
+        )
+        if is_adjacent:
+            age_s = min(age_s, max((now_ns - ends_ns) * 1e-9, 0.0))
         return cls(
             state.joints_rad,
             state.world_from_flange,
@@ -46,6 +69,7 @@ class OtherArm:
             age_s,
             state.ready,
             state.estop_engaged,
+            is_adjacent,
         )
 
     @cached_property

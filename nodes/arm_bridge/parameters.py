@@ -44,10 +44,13 @@ class ArmBridgeParameters(NodeParameters):
     )
     hold_after_s: Positive = Field(
         default=0.02,
-        description="lateness of a target or of the other arm after which it decelerates",
+        description="lateness of a target or of the other arm, from the end of the trajectory, "
+        "after which it decelerates",
     )
     stop_after_s: Positive = Field(
-        default=0.1, description="lateness of a target or of the other arm after which it stops"
+        default=0.1,
+        description="lateness of a target or of the other arm, from the end of the trajectory, "
+        "after which it stops",
     )
     max_extrapolation_s: Positive = Field(
         default=0.06, description="longest extrapolation of a target"

@@ -11,17 +11,22 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
+REPORTED_TARGETS = 12
+"""Number of targets in one reported mean; five reports per second at 60 Hz load no reader."""
+
 
 @dataclass(slots=True)
 class LastExchange:
     """Times of the newest exchange with the arm, ns on this computer's clock; 0: never.
 
     target, received_ns: header and arrival of the sheet target behind the command.
+    trajectory_ends_ns: time of the last command by that target's trajectory; 0: it has none.
     sent_ns, measured_ns: times of the last command and of the last answer.
     """
 
     target: Header | None = None
     received_ns: int = 0
+    trajectory_ends_ns: int = 0
     sent_ns: int = 0
     measured_ns: int = 0
     duration_s: float = 0.0
@@ -29,6 +34,27 @@ class LastExchange:
     def on_answer(self, now_ns: int) -> None:
         """Store the time of the answer."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
+
+
+class LatencyMean:
+    """Mean of the time from the exposure behind each new target until the arm has moved by it."""
+
+    def __init__(self) -> None:
+        self._target: Header | None = None
+        self._sum_s, self._count = 0.0, 0
+
+    def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
+        """Add the first command with a target; return the mean (s) once per REPORTED_TARGETS."""
+        target, before = exchange.target, self._target
+        self._target = target
+        if target is None or target is before or lag.estimate is None:
+            return None
+        self._sum_s += (exchange.sent_ns - target.source_ns) * 1e-9 + lag.lag_s
+        self._count += 1
+        if self._count < REPORTED_TARGETS:
+            return None
+        mean_s, self._sum_s, self._count = self._sum_s / self._count, 0.0, 0
+        return mean_s
 
 
 def make_arm_state(
@@ -64,6 +90,7 @@ def make_arm_state(
         world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
         command_age_s=None if target is None else (now_ns - exchange.received_ns) * 1e-9,
         target_source_ns=0 if target is None else target.source_ns,
+        trajectory_ends_ns=exchange.trajectory_ends_ns if control.ready else 0,
         command_sent_ns=exchange.sent_ns,
         edge_distance_m=distance_m,
         edge_force_n=force_n,

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.rigid import (
     moved,
     rotation_from_vector,
-    skew,
     transform,
     vector_from_rotation,
 )
@@ -26,7 +25,7 @@ BRAKE_FRACTION = 1.0 / 3.0
 """Fraction of the acceleration for braking onto the target; the rest is for following it."""
 
 
-def closing_speed(distance: Floats, deceleration: Floats | float, step_s: float) -> Floats:
+def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s: float) -> Floats:
     """Return the maximum speeds at which a point can still stop within distances (n,) >= 0.
 
     In discrete time the point moves by speed * step_s per step, and the speed then decreases by
@@ -59,11 +58,11 @@ def follow(
         max_acceleration=max_acceleration,
         step_s=step_s,
     )
-    distance = _length(error - target_velocity * step_s)
+    distance = measure_length(error - target_velocity * step_s)
     reach = (1.0 - BRAKE_FRACTION) * max_acceleration * step_s
     mean = velocity + _clamp_length(desired - velocity, reach)
-    landed = _length(error - mean * step_s) <= 1e-12 + 1e-9 * distance
-    settles = _length(target_velocity - mean) <= BRAKE_FRACTION * max_acceleration * (
+    landed = measure_length(error - mean * step_s) <= 1e-12 + 1e-9 * distance
+    settles = measure_length(target_velocity - mean) <= BRAKE_FRACTION * max_acceleration * (
         step_s * (1.0 + 1e-9)
     )
     return mean * step_s, target_velocity if landed and settles else mean
@@ -79,22 +78,22 @@ def desired_velocity(
 ) -> Floats:
     """Return the fastest velocity (n,) towards the target that still allows a stop there."""
     offset = error - target_velocity * step_s
-    distance = _length(offset)
+    distance = measure_length(offset)
     if distance == 0.0:
         return _clamp_length(target_velocity, max_speed)
     brake = BRAKE_FRACTION * max_acceleration
-    speed = float(closing_speed(np.array(distance), brake, step_s))
+    speed = float(closing_speed(distance, brake, step_s))
     return _clamp_length(target_velocity + offset * (speed / distance), max_speed)
 
 
-def _length(vector: Floats) -> float:
+def measure_length(vector: Floats) -> float:
     """Return the norm of a short vector, five times as fast as `numpy.linalg.norm`."""
     return sqrt(float(vector @ vector))
 
 
 def _clamp_length(vector: Floats, longest: float) -> Floats:
     """Limit the length of a vector to `longest`."""
-    length = _length(vector)
+    length = measure_length(vector)
     return vector if length <= longest else vector * (longest / length)
 
 
@@ -147,7 +146,7 @@ def follow_sheet(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
     )
     speed, turn_speed = (
-        _length(
+        measure_length(
             desired_velocity(
                 error,
                 velocity,
@@ -228,14 +227,39 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
     )
 
 
+def follow_trajectory(
+    motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
+) -> SheetMotion:
+    """Return the motion `time_s` later: constant twist for `keep_s`, then even braking to rest."""
+    braked_s = min(max(time_s - keep_s, 0.0), brake_s)
+    travelled_s = min(time_s, keep_s) + braked_s - 0.5 * braked_s * braked_s / brake_s
+    return replace(
+        motion,
+        world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, travelled_s),
+        twist_world=motion.twist_world * (1.0 - braked_s / brake_s),
+        stretch_rate_per_s=0.0,
+    )
+
+
 def _decelerate(velocity: Floats, change: float) -> Floats:
-    speed = _length(velocity)
+    speed = measure_length(velocity)
     return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)
 
 
 def _orthonormal(pose: Floats) -> Floats:
     """Return the pose with its rotation made orthonormal (Gram-Schmidt on x, then y)."""
-    x_axis = pose[:3, 0] / _length(pose[:3, 0])
-    y_axis = pose[:3, 1] - x_axis * (x_axis @ pose[:3, 1])
-    y_axis = y_axis / _length(y_axis)
-    return transform(np.column_stack([x_axis, y_axis, skew(x_axis) @ y_axis]), pose[:3, 3])
+    (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
+    length = sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax / length, ay / length, az / length
+    along = ax * bx + ay * by + az * bz
+    bx, by, bz = bx - along * ax, by - along * ay, bz - along * az
+    length = sqrt(bx * bx + by * by + bz * bz)
+    bx, by, bz = bx / length, by / length, bz / length
+    return np.array(
+        [
+            [ax, bx, ay * bz - az * by, px],
+            [ay, by, az * bx - ax * bz, py],
+            [az, bz, ax * by - ay * bx, pz],
+            last,
+        ]
+    )

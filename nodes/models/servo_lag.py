@@ -46,7 +46,7 @@ HISTORY = 256
 MIN_COMMANDS = 4
 """Number of stored commands, and the fewest with which a measurement is compared."""
 
-MIN_STEP_S = 0.012
+MIN_STEP_S = 0.02
 """Shortest time between two measurements in use; more would cost time and tell little."""
 
 MAX_JOINT_RAD = 10.0

@@ -19,6 +19,7 @@ from flexsheet.nodes.models.motion import (
     SheetMotion,
     closing_speed,
     desired_velocity,
+    measure_length,
 )
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
 
@@ -71,17 +72,17 @@ def limit_jerk(
     The acceleration never exceeds its limit, and never changes by more than max_jerk step_s.
     """
     change = goal_velocity - mean_velocity
-    size = float(np.linalg.norm(change))
+    size = measure_length(change)
     goal = np.zeros_like(change)
     if size > 0.0:
-        taper = closing_speed(np.array(size), TAPER_FRACTION * max_jerk, step_s)
+        taper = closing_speed(size, TAPER_FRACTION * max_jerk, step_s)
         goal = change * (min(float(taper), max_acceleration) / size)
     step = goal - acceleration
-    length, max_length = float(np.linalg.norm(step)), max_jerk * step_s
+    length, max_length = measure_length(step), max_jerk * step_s
     if length > max_length:
         step = step * (max_length / length)
     after = acceleration + step
-    error = float(np.linalg.norm(after * step_s - change))
+    error = measure_length(after * step_s - change)
     reached = length <= max_length and error <= 1e-12 * size
     return goal_velocity.copy() if reached else mean_velocity + after * step_s, after
 
@@ -164,5 +165,5 @@ def _desired_velocities(
         max_acceleration=bounds.stretch_acceleration_per_s2,
         step_s=step_s,
     )
-    scale = edges.speed_scale(float(np.linalg.norm(linear)), float(np.linalg.norm(angular)))
+    scale = edges.speed_scale(measure_length(linear), measure_length(angular))
     return np.concatenate([scale * linear, scale * angular, stretch_rate])

@@ -10,7 +10,13 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from flexsheet.messages.types import ArmState, Fingertip, ParameterChange, SheetTarget, SoftBody
+from flexsheet.messages.types import (
+    ArmLatency,
+    Fingertip,
+    ParameterChange,
+    SheetTarget,
+    SoftBody,
+)
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
@@ -42,15 +48,14 @@ def _is_finite(fingertip: Fingertip) -> bool:
 class Planner(Node):
     """Publish one sheet target per fingertip; equal inputs give equal bytes."""
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_left", "arm_right"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency"})
 
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
     parameters: PlannerParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]
     soft_body: Input[SoftBody]
-    arm_left: Input[ArmState]
-    arm_right: Input[ArmState]
+    arm_latency: Input[ArmLatency]
     parameter: Input[ParameterChange]
     sheet_target: Output[SheetTarget]
 
@@ -90,12 +95,16 @@ class Planner(Node):
         else:
             model, self._model_note = make_force_model(scene.sheet, self._calibration), "calibrated"
         measured = None if self._calibration is None else self._calibration.hysteresis_ratio
+        mode = self.parameters.choose_compliance(scene)
+        bounds = None
+        if mode == "force_curve":
+            bounds = load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir)
         self._compliance = ComplianceController(
             scene,
             model,
-            self.parameters.choose_compliance(scene),
+            mode,
             hysteresis_ratio=None if measured is None else float(measured.value),
-            bounds=load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir),
+            bounds=bounds,
             delay_s=self._horizon_s,
         )
         self._first_step_s = 1.0 / scene.camera.rate_hz
@@ -106,11 +115,9 @@ class Planner(Node):
             self._compliance.update(soft_body, in_contact=self._trajectory.in_contact)
             self._update_note()
 
-    def on_arm_left(self, arm: ArmState, header: Header) -> None:
+    def on_arm_latency(self, arm: ArmLatency, header: Header) -> None:
         if self.parameters.measure_actuation_delay:
-            self._actuation.on_arm(arm)
-
-    on_arm_right = on_arm_left
+            self._actuation.on_latency(arm.side, arm.latency_s)
 
     def _update_note(self) -> None:
         late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
@@ -137,7 +144,6 @@ class Planner(Node):
             self._late_count += 1
             self._update_note()
             return
-        self._actuation.on_fingertip(source_ns, header.publish_ns)
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = trajectory.hold("fingertip_invalid", step_s)
@@ -163,6 +169,7 @@ class Planner(Node):
 
     def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:
         """Update the prediction horizon and return its change (s)."""
+        self._actuation.on_fingertip(age_s)
         if self.parameters.prediction_horizon_s is not None:
             return 0.0
         before_s = self._horizon_s
@@ -181,6 +188,7 @@ class Planner(Node):
                 world_from_sheet=planned.motion.world_from_sheet,
                 twist_world=planned.motion.twist_world,
                 stretch_ratio=planned.motion.stretch_ratio,
+                trajectory=planned.trajectory,
                 contact_world_m=planned.contact_world_m,
                 normal_world=planned.normal_world,
                 contact_sheet_m=planned.contact_sheet_m,

@@ -30,7 +30,7 @@ class PlannerParameters(NodeParameters):
         "measure_actuation_delay, until it is measured",
     )
     measure_actuation_delay: bool = Field(
-        default=True, description="measure the delay from the states of the arms, and use it"
+        default=True, description="use the delay that the arms measure"
     )
     max_actuation_delay_s: Positive = Field(
         default=0.15, description="maximum delay that is measured and used"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flexsheet.messages.types import ArmState
+from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
 """Number of late fingertips in a row, with rising stamps, that indicate a clock step."""
@@ -13,11 +13,8 @@ MIN_STEP_NS = 1_000_000
 AGE_WEIGHT = 0.05
 """Weight of the newest age in the mean; at 60 Hz the mean spans a third of a second."""
 
-DELAY_WEIGHT = 0.01
-"""Weight of the newest actuation delay in the mean; at 60 Hz the mean spans 1.7 s."""
-
-STORED_FINGERTIPS = 32
-"""Number of fingertips whose publication is stored, half a second at 60 Hz."""
+DELAY_WEIGHT = 0.11
+"""Weight of the newest report of an arm in the mean; at 5 Hz the mean spans 1.8 s."""
 
 
 class MonotonicTimestampFilter:
@@ -51,39 +48,27 @@ class MonotonicTimestampFilter:
 class ActuationDelayEstimator:
     """Estimator of the time from a fingertip's publication until the arms have moved by it.
 
-    For each arm it is the time until the first command with the fingertip's target was sent, plus
-    the arm's measured lag.  delay_s: the mean of both arms; before measurements the initial value;
-    always between 0 and the maximum.
+    It is the latency that the arms report, less the mean age of published fingertips.  delay_s: the
+    mean of both arms; before reports the initial value; always between 0 and the maximum.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:
         self.delay_s = self._initial_s = min(initial_s, max_s)
         self._max_s = max_s
-        self._published_ns: dict[int, int] = {}
-        self._delays_s: dict[str, float] = {}
-        self._targets_ns: dict[str, int] = {}
+        self._age_s: float | None = None
+        self._delays_s: dict[Side, float] = {}
 
-    def on_fingertip(self, source_ns: int, publish_ns: int) -> None:
-        """Store the exposure and the publication of a fingertip that leads to a target."""
-        self._published_ns[source_ns] = publish_ns
-        if len(self._published_ns) > STORED_FINGERTIPS:
-            del self._published_ns[next(iter(self._published_ns))]
+    def on_fingertip(self, age_s: float) -> None:
+        """Add the age at its publication of a fingertip that leads to a target."""
+        before_s = age_s if self._age_s is None else self._age_s
+        self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
-    def on_arm(self, arm: ArmState) -> None:
-        """Update by the state of an arm, if it has a measured lag and a new target."""
-        source_ns = arm.target_source_ns
-        is_new = source_ns != self._targets_ns.get(arm.side)
-        self._targets_ns[arm.side] = source_ns
-        published_ns = self._published_ns.get(source_ns)
-        if arm.servo_lag_s is None or arm.servo_lag_uncertainty_s is None:
+    def on_latency(self, side: Side, latency_s: float) -> None:
+        """Add the reported time from exposures until an arm has moved; ignore implausible ones."""
+        if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return
-        if not is_new or published_ns is None or arm.mode != "follow":
-            return
-        delay_s = (arm.command_sent_ns - published_ns) * 1e-9 + arm.servo_lag_s
-        if not 0.0 <= delay_s <= self._max_s:
-            return
-        before_s = self._delays_s.get(arm.side, self._initial_s)
-        self._delays_s[arm.side] = before_s + DELAY_WEIGHT * (delay_s - before_s)
+        before_s = self._delays_s.get(side, self._initial_s)
+        self._delays_s[side] = before_s + DELAY_WEIGHT * (latency_s - self._age_s - before_s)
         self.delay_s = sum(self._delays_s.values()) / len(self._delays_s)
 
 

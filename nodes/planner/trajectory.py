@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Phase, SheetReason
-from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
+from flexsheet.messages.types import Phase, SheetReason, SheetTrajectory
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, measure_length
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
@@ -23,6 +23,7 @@ from flexsheet.nodes.planner.contact_state import (
     ContactStateMachine,
 )
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
+from flexsheet.nodes.planner.rolling import cross
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
@@ -41,15 +42,24 @@ MAX_STEP_S = 0.1
 """Gap after which the sheet restarts from rest at its last pose: the arms have stopped."""
 
 
+KEEP_S = 0.15
+"""Time for which a trajectory keeps the twist: a lost packet is repeated within 0.1 to 0.15 s."""
+
+MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
+"""Shortest and longest deceleration at the end of a trajectory."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
     """Result of one step, in the world frame.
 
+    trajectory: motion after it, if no newer target arrives.
     contact_sheet_m: (x, y) of the contact on the sheet.
     normal_offset_m: distance of the sheet behind the object's tangent plane.
     """
 
     motion: SheetMotion
+    trajectory: SheetTrajectory | None
     command: ContactCommand
     contact_world_m: Floats
     normal_world: Floats
@@ -231,6 +241,7 @@ class SheetTrajectoryPlanner:
         contact_sheet = apply(inverse(self.motion.world_from_sheet), contact_world)[:2]
         return PlannedStep(
             self.motion,
+            plan_continuation(self.motion, self._settings.bounds),
             command,
             contact_world,
             self._world_from_object[:3, :3] @ command.contact.normal,
@@ -239,10 +250,20 @@ class SheetTrajectoryPlanner:
         )
 
 
+def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
+    """Return the trajectory after a target, within the bounds; None if it cannot stop in time."""
+    brake_s = max(
+        MIN_BRAKE_S,
+        measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,
+        measure_length(motion.twist_world[3:]) / bounds.turn_acceleration_rad_per_s2,
+    )
+    return SheetTrajectory(keep_s=KEEP_S, brake_s=brake_s) if brake_s <= MAX_BRAKE_S else None
+
+
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
     """Move the sheet back along its normal by an offset that changes at the given rate."""
     normal = sheet.world_from_sheet[:3, 2]
     pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
     pose[:3, 3] -= offset_m * normal
-    twist[:3] -= rate_m_per_s * normal + offset_m * np.cross(twist[3:], normal)
+    twist[:3] -= rate_m_per_s * normal + offset_m * cross(twist[3:], normal)
     return replace(sheet, world_from_sheet=pose, twist_world=twist)

@@ -16,7 +16,6 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import reduce
 from itertools import accumulate
 from typing import Any, Literal
 
@@ -106,19 +105,22 @@ _CROSS, _SQUARE = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
 for _joint, (_axis, _point) in enumerate(zip(_AXES, _POINTS, strict=True)):
     _CROSS[_joint, :3] = np.column_stack([_skew(_axis), -_skew(_axis) @ _point])
     _SQUARE[_joint, :3] = _skew(_axis) @ _CROSS[_joint, :3]
-_HOME = np.eye(4)
+_UNIT = np.eye(4)
+_HOME = _UNIT.copy()
 _HOME[:3, 3] = _FLANGE_AT_ZERO
 
 
 def forward(joints_rad: Floats) -> Floats:
     """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
-    return reduce(np.matmul, (*_rotations(joints_rad), _HOME))
+    turns = _rotations(joints_rad)
+    one, two, three = turns[::2] @ turns[1::2]
+    return np.asarray(one @ two @ three @ _HOME)
 
 
 def _rotations(joints_rad: Floats) -> Floats:
     """exp(S q) of each joint (6, 4, 4)."""
     angles = joints_rad[:, None, None]
-    return np.asarray(np.eye(4) + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
+    return np.asarray(_UNIT + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
 
 
 def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Floats:

@@ -189,7 +189,14 @@ class SmoothPath:
             return self.points[0], np.zeros(3)
         if time_s >= self.times_s[-1]:
             return self.points[-1], np.zeros(3)
-        return self.spline(time_s), self.rate(time_s)
+        # For one time, the library's evaluation takes six times as long.
+        i = int(np.searchsorted(self.times_s, time_s, side="right")) - 1
+        since = time_s - self.times_s[i]
+        cubic, square, linear, constant = self.spline.c[:, i]
+        return (
+            ((cubic * since + square) * since + linear) * since + constant,
+            (3.0 * cubic * since + 2.0 * square) * since + linear,
+        )
 
 
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
@@ -328,7 +335,7 @@ class FingerMotion:
     def at(self, time_s: float) -> FingerState:
         """Return the true fingertip `time_s` after the path was given."""
         position, velocity, amplitudes = self._steady(time_s)
-        _, share_rate = minimum_jerk_profile(np.clip(time_s / self.ease_s, 0.0, 1.0))
+        _, share_rate = minimum_jerk_profile(min(max(time_s / self.ease_s, 0.0), 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
         for (noise, deviation), amplitude, before, after in zip(
             noises, amplitudes, self.amplitudes_before_m, self.amplitudes_m, strict=True
