@@ -31,8 +31,9 @@ Lengths are in metres and angles in radians.  The world frame has its origin at 
 imaginary screen: x to the right, y up, z towards the user.  Names `a_from_b` are poses of frame b
 in frame a.  Unknown keys are errors.  Numbers also have the limits of their unit
 ([limits](launch-files.md#limits)).  `object.support_angle_rad: A` is short for
-`object.support: {kind: strip, angle_rad: A}`.  Without `object.material` the object is rigid, without `projector` there is no
-image ([which nodes start](launch-files.md#which-nodes-start)).  To check a scene and the reach of the arms:
+`object.support: {kind: strip, angle_rad: A}`.  Without `object.material` the object is rigid,
+without `projector` there is no image ([which nodes start](launch-files.md#which-nodes-start)).
+To check a scene and the reach of the arms:
 
 ```bash
 flexsheet doctor scene launch/scenes/cylinder.yaml
