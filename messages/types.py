@@ -145,8 +145,8 @@ class SheetTarget(Message):
     push_depth_m: NonNegative = Field(description="depth of the finger in the undeformed object")
     normal_offset_m: Finite = Field(
         default=0.0,
-        description="distance of the sheet behind the object's tangent plane, where it has the "
-        "object's force; negative: in front of it",
+        description="distance of the sheet's surface behind the object's tangent plane, where it "
+        "has the object's force; negative: in front of it. The edges are further behind by the sag",
     )
 
 

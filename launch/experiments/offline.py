@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges, pose_matrix
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -28,7 +29,8 @@ from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_ca
 from flexsheet.nodes import node_class
 from flexsheet.nodes.models.rigid import apply, inverse, transform
 from flexsheet.nodes.models.shapes import make_shape
-from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
+from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
 from flexsheet.nodes.renderer.gl import headless_context
@@ -218,8 +220,12 @@ class OfflineEvaluator:
         arms = ArmPair(self._scene, apparatus)
         sheet = image = felt = expected = None
         if Metric.SHEET in metrics:
+            surface = SheetSurface.of(self._scene, apparatus)
             sheet = np.array(
-                [self._sheet_error(arms, *pair) for pair in zip(contacts, tip_errors, strict=True)]
+                [
+                    self._sheet_error(arms, surface, *pair)
+                    for pair in zip(contacts, tip_errors, strict=True)
+                ]
             )
         if Metric.FORCE in metrics:
             felt, expected = self._compare_forces(scene, apparatus, arms, tip_errors[0])
@@ -281,10 +287,23 @@ class OfflineEvaluator:
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
-        width_m = self._scene.sheet.width_m * self._stretch_ratio
-        return place_edges(contact.world_from_sheet, width_m)
+        """Return the edges of the sheet, behind the contact's plane by the sag of the middle."""
+        sheet = self._scene.sheet
+        distance_m = sheet.width_m * self._stretch_ratio
+        sag_m = compute_sag_m(
+            make_rubber(sheet),
+            contact.normal,
+            density_kg_per_m3=sheet.density_kg_per_m3,
+            edge_distance_m=distance_m,
+            across=0.5,
+        )
+        pose = contact.world_from_sheet.copy()
+        pose[:3, 3] -= sag_m * contact.normal
+        return place_edges(pose, distance_m)
 
-    def _sheet_error(self, arms: ArmPair, contact: Contact, tip_error: Floats) -> Floats:
+    def _sheet_error(
+        self, arms: ArmPair, surface: SheetSurface, contact: Contact, tip_error: Floats
+    ) -> Floats:
         """Return the point under the true finger minus the sheet's contact point, (3,), world."""
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
@@ -293,13 +312,26 @@ class OfflineEvaluator:
         before = contact.world_from_sheet
         rolled_m = before[:3, :3].T @ (believed - before[:3, 3])
         rolled_m[2] = 0.0
-        left, right = arms.hold(self._edges(self._lay_sheet(believed, normal, rolled_m)))
-        plane = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
-        plane /= np.linalg.norm(plane)
-        centre = apply(object_from_world, 0.5 * (left[:3, 3] + right[:3, 3]))
+        laid = self._lay_sheet(believed, normal, rolled_m)
+        left, right = arms.hold(self._edges(laid))
+        across = right[:3, 3] - left[:3, 3]
+        plane = np.cross(across, left[:3, 1] + right[:3, 1])
+        distance_m = np.linalg.norm(across)
+        planes = surface.find_tangent_planes(
+            SheetPlanes(
+                0.5 * (left[:3, 3] + right[:3, 3])[None],
+                (plane / np.linalg.norm(plane))[None],
+                (across / distance_m)[None],
+                np.array([distance_m]),
+            ),
+            contact.point[None],
+            np.array([0.0, 1.0, 0.0]),
+        )
         true_foot = self._shape.closest(apply(object_from_world, contact.point)[None])
         presented = project_presented_point(
-            true_foot, centre[None], (object_from_world[:3, :3] @ plane)[None]
+            true_foot,
+            apply(object_from_world, planes.points),
+            planes.normals @ self._world_from_object[:3, :3],
         )
         error = (true_foot.point - presented)[0]
         return np.asarray(self._world_from_object[:3, :3] @ error)

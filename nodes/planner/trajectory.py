@@ -45,7 +45,7 @@ class PlannedStep:
     """Result of one step, in the world frame.
 
     contact_sheet_m: (x, y) of the contact on the sheet.
-    normal_offset_m: distance of the sheet behind the object's tangent plane.
+    normal_offset_m: distance of the sheet's surface behind the object's tangent plane.
     """
 
     motion: SheetMotion
@@ -132,18 +132,15 @@ class SheetTrajectoryPlanner:
             compliance.stretch_ratio,
             0.0,
         )
-        self._normal_offset_m += self._sag_m(target, float(x))
+        behind_m = self._normal_offset_m + self._sag_m(target, float(x))
         depth_rate_m_per_s = -float(velocity @ command.contact.normal)
-        self._advance(
-            offset_along_normal(target, self._normal_offset_m, per_depth * depth_rate_m_per_s),
-            step_s,
-        )
+        self._advance(offset_along_normal(target, behind_m, per_depth * depth_rate_m_per_s), step_s)
         return self._make_step(command)
 
     def _sag_m(self, sheet: SheetMotion, x_m: float) -> float:
         """Return the deflection of the sheet by its weight along its normal, x_m from its centre.
 
-        The sheet is placed behind its tangent plane by this, so that its surface is in the plane.
+        The sheet's edges are placed behind its tangent plane by this, so that its surface is in it.
         """
         distance_m = self._rubber.width_m * sheet.stretch_ratio
         return float(
