@@ -231,6 +231,13 @@ def follow(
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
+    simulated_time: Annotated[
+        bool,
+        typer.Option(
+            "--simulated-time",
+            help="Run tracking, planning and arms in simulated time, without a graph.",
+        ),
+    ] = False,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -242,7 +249,7 @@ def follow(
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
     path = load_path(launch_file, finger_path)
-    bag = make_result_folder(output, "follow") / "follow.mcap"
+    bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:
         result = experiment.run_follow(
             launch_file, settings or (), bag, path, progress, apparatus=apparatus
@@ -255,7 +262,8 @@ def follow(
     words.print(
         f"lower bound of the arms: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
     )
-    words.print(f"bag: {bag}")
+    if bag is not None:
+        words.print(f"bag: {bag}")
 
 
 def _shown(value: Any) -> str:
