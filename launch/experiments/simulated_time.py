@@ -160,7 +160,7 @@ class SimulatedArm:
             self._run_servo(due_s)
             self._acting_rad = joints_rad
         self._run_servo(until_s)
-        return self._servo.driven_rad + np.array(self._truth.joint_offsets_rad)
+        return np.asarray(self._servo.driven_rad + np.array(self._truth.joint_offsets_rad))
 
     def _run_servo(self, until_s: float) -> None:
         if until_s > self._now_s:

@@ -16,6 +16,7 @@ from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.self_checks import check_stiffness
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import (
     ActuationDelayEstimator,
@@ -87,6 +88,7 @@ class Planner(Node):
             self.parameters.compliance_mode,
             hysteresis_ratio=None if measured is None else float(measured.value),
         )
+        self.self_checks = check_stiffness(scene.sheet, self._calibration)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._timestamps = MonotonicTimestampFilter()
 
