@@ -222,6 +222,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "cameras_misaligned": "one of the two cameras has moved against the other",
     "marker_offset": "the finger's marker is not at its assumed position",
     "servo_lag": "the lag of the arm differs from the configured one",
+    "sheet_stiffness": "the sheet is not as stiff as the scene states",
     "arm_not_following": "the arm does not do the commanded motion",
 }
 """Findings by the cause that a self-check suspects."""
@@ -232,11 +233,19 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "marker_offset": "Put the marker back where it was, or calibrate its offset again.",
     "servo_lag": "The measured lag is used. Check the payload and filters of the arm, or set "
     "`servo_lag_s` of its bridge to the measured lag.",
+    "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated value over the "
+    "thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",
 }
 """Remedies by the cause that a self-check suspects."""
 
-_SHOWN_UNITS = {"m": ("mm", 1e3), "s": ("ms", 1e3), "px": ("px", 1.0), "rad": ("mrad", 1e3)}
+_SHOWN_UNITS = {
+    "m": ("mm", 1e3),
+    "s": ("ms", 1e3),
+    "px": ("px", 1.0),
+    "rad": ("mrad", 1e3),
+    "N/m": ("N/m", 1.0),
+}
 
 
 def describe_self_check(check: SelfCheck) -> str:

@@ -159,8 +159,8 @@ class SheetTarget(Message):
     push_depth_m: NonNegative = Field(description="depth of the finger in the undeformed object")
     normal_offset_m: Finite = Field(
         default=0.0,
-        description="distance of the sheet behind the object's tangent plane, where it has the "
-        "object's force; negative: in front of it",
+        description="distance of the sheet's surface behind the object's tangent plane, where it "
+        "has the object's force; negative: in front of it. The edges are further behind by the sag",
     )
 
 
@@ -431,10 +431,12 @@ SuspectedCause = Literal[
     "marker_offset",
     "servo_lag",
     "arm_not_following",
+    "sheet_stiffness",
 ]
 """Explanation of a residual: the stereo camera is not where the scene says; one of its two cameras
 has moved against the other; the marker is not at the assumed offset from the finger's pad; an arm
-lags more or less than configured; an arm does not do the commanded motion."""
+lags more or less than configured; an arm does not do the commanded motion; the calibrated sheet is
+not as stiff as the scene states."""
 
 
 class SelfCheck(MessagePart):
@@ -442,7 +444,7 @@ class SelfCheck(MessagePart):
 
     cause: SuspectedCause
     subject: str = Field(default="", description="device concerned, if there are several")
-    unit: Literal["m", "s", "px", "rad"]
+    unit: Literal["m", "s", "px", "rad", "N/m"]
     value: Finite = Field(description="measured, mean over some seconds")
     expected: Finite = Field(description="value if everything is as assumed")
     threshold: Positive = Field(description="maximum deviation of an apparatus in tolerance")

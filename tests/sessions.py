@@ -38,6 +38,7 @@ from flexsheet.nodes.models.rigid import (
 )
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
+from tests.scenes import make_weightless
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ OFF_M, TURNED_RAD = 2e-4, 3e-3
 LATENCY_S = 0.008
 FAULT_S, ESTOP_S, SILENCE_S, BOOKMARK_S = 2.0, 2.1, (1.0, 1.8), 1.5
 ENDS_S = 3.0
-SCENE: Scene = load_scene(Path("launch/scenes/cylinder.yaml"))
+SCENE: Scene = make_weightless(load_scene(Path("launch/scenes/cylinder.yaml")))
 
 
 def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetTarget:

@@ -24,6 +24,7 @@ from flexsheet.launch.experiments.offline import (
     Metric,
     NodeCalibrations,
     OfflineEvaluator,
+    compute_history_ratios,
     exceeded_tolerances,
 )
 from flexsheet.launch.experiments.ports import choose_ports
@@ -299,6 +300,18 @@ def test_each_parameter_is_evaluated_or_says_why_not() -> None:
     )
 
 
+def test_the_history_of_the_rubber_raises_the_force_inwards_and_lowers_it_outwards() -> None:
+    def ratios(**sheet: float) -> np.ndarray:
+        given = Apparatus.model_validate({"scene": "cylinder", "sheet": sheet})
+        return compute_history_ratios(given)
+
+    np.testing.assert_array_equal(ratios(), 1.0)
+    inwards, outwards = ratios(hysteresis_ratio=0.1)
+    assert inwards > 1.02
+    assert outwards < 0.98
+    assert ratios(creep_ratio_per_decade=0.05)[0] > ratios(creep_ratio_per_decade=0.05)[1]
+
+
 def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"sheet.modulus_ratio": 10.0, "camera.position_offset_m": 0.3}
 
@@ -310,9 +323,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return {"parameter": trial["parameter"], "effects": effects}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
-    names = ",".join(
-        [*sizes, "arms.*.servo_lag_s", "sheet.creep_ratio_per_decade", "finger.hand_mass_kg"]
-    )
+    names = ",".join([*sizes, "arms.*.servo_lag_s", "eyes.sway_m", "finger.hand_mass_kg"])
     arguments = ["experiment", "sensitivity", "--parameters", names, "--output", str(tmp_path)]
     printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
     result = json.loads(printed.stdout)
@@ -326,13 +337,13 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert result["ranking"][0] == {
         "parameter": "sheet.modulus_ratio",
         "share": pytest.approx(20.0),
-        "metric": "image_mm",
+        "metric": "sheet_mm",
     }
     by_parameter = {row["parameter"]: row for row in result["rows"]}
     assert by_parameter["sheet.modulus_ratio"]["fingertip_mm"] == 0.0
     assert by_parameter["arms.*.servo_lag_s"]["evaluation"] == "not_measured"
     assert by_parameter["arms.*.servo_lag_s"]["sheet_mm"] is None
-    assert by_parameter["sheet.creep_ratio_per_decade"]["evaluation"] == "not_measured"
+    assert by_parameter["eyes.sway_m"]["evaluation"] == "not_measured"
     assert by_parameter["finger.hand_mass_kg"]["evaluation"] == "not_simulated"
     assert Path(result["figure"]).stat().st_size > 1000
 

@@ -16,13 +16,15 @@ import pytest
 
 from flexsheet.launch.health.doctor_hosts import check_apparatus
 from flexsheet.launch.health.probe import HostProbe, Reachability
-from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES
+from flexsheet.messages.sheet_calibration import Fitted, SheetCalibration
 from flexsheet.messages.types import SelfCheck, Status, StereoPair
 from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
+from flexsheet.nodes.planner.self_checks import check_stiffness
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
@@ -308,11 +310,35 @@ def test_doctor_and_console_show_the_cause_with_its_remedy() -> None:
     assert "measured 52.00 ms, expected 30.00" in text
     assert "servo_lag_s" in text
     probe = HostProbe("main", Reachability.RESPONDING, nodes={status.node: status})
-    (finding,) = check_apparatus(probe)
+    (finding,) = check_apparatus(probe, [])
     assert (finding.check, finding.state) == ("self-check", "warning")
     assert finding.remedy == SELF_CHECK_REMEDIES["servo_lag"]
     fine = status.model_copy(
         update={"self_checks": (check.model_copy(update={"suspected": False}),)}
     )
     probe = HostProbe("main", Reachability.RESPONDING, nodes={status.node: fine})
-    assert [one.state for one in check_apparatus(probe)] == ["ok"]
+    assert [one.state for one in check_apparatus(probe, [])] == ["ok"]
+
+
+def test_doctor_says_which_parameters_the_checks_need() -> None:
+    plan = load_graph(Path("launch") / "demo.yaml")
+    probe = HostProbe("main", Reachability.RESPONDING)
+    (found,) = check_apparatus(probe, list(plan.nodes.values()))
+    assert found.state == "ok"
+    for parameter in ("reference_marks_world_m", "touch_point_world_m", "sheet_calibration"):
+        assert parameter in found.what
+
+
+@pytest.mark.parametrize(("ratio", "suspected"), [(0.8, True), (0.97, False), (1.2, True)])
+def test_a_wrong_modulus_is_named_where_the_sheet_is_calibrated(
+    ratio: float, suspected: bool
+) -> None:
+    sheet = SCENE.sheet
+    calibration = SheetCalibration.model_construct(
+        modulus_thickness_n_per_m=Fitted(
+            value=ratio * sheet.young_modulus_pa * sheet.thickness_m, standard_deviation=2.0
+        )
+    )
+    (check,) = check_stiffness(sheet, calibration)
+    assert (check.cause, check.suspected) == ("sheet_stiffness", suspected)
+    assert check_stiffness(sheet, None) == ()

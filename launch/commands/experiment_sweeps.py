@@ -229,6 +229,13 @@ def follow(
     scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
+    simulated_time: Annotated[
+        bool,
+        typer.Option(
+            "--simulated-time",
+            help="Run tracking, planning and arms in simulated time, without a graph.",
+        ),
+    ] = False,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -241,7 +248,7 @@ def follow(
 
     given = with_scene(settings, scene)
     path = load_path(launch_file, finger_path, given)
-    bag = make_result_folder(output, "follow") / "follow.mcap"
+    bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:
         result = experiment.run_follow(launch_file, given, bag, path, progress, apparatus=apparatus)
     if as_json:
@@ -252,7 +259,8 @@ def follow(
     words.print(
         f"lower bound of the arms: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
     )
-    words.print(f"bag: {bag}")
+    if bag is not None:
+        words.print(f"bag: {bag}")
 
 
 def _shown(value: Any) -> str:

@@ -4,8 +4,8 @@ The bound is the optimum of a linear program over the whole recording. It assume
 
 - the future of the finger is known, so delays, tracking and prediction cost nothing;
 - the sheet rolls on the undeformed object without slip, with a constant stretch;
-- joints obey their ranges, speeds and accelerations, and flanges the scene's tool speed; there is
-  no servo lag, and no limit of the jerk;
+- joints obey their ranges, speeds and accelerations, and the ends of the clamped edges the scene's
+  tool speed, as in the bridges; there is no servo lag, and no limit of the jerk;
 - outside of contact the sheet may move as it likes;
 - small deviations of the contact move the joints linearly.
 
@@ -38,6 +38,7 @@ from flexsheet.launch.experiments.run import (
     require_scene,
     run_experiment,
 )
+from flexsheet.launch.experiments.simulated_time import follow_in_simulated_time
 from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges, pose_matrix
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
@@ -49,9 +50,9 @@ from flexsheet.nodes.twin.arms import (
     ACCELERATION_RAD_PER_S2,
     RANGE_RAD,
     SPEED_RAD_PER_S,
-    forward,
 )
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
+from flexsheet.nodes.twin.finger import validate_path
 from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -246,13 +247,14 @@ class FollowedContact:
         return sheet.rolled_to(found.point, found.normal)
 
     def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
-        """Return joints and flange positions over the deviation of the contact.
+        """Return joints and ends of the clamped edges over the deviation of the contact.
 
         The deviation is that along the sheet's x and y over the object, and along its normal, m.
         reachable gets whether the arms reach each nominal sheet; the values of others are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
-        flanges = np.full((len(sheets), 4, 2, 3), np.nan)
+        ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
+        half_m = 0.5 * self._scene.sheet.height_m
         guesses = [START_GUESS_RAD, START_GUESS_RAD]
         for number, sheet in enumerate(sheets):
             try:
@@ -263,14 +265,14 @@ class FollowedContact:
                         if case == 0:
                             guesses[side] = found
                         joints[number, case, side] = found
-                        flange = arm.world_from_base @ forward(found)
-                        flanges[number, case, side] = flange[:3, 3]
+                        along_edge = half_m * edge[:3, 1]
+                        ends[number, case, side] = edge[:3, 3] + [-along_edge, along_edge]
                 reachable.append(True)
             except ValueError:
-                joints[number] = flanges[number] = np.nan
+                joints[number] = ends[number] = np.nan
                 reachable.append(False)
         joint = joints.reshape(len(sheets), 4, 12)
-        along = np.einsum("ncsx,dx->ncsd", flanges, SPEED_DIRECTIONS).reshape(len(sheets), 4, -1)
+        along = np.einsum("ncsex,dx->ncsed", ends, SPEED_DIRECTIONS).reshape(len(sheets), 4, -1)
         values = np.concatenate([joint, along], axis=2)
         slopes = (values[:, 1:] - values[:, :1]) / DEVIATION_M
         count = along.shape[2]
@@ -379,25 +381,34 @@ def _windows(reachable: Bools) -> list[slice]:
 def run_follow(
     launch_file: Path,
     settings: Sequence[str],
-    bag: Path,
+    bag: Path | None,
     path: FingerPath,
     progress: Progress,
     *,
     apparatus: str | None = None,
 ) -> dict[str, Any]:
-    """Follow a path in a graph; return the results of `experiment follow --json`."""
+    """Follow a path in a graph; return the results of `experiment follow --json`.
+
+    bag: of the graph; None: in simulated time, without a graph.
+    """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()
-    procedure = make_stroke_procedure([], progress, path=path)
-    run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
-    followed = read_followed_path(bag, path.label)
-    recorded = read_gestures(bag)
-    begin_ns, end_ns = recorded.windows_ns[path.label]
-    inside = (recorded.truth.times_ns >= begin_ns) & (recorded.truth.times_ns <= end_ns)
-    times_s = np.asarray((recorded.truth.times_ns[inside] - begin_ns) * 1e-9, dtype=np.float64)
-    bound = bound_errors(
-        scene, times_s, recorded.truth.positions[inside], progress, apparatus=truth
-    )
+    if bag is None:
+        progress("following in simulated time")
+        followed = {"path": path.label, **follow_in_simulated_time(scene, path, truth)}
+        finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+        times_s = np.arange(0.0, finger.duration_s, 0.5 * STEP_S)
+        positions = np.array([finger.at(time_s)[0] for time_s in times_s])
+    else:
+        procedure = make_stroke_procedure([], progress, path=path)
+        run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
+        followed = read_followed_path(bag, path.label)
+        recorded = read_gestures(bag)
+        begin_ns, end_ns = recorded.windows_ns[path.label]
+        inside = (recorded.truth.times_ns >= begin_ns) & (recorded.truth.times_ns <= end_ns)
+        times_s = np.asarray((recorded.truth.times_ns[inside] - begin_ns) * 1e-9, np.float64)
+        positions = recorded.truth.positions[inside]
+    bound = bound_errors(scene, times_s, positions, progress, apparatus=truth)
     contact = followed["contact"]["true_delta_d_mm"]
     return {
         **followed,
@@ -406,5 +417,5 @@ def run_follow(
             contact["mean"] / bound["mean"] if contact and bound["mean"] > 0.0 else None
         ),
         "apparatus": "nominal" if truth is None else truth.origin,
-        "bag": str(bag),
+        "bag": None if bag is None else str(bag),
     }

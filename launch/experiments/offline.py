@@ -1,9 +1,9 @@
 """Evaluate an apparatus without a graph: fingertip, sheet, image and felt force at rest.
 
-The nodes' methods get what the scene states, and the simulator's models get what is true. Nothing
-moves, so servo lag, delays, frame rate, tremor and backlash have no effect here; a graph measures
-those. Images have no noise. The references share no code with the methods: own camera, arms,
-membrane and eye.
+The nodes' methods get what the scene states, and the simulator's models get what is true. Only the
+rubber remembers a push in and out. Nothing else moves, so servo lag, delays, frame rate, tremor and
+backlash have no effect here; a graph measures those. Images have no noise. The references share no
+code with the methods: own camera, arms, membrane and eye.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges, pose_matrix
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -28,7 +29,8 @@ from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_ca
 from flexsheet.nodes import node_class
 from flexsheet.nodes.models.rigid import apply, inverse, transform
 from flexsheet.nodes.models.shapes import make_shape
-from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.models.sheet.tension import compute_sag_m
+from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
 from flexsheet.nodes.renderer.gl import headless_context
@@ -38,10 +40,11 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, meas
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
+from flexsheet.nodes.twin.force_history import ForceHistory, apply_history
 from flexsheet.nodes.twin.membrane import NotConvergedError, solve
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
-from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -55,6 +58,10 @@ STROKE_RATIOS = (0.0, 0.5, 1.0)
 
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
 """Depths of the pushes whose force is compared; limited to half and all of the scene's depth."""
+
+MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
+"""Time in which the force of a push rises to the evaluated one, and the force at which the finger
+turns back over the evaluated one."""
 
 MIN_FORCE_N = 0.1
 """Smallest force to which an error is related; nobody feels a fraction of a smaller one."""
@@ -218,8 +225,12 @@ class OfflineEvaluator:
         arms = ArmPair(self._scene, apparatus)
         sheet = image = felt = expected = None
         if Metric.SHEET in metrics:
+            surface = SheetSurface.of(self._scene, apparatus)
             sheet = np.array(
-                [self._sheet_error(arms, *pair) for pair in zip(contacts, tip_errors, strict=True)]
+                [
+                    self._sheet_error(arms, surface, *pair)
+                    for pair in zip(contacts, tip_errors, strict=True)
+                ]
             )
         if Metric.FORCE in metrics:
             felt, expected = self._compare_forces(scene, apparatus, arms, tip_errors[0])
@@ -281,10 +292,23 @@ class OfflineEvaluator:
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
-        width_m = self._scene.sheet.width_m * self._stretch_ratio
-        return place_edges(contact.world_from_sheet, width_m)
+        """Return the edges of the sheet, behind the contact's plane by the sag of the middle."""
+        sheet = self._scene.sheet
+        distance_m = sheet.width_m * self._stretch_ratio
+        sag_m = compute_sag_m(
+            make_rubber(sheet),
+            contact.normal,
+            density_kg_per_m3=sheet.density_kg_per_m3,
+            edge_distance_m=distance_m,
+            across=0.5,
+        )
+        pose = contact.world_from_sheet.copy()
+        pose[:3, 3] -= sag_m * contact.normal
+        return place_edges(pose, distance_m)
 
-    def _sheet_error(self, arms: ArmPair, contact: Contact, tip_error: Floats) -> Floats:
+    def _sheet_error(
+        self, arms: ArmPair, surface: SheetSurface, contact: Contact, tip_error: Floats
+    ) -> Floats:
         """Return the point under the true finger minus the sheet's contact point, (3,), world."""
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
@@ -293,13 +317,26 @@ class OfflineEvaluator:
         before = contact.world_from_sheet
         rolled_m = before[:3, :3].T @ (believed - before[:3, 3])
         rolled_m[2] = 0.0
-        left, right = arms.hold(self._edges(self._lay_sheet(believed, normal, rolled_m)))
-        plane = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
-        plane /= np.linalg.norm(plane)
-        centre = apply(object_from_world, 0.5 * (left[:3, 3] + right[:3, 3]))
+        laid = self._lay_sheet(believed, normal, rolled_m)
+        left, right = arms.hold(self._edges(laid))
+        across = right[:3, 3] - left[:3, 3]
+        plane = np.cross(across, left[:3, 1] + right[:3, 1])
+        distance_m = np.linalg.norm(across)
+        planes = surface.find_tangent_planes(
+            SheetPlanes(
+                0.5 * (left[:3, 3] + right[:3, 3])[None],
+                (plane / np.linalg.norm(plane))[None],
+                (across / distance_m)[None],
+                np.array([distance_m]),
+            ),
+            contact.point[None],
+            np.array([0.0, 1.0, 0.0]),
+        )
         true_foot = self._shape.closest(apply(object_from_world, contact.point)[None])
         presented = project_presented_point(
-            true_foot, centre[None], (object_from_world[:3, :3] @ plane)[None]
+            true_foot,
+            apply(object_from_world, planes.points),
+            planes.normals @ self._world_from_object[:3, :3],
         )
         error = (true_foot.point - presented)[0]
         return np.asarray(self._world_from_object[:3, :3] @ error)
@@ -307,11 +344,16 @@ class OfflineEvaluator:
     def _compare_forces(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the felt forces (k,) and those of the planner's model at the same pushes, N."""
+        """Return the felt forces (k,) and those of the planner's model at the same pushes, N.
+
+        Each push has two: while the finger moves in, and while it moves out.
+        """
         contact = self._touch(0.0)
         left, right = arms.hold(self._edges(contact))
         most_m = self._scene.working_range.push_depth_m
-        felt, expected = [], []
+        history_ratios = compute_history_ratios(apparatus)
+        felt: list[float] = []
+        expected: list[float] = []
         for depth_m, limit_m in zip(MAX_FORCE_DEPTHS_M, (0.5 * most_m, most_m), strict=True):
             true_m = min(depth_m, limit_m)
             pushed = solve(
@@ -320,8 +362,9 @@ class OfflineEvaluator:
                 right,
                 finger_tip=contact.point - true_m * contact.normal,
                 finger_radius_m=scene.finger.radius_m,
+                friction_coefficient=true_friction(apparatus),
             )
-            felt.append(float(pushed.finger_force_n @ contact.normal))
+            felt.extend((history_ratios * (pushed.finger_force_n @ contact.normal)).tolist())
             believed_m = true_m - float(tip_error @ contact.normal)
             model = self._force_model.evaluate(
                 self._stretch_ratio,
@@ -329,7 +372,7 @@ class OfflineEvaluator:
                 position_m=(0.0, 0.0),
                 finger_radius_m=self._scene.finger.radius_m,
             )
-            expected.append(float(model.force_n[0]))
+            expected.extend([float(model.force_n[0])] * len(history_ratios))
         return np.array(felt), np.array(expected)
 
     def _compare_images(
@@ -370,6 +413,7 @@ class OfflineEvaluator:
             *true_edges,
             finger_tip=tip,
             finger_radius_m=scene.finger.radius_m,
+            friction_coefficient=true_friction(apparatus),
         )
         eye = scene.eyes.centre_world_m
         x, y = (seen(one, sheet, scene, eye=eye, metres_per_px=METRES_PER_PX) for one in ramps)
@@ -431,6 +475,20 @@ class OfflineEvaluator:
         points = np.full((size, size, 3), np.nan)
         points[hit] = rays.origin + directions[hit] / hits.inverse_range[hit][:, None]
         return (rays.origin + directions)[..., :2], points
+
+
+def compute_history_ratios(apparatus: Apparatus) -> Floats:
+    """Return the force of the rubber over that of an elastic sheet (2,), moving in and out.
+
+    The elastic force rises to `TURNING_RATIO` of the evaluated one and falls again, linearly.
+    """
+    history = ForceHistory.of(apparatus)
+    if history is None:
+        return np.ones(2)
+    elastic = np.concatenate([np.linspace(0.0, TURNING_RATIO, 51), np.linspace(1.0, 0.0, 41)])
+    times_s = MOVING_IN_S * np.concatenate([elastic[:51], 2.0 * TURNING_RATIO - elastic[51:]])
+    forces = apply_history(history, times_s, elastic)
+    return np.array([np.interp(1.0, elastic[:51], forces[:51]), forces[51]])
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:

@@ -56,9 +56,6 @@ TIMING = frozenset(
         "arms.*.controller_period_s",
         "arms.*.controller_jitter_s",
         "arms.*.backlash_rad",
-        "sheet.friction_coefficient",
-        "sheet.hysteresis_ratio",
-        "sheet.creep_ratio_per_decade",
         "finger.marker_shape",
         "finger.marker_tilt_rad",
         "finger.tremor_frequency_hz",
@@ -73,13 +70,13 @@ TIMING = frozenset(
 )
 """Parameters without effect at rest, or on a noise-free image of a marker's centre.
 
-Stroke and fingertip of a graph show the effect of all but those of sheet, eyes and projector.
+Stroke and fingertip of a graph show the effect of all but those of eyes and projector.
 """
 
 AFFECTED: dict[str, frozenset[Metric]] = {
     "camera": frozenset(Metric),
     "arms": frozenset({Metric.SHEET, Metric.IMAGE, Metric.FORCE}),
-    "sheet": frozenset({Metric.IMAGE, Metric.FORCE}),
+    "sheet": frozenset({Metric.SHEET, Metric.IMAGE, Metric.FORCE}),
     "finger": frozenset(Metric),
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
@@ -104,7 +101,7 @@ def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:
         return EvaluationKind.NOT_SIMULATED
     if parameter not in TIMING:
         return EvaluationKind.OFFLINE
-    in_motion = with_graph and parameter.partition(".")[0] not in ("sheet", "eyes", "projector")
+    in_motion = with_graph and parameter.partition(".")[0] not in ("eyes", "projector")
     return EvaluationKind.GRAPH if in_motion else EvaluationKind.NOT_MEASURED
 
 

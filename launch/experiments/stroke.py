@@ -12,6 +12,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.lag import estimate_lag_s
+from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
@@ -179,7 +180,8 @@ class StrokeRecording:
     Edges are rows (9,): centre of the clamped edge, its y axis and its z axis, in the world.
     delays_s: from the middle of an exposure to each event that it caused, by event. drops: number
     of lost or refused messages, except those that a `latest` reader skipped.
-    apparatus: where the truth came from.
+    apparatus: where the truth came from. surface, true_surface: of the unpushed sheet by the scene,
+    and the true one.
     """
 
     scene: Scene
@@ -193,6 +195,8 @@ class StrokeRecording:
     drops: int
     apparatus: str = "nominal"
     frames: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
+    surface: SheetSurface | None = None
+    true_surface: SheetSurface | None = None
 
     def arm_delays_s(self) -> Floats:
         """Return the delays (n,) from exposure to the written command, of both arms, s."""
@@ -330,6 +334,8 @@ def read_recording(bag: Path) -> StrokeRecording:
         drops=sum(losses.values()),
         apparatus="nominal" if apparatus is None else apparatus.origin,
         frames=frames,
+        surface=SheetSurface.of(scene),
+        true_surface=SheetSurface.of(scene, apparatus),
     )
 
 
@@ -337,11 +343,8 @@ def compute_sheet_planes(
     edges: tuple[SampledMotion, SampledMotion],
     world_from_object: Floats,
     times_ns: NDArray[np.int64],
-) -> tuple[Floats, Floats]:
-    """Return centres (n, 3) m and unit normals (n, 3) of the plane through both edges.
-
-    They are in the object's frame.
-    """
+) -> SheetPlanes:
+    """Return the planes through both edges, in the object's frame."""
     object_from_world = inverse(world_from_object)
     left, right = (
         np.concatenate(
@@ -357,23 +360,21 @@ def compute_sheet_planes(
     across = right[:, :3] - left[:, :3]
     normal = np.cross(across, left[:, 3:6] + right[:, 3:6])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return 0.5 * (left[:, :3] + right[:, :3]), normal
+    distance = np.linalg.norm(across, axis=1)
+    return SheetPlanes(
+        0.5 * (left[:, :3] + right[:, :3]), normal, across / distance[:, None], distance
+    )
 
 
-def find_presented_points(
-    edges: tuple[SampledMotion, SampledMotion],
-    world_from_object: Floats,
-    times_ns: NDArray[np.int64],
-    x_m: Floats,
-) -> tuple[Floats, Floats]:
+def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
     """Return the contact points D' (n, 3) of the sheet in the object's frame, and angles (n,).
 
     D' is the plane's point nearest to the cylinder's axis at x = `x_m` (n,). The angle is that of
     the plane's normal about the axis, rad.
     """
-    centre, normal = compute_sheet_planes(edges, world_from_object, times_ns)
+    normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
-    distance = np.einsum("ij,ij->i", centre - axis_point, normal)
+    distance = np.einsum("ij,ij->i", planes.points - axis_point, normal)
     return axis_point + distance[:, None] * normal, np.arctan2(normal[:, 1], normal[:, 2])
 
 
@@ -406,32 +407,35 @@ def sheet_errors(
     normal_offset_m: Floats | float = 0.0,
     *,
     shape: Shape | None = None,
+    surface: SheetSurface | None = None,
 ) -> tuple[Floats, Floats]:
     """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any object shape.
 
     D is the object's point nearest to the finger. The sheet renders the undeformed surface, so the
     push depth is not an error. normal_offset_m (n,): commanded depth of the sheet below that
     surface. On a cylinder, delta theta is the angle about its axis, as in the paper; on other
-    shapes, the angle between the normals. shape: that of the scene, if already computed.
+    shapes, the angle between the normals. shape: that of the scene, if already computed. surface:
+    of the unpushed sheet; None for a flat one.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.interpolate(times_ns))
+    planes = compute_sheet_planes(edges, world_from_object, times_ns)
+    if surface is not None:
+        planes = surface.find_tangent_planes(planes, points, world_from_object[1, :3])
     if not isinstance(scene.object.geometry, Cylinder):
         foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
-        centre, normal = compute_sheet_planes(edges, world_from_object, times_ns)
+        normal = planes.normals
         on_surface = (
             foot.point - np.broadcast_to(normal_offset_m, len(points))[:, None] * foot.normal
         )
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
-        error = on_surface - project_presented_point(foot, centre, normal)
+        error = on_surface - project_presented_point(foot, planes.points, normal)
         return np.linalg.norm(error, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
     radius = require_cylinder(scene).radius_m - normal_offset_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
-    presented_points, presented_angles = find_presented_points(
-        edges, world_from_object, times_ns, points[:, 0]
-    )
+    presented_points, presented_angles = find_presented_points(planes, points[:, 0])
     delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi
     return np.linalg.norm(on_surface - presented_points, axis=1), np.abs(delta_theta)
 
@@ -516,8 +520,16 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
             f'the bag contains {len(times)} fingertips of "{label}", at least 10 are required'
         )
     scene = recording.scene
-    delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
-    true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, exposures)
+    delta_d, delta_theta = sheet_errors(
+        scene,
+        recording.fingertip,
+        recording.measured_edges,
+        times,
+        surface=recording.surface,
+    )
+    true_d, true_theta = sheet_errors(
+        scene, recording.finger, recording.true_edges, exposures, surface=recording.true_surface
+    )
     smooth = smooth_motion(recording.measured, times)
     world_from_object = object_pose(scene)
     true_points = recording.finger.interpolate(times)
@@ -547,7 +559,8 @@ def compute_arcs(
     """Return arc lengths (n, 2) m around the cylinder of contact line and points."""
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
-    _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])
+    planes = compute_sheet_planes(edges, world_from_object, times_ns)
+    _, angles = find_presented_points(planes, local[:, 0])
     both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
     return np.asarray(require_cylinder(scene).radius_m * both)
 
@@ -601,9 +614,8 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 
     true_ns = recording.true_edges[0].times_ns
     true_ns = true_ns[recording.true_edges[1].covers(true_ns)]
-    _, angles = find_presented_points(
-        recording.true_edges, world_from_object, true_ns, np.zeros(len(true_ns))
-    )
+    planes = compute_sheet_planes(recording.true_edges, world_from_object, true_ns)
+    _, angles = find_presented_points(planes, np.zeros(len(true_ns)))
     sheet = [
         (time, compute_arcs_m(row[None, 3:])[0]) for time, row in within(recording.frames.sheet)
     ]

@@ -150,13 +150,21 @@ def evaluate_probes(
         found.append(_check_nodes(plan, probe))
         found.append(_check_rates(probe))
         found += _check_devices(plan.nodes_on(host), probe)
-        found += check_apparatus(probe)
+        found += check_apparatus(probe, plan.nodes_on(host))
         found += _check_resources(probe)
     return found
 
 
-def check_apparatus(probe: HostProbe) -> Iterator[HostFinding]:
-    """Report the causes that the self-checks of a host's nodes suspect."""
+REQUIRED_FOR_CHECKS = {
+    "reference_marks_world_m": "the pose of the camera",
+    "touch_point_world_m": "the marker on the finger",
+    "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
+}
+"""What is checked only with a value of this parameter."""
+
+
+def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:
+    """Report the causes that the self-checks of a host's nodes suspect, and what is not checked."""
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
@@ -167,8 +175,16 @@ def check_apparatus(probe: HostProbe) -> Iterator[HostFinding]:
             describe_self_check(one),
             SELF_CHECK_REMEDIES[one.cause],
         )
-    if checks and not suspected:
-        yield HostFinding(probe.host, SELF_CHECK, "ok", f"{len(checks)} residuals as expected")
+    missing = [
+        f"{what}: set `{parameter}` of {node.name}"
+        for node in nodes
+        for parameter, what in REQUIRED_FOR_CHECKS.items()
+        if parameter in node.parameters and not node.parameters[parameter]
+    ]
+    if not suspected and (checks or missing):
+        unchecked = (f"no check of {one}" for one in missing)
+        text = "; ".join([f"{len(checks)} residuals as expected", *unchecked])
+        yield HostFinding(probe.host, SELF_CHECK, "ok", text)
 
 
 def _check_reachability(

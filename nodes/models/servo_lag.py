@@ -36,6 +36,9 @@ motion: an arm that does not move, moves otherwise, or has reversed signs."""
 CORRELATION_S = 0.1
 """Time in which errors of the difference are correlated; it reduces the number of samples."""
 
+MIN_NOISE_RATIO = 0.2
+"""Least part of the difference's variance that counts as noise; real servos are no exact model."""
+
 MAX_UNCERTAINTY_S = 0.004
 """Standard deviation of an estimate above which it is not used."""
 
@@ -194,12 +197,14 @@ class ServoLagEstimator:
         lag_s = self._bounds.clip(
             float(self._lags_s[best]) + GRID_STEP_S * min(max(shift, -0.5), 0.5)
         )
-        samples = max(self._weight / CORRELATION_S, 1.0)
-        uncertainty_s = math.sqrt(smallest / (samples * self._speed_square))
-        if not uncertainty_s <= MAX_UNCERTAINTY_S:
-            return None
         # Expansion of 1 / (1 + s L / 2)^2 against exp(-s L): the difference is (s L)^2 / 4.
         expected = 0.25 * lag_s**2 * math.sqrt(self._bend_square)
+        # A servo's distortion of the motion is no noise, and grows with the square of the lag.
+        noise = max(smallest - expected**2, MIN_NOISE_RATIO * smallest)
+        samples = max(self._weight / CORRELATION_S, 1.0)
+        uncertainty_s = math.sqrt(noise / (samples * self._speed_square))
+        if not uncertainty_s <= MAX_UNCERTAINTY_S:
+            return None
         return LagEstimate(lag_s, uncertainty_s, math.sqrt(smallest), expected)
 
 

@@ -165,5 +165,34 @@ def _desired_velocities(
         max_acceleration=bounds.stretch_acceleration_per_s2,
         step_s=step_s,
     )
-    scale = edges.speed_scale(measure_length(linear), measure_length(angular))
-    return np.concatenate([scale * linear, scale * angular, stretch_rate])
+    scales = share_edge_speed(
+        edges,
+        (measure_length(linear), measure_length(angular)),
+        (measure_length(displacement), measure_length(rotation)),
+    )
+    return np.concatenate([scales[0] * linear, scales[1] * angular, stretch_rate])
+
+
+def share_edge_speed(
+    edges: EdgeBound, speeds: tuple[float, float], distances: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the factors (0..1) on linear and angular speed that meet the edges' speed limit.
+
+    speeds, distances: linear (m/s, m) and angular (rad/s, rad), to the target.
+
+    Each gets its part of the remaining path of the edges, so that both arrive together; what one
+    leaves unused the other gets. With one common factor, a short displacement took half of the
+    speed from a long rotation.
+    """
+    limit, reach = edges.speed_m_per_s, edges.reach_m
+    linear, angular = speeds[0], reach * speeds[1]
+    if linear + angular <= limit:
+        return 1.0, 1.0
+    path_m = distances[0] + reach * distances[1]
+    fraction = distances[0] / path_m if path_m > 0.0 else linear / (linear + angular)
+    max_linear = max(fraction * limit, limit - angular)
+    max_angular = max((1.0 - fraction) * limit, limit - linear)
+    return (
+        min(1.0, max_linear / linear) if linear > 0.0 else 1.0,
+        min(1.0, max_angular / angular) if angular > 0.0 else 1.0,
+    )

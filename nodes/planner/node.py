@@ -23,6 +23,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import load_force_model
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.self_checks import check_stiffness
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import (
     ActuationDelayEstimator,
@@ -107,6 +108,7 @@ class Planner(Node):
             bounds=bounds,
             delay_s=self._horizon_s,
         )
+        self.self_checks = check_stiffness(scene.sheet, self._calibration)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._timestamps = MonotonicTimestampFilter()
 

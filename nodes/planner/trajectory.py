@@ -55,7 +55,7 @@ class PlannedStep:
 
     trajectory: motion after it, if no newer target arrives.
     contact_sheet_m: (x, y) of the contact on the sheet.
-    normal_offset_m: distance of the sheet behind the object's tangent plane.
+    normal_offset_m: distance of the sheet's surface behind the object's tangent plane.
     """
 
     motion: SheetMotion
@@ -152,10 +152,10 @@ class SheetTrajectoryPlanner:
             compliance.stretch_ratio,
             0.0,
         )
-        self._normal_offset_m += self._sag_m(target, float(command.contact.position_sheet_m[0]))
-        self._advance(
-            offset_along_normal(target, self._normal_offset_m, offset_rate_m_per_s), step_s
+        behind_m = self._normal_offset_m + self._sag_m(
+            target, float(command.contact.position_sheet_m[0])
         )
+        self._advance(offset_along_normal(target, behind_m, offset_rate_m_per_s), step_s)
         return self._make_step(command)
 
     def _update_offset(
@@ -193,7 +193,7 @@ class SheetTrajectoryPlanner:
     def _sag_m(self, sheet: SheetMotion, x_m: float) -> float:
         """Return the deflection of the sheet by its weight along its normal, x_m from its centre.
 
-        The sheet is placed behind its tangent plane by this, so that its surface is in the plane.
+        The sheet's edges are placed behind its tangent plane by this, so that its surface is in it.
         """
         distance_m = self._rubber.width_m * sheet.stretch_ratio
         return float(

@@ -9,6 +9,7 @@ the reference is the surface itself, as in the paper.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
+from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     make_edge_row,
@@ -120,6 +122,7 @@ class SheetErrors:
         self._scene: Scene | None = None
         self._shape: Shape | None = None
         self._apparatus: Apparatus | None = None
+        self._surfaces: dict[str, SheetSurface] = {}
         self._edge_poses: dict[str, Floats] = {}
         self._true_edge_poses: dict[str, Floats] = {}
         self.measured, self.true = MotionBuffer(), MotionBuffer()
@@ -171,6 +174,10 @@ class SheetErrors:
         if self._scene is not None:
             arms = apply_apparatus(self._scene, self._apparatus).arms
             self._true_edge_poses = {"left": _edge(arms.left), "right": _edge(arms.right)}
+            self._surfaces = {
+                "measured": SheetSurface.of(self._scene),
+                "true": SheetSurface.of(self._scene, self._apparatus),
+            }
 
     def _add_edge(self, side: MotionBuffer, name: str, flange: Floats, source_ns: int) -> None:
         if self._scene is not None:
@@ -215,11 +222,20 @@ class SheetErrors:
                 continue
             finger, edges, times_ns = complete
             if len(times_ns):
+                errors = partial(
+                    sheet_errors,
+                    scene,
+                    finger,
+                    edges,
+                    times_ns,
+                    shape=shape,
+                    surface=self._surfaces[name],
+                )
                 if any(run.stroke_s is not None for run in self.runs):
-                    found = sheet_errors(scene, finger, edges, times_ns, shape=shape)
+                    found = errors()
                     self._add_strokes(name, times_ns, *found)
                 touches, normal_offset_m = self._read_contact(times_ns)
-                found = sheet_errors(scene, finger, edges, times_ns, normal_offset_m, shape=shape)
+                found = errors(normal_offset_m=normal_offset_m)
                 self._add_errors(name, times_ns[touches], found[0][touches], found[1][touches])
                 if name == "true":
                     local = apply(inverse(object_pose(scene)), finger.interpolate(times_ns))

@@ -1,0 +1,148 @@
+"""Compute the surface of the sheet between its edges: their plane, and the sag by its weight.
+
+The sag is that of the simulator's membrane, which shares no code with the nodes' model of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+
+CELLS = 8
+"""Elements per side: the sag at the usable height then differs by 0.3 % from that of 32."""
+
+STRETCH_NODES = 4
+LEANS = np.array([0.35, 0.7, 1.0])
+"""Vertical components of the normal at which the membrane is solved; 0 has no sag."""
+
+STRETCH_MARGIN = 0.005
+"""Stretch ratio beyond the scene's range that the table covers; further values are clipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class SheetPlanes:
+    """Planes at several times: points (n, 3) m, unit normals and x axes (n, 3), distances of the
+    clamped edges (n,) m. The points are between the edges' centres at first.
+    """
+
+    points: Floats
+    normals: Floats
+    x_axes: Floats
+    distances_m: Floats
+
+
+class SagTable:
+    """Sag of an unpushed sheet over stretch, lean and position, from solutions of the membrane."""
+
+    def __init__(self, rubber: Rubber, min_stretch_ratio: float, max_stretch_ratio: float) -> None:
+        cosines = np.cos(np.pi * (np.arange(STRETCH_NODES) + 0.5) / STRETCH_NODES)
+        middle = 0.5 * (min_stretch_ratio + max_stretch_ratio)
+        half = 0.5 * (max_stretch_ratio - min_stretch_ratio)
+        self._stretches, self._range = middle + half * cosines, (middle - half, middle + half)
+        self._width_m = rubber.width_m
+        self._fields = [
+            [_solve_sag(rubber, stretch, lean) for lean in LEANS] for stretch in self._stretches
+        ]
+
+    def evaluate(
+        self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return the sag along the normal (n,) m, and its slopes along x and y (n,).
+
+        leans: vertical component of the normal. x_m, y_m: position from the centre.
+        """
+        stretches = np.clip(distances_m / self._width_m, *self._range)
+        by_stretch = _lagrange(self._stretches, stretches) / _compute_tension(stretches)
+        by_lean = leans * _lagrange(LEANS**2, leans**2) / LEANS[:, None]
+        across = np.clip(x_m / distances_m + 0.5, 0.0, 1.0)
+        result = np.zeros((3, len(x_m)))
+        for fields, tension, weights in zip(
+            self._fields, _compute_tension(self._stretches), by_stretch, strict=True
+        ):
+            for field, lean_weights in zip(fields, by_lean, strict=True):
+                values = [field.ev(across, y_m, dx, dy) for dx, dy in ((0, 0), (1, 0), (0, 1))]
+                result += tension * weights * lean_weights * np.array(values)
+        return result[0], result[1] / distances_m, result[2]
+
+
+def _compute_tension(stretch: Floats) -> Floats:
+    """Return the tension of a uniaxially stretched neo-Hookean sheet, without unit.
+
+    The sag times this hardly depends on the stretch, which makes the interpolation accurate.
+    """
+    return stretch - stretch**-2
+
+
+def _lagrange(nodes: Floats, at: Floats) -> Floats:
+    """Return the Lagrange polynomials (nodes, n) at positions (n,)."""
+    factors = [
+        np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
+        for node in nodes
+    ]
+    return np.array(factors)
+
+
+def _solve_sag(rubber: Rubber, stretch: float, lean: float) -> RectBivariateSpline:
+    """Return the sag over the position across (0..1) and y (m) of a sheet that leans back."""
+    cosine = np.sqrt(1.0 - lean**2)
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
+    half_m = 0.5 * stretch * rubber.width_m
+    edges = [transform(rotation, [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]
+    local = solve(rubber, *edges, cells=CELLS).positions @ rotation
+    middle = local[:, local.shape[1] // 2]
+    across = np.linspace(0.0, 1.0, local.shape[1])
+    return RectBivariateSpline(across, middle[:, 1], local[..., 2].T)
+
+
+@lru_cache(maxsize=64)
+def _cached_table(rubber: Rubber, low: float, high: float) -> SagTable:
+    return SagTable(rubber, low, high)
+
+
+@dataclass(frozen=True, slots=True)
+class SheetSurface:
+    """Surface of a scene's unpushed sheet; table: None without weight."""
+
+    table: SagTable | None
+
+    @classmethod
+    def of(cls, scene: Scene, apparatus: Apparatus | None = None) -> Self:
+        """Return the surface of the true sheet; without an apparatus, of the scene's."""
+        rubber = true_rubber(apply_apparatus(scene, apparatus).sheet, apparatus)
+        if rubber.density_kg_per_m3 == 0.0:
+            return cls(None)
+        low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
+        return cls(_cached_table(rubber, max(low - STRETCH_MARGIN, 1.01), high + STRETCH_MARGIN))
+
+    def find_tangent_planes(self, planes: SheetPlanes, points: Floats, up: Floats) -> SheetPlanes:
+        """Return the planes that touch the sheet below or above given points (n, 3).
+
+        planes: through the edges. up: unit vector (3,) against gravity, in the same frame.
+        """
+        if self.table is None:
+            return planes
+        x, z = planes.x_axes, planes.normals
+        y = np.cross(z, x)
+        offsets = points - planes.points
+        x_m, y_m = (np.einsum("ni,ni->n", offsets, axes) for axes in (x, y))
+        sag_m, slope_x, slope_y = self.table.evaluate(planes.distances_m, z @ up, x_m, y_m)
+        normals = z - slope_x[:, None] * x - slope_y[:, None] * y
+        return replace(
+            planes,
+            points=planes.points + x_m[:, None] * x + y_m[:, None] * y + sag_m[:, None] * z,
+            normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        )

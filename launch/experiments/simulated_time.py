@@ -1,0 +1,303 @@
+"""Follow a finger in simulated time: tracking, planning and both arms without a graph.
+
+The nodes' methods run at the times at which their nodes would run them: an exposure, its image, its
+target, and the period of the arms. Nothing waits and no computer is busy, so that results depend on
+the methods alone and repeat exactly. Left out are images, the path check before the first motion,
+the synchronization of the two arms and every stop; the soft body applies no force, so that the
+sheet keeps its stretch.
+
+The truth is the simulator's: camera, servos, flange compliance, and the surface of the sheet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
+from numpy.typing import NDArray
+
+from flexsheet.launch.bags.report.followed import FollowedFinger
+from flexsheet.launch.experiments.sheet_surface import SheetSurface
+from flexsheet.launch.experiments.stroke import (
+    SampledMotion,
+    make_edge_row,
+    make_motion,
+    object_pose,
+    sheet_errors,
+)
+from flexsheet.launch.experiments.true_geometry import ArmModel, pose_matrix
+from flexsheet.messages.apparatus import Apparatus, ArmTruth, nominal_apparatus
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath, Side
+from flexsheet.nodes.arm_bridge.control import FOLLOW_BOUNDS
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import extrapolate_goal
+from flexsheet.nodes.arm_bridge.limiter import limit_velocity
+from flexsheet.nodes.models.interpolation import interpolate_path
+from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
+from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.planner.timing import update_horizon_s
+from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
+from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.twin import rig
+from flexsheet.nodes.twin.arms import Servo, forward
+from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
+from flexsheet.nodes.twin.finger import validate_path
+from flexsheet.nodes.twin.sheet_pull import SheetPull
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+
+CYCLE_S = 0.0071
+"""Period of the arms' commands."""
+
+READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
+"""Time of the read-out, unless the apparatus states it; from there until the target is published;
+and from the target to the command that it causes."""
+
+PIXEL_NOISE_PX = 0.02
+PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
+SERVO_LAG_S = 0.025
+"""Lag of the simulated arms, unless the apparatus states it."""
+
+MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
+"""Parameters of the bridges."""
+
+SETTLING_S = 2.0
+"""Time in which the finger rests where the path begins, and the sheet reaches it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSettings:
+    """Differences between runs: tracking method, seed, parameters of the planner by name.
+
+    lag_known: whether the bridges know the lag of the arms, as a reference for measured lags.
+    """
+
+    tracking: str = "adaptive"
+    seed: int = 0
+    planner: Mapping[str, Any] = field(default_factory=dict)
+    lag_known: bool = False
+
+
+class MeasuredFinger:
+    """Measure and track the finger like the triangulator, with noisy pixels."""
+
+    def __init__(self, scene: Scene, settings: LoopSettings) -> None:
+        self._camera, self._geometry = scene.camera, StereoGeometry.of(scene.camera, None)
+        self._left_from_world = inverse(pose_matrix(scene.camera.world_from_left))
+        self._random = np.random.default_rng(settings.seed)
+        speed_m_per_s = scene.finger.max_speed_m_per_s
+        self._tracker = Tracker(
+            TRACKING_METHODS[settings.tracking](speed_m_per_s), TrackingSettings(speed_m_per_s)
+        )
+        self._horizons_s = np.arange(0.0, PREDICTION_S + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
+
+    def predict_path(self, at_ns: int, position_world: Floats) -> Floats:
+        """Return the path (n, 3) that is predicted from an exposure of the finger (3,)."""
+        in_left = apply(self._left_from_world, position_world)
+        in_right = apply(self._camera.right_from_left, in_left)
+        pixels = [
+            rig.pixels_of(lens, point[:2] / point[2])
+            + PIXEL_NOISE_PX * self._random.standard_normal(2)
+            for lens, point in ((self._camera.left, in_left), (self._camera.right, in_right))
+        ]
+        covariance = PIXEL_NOISE_PX**2 * np.eye(2)
+        found = measure(
+            self._geometry,
+            *pixels,
+            method=dlt,
+            left_covariance=covariance,
+            right_covariance=covariance,
+        )
+        if found is not None:
+            self._tracker.update(at_ns, found.point_world, found.covariance)
+        return self._tracker.predict_at(at_ns, self._horizons_s).path
+
+
+class SimulatedArm:
+    """One arm: the methods of its bridge, and its true servo."""
+
+    def __init__(
+        self, scene: Scene, side: Side, truth: ArmTruth, sheet: SheetMotion, *, lag_known: bool
+    ) -> None:
+        self._geometry = ArmGeometry(scene, side)
+        self._truth, self._sheet = truth, sheet
+        self._goal_rad = self._commanded_rad = self._acting_rad = self._geometry.joints_for_sheet(
+            sheet, START_GUESS_RAD
+        )
+        self._velocity = np.zeros(6)
+        lag_s = SERVO_LAG_S if truth.servo_lag_s is None else truth.servo_lag_s
+        self._servo = Servo(self._commanded_rad.copy(), lag_s, truth.backlash_rad or 0.0)
+        self._lag = ServoLagEstimator(SERVO_LAG_S, LagBounds(0.002, MAX_LAG_S))
+        self._known_lag_s: float | None = None
+        if lag_known:
+            waits_s = 0.5 * (truth.controller_period_s or 0.0)
+            self._known_lag_s = lag_s + truth.command_latency_s + waits_s
+        self._pending: deque[tuple[float, Floats]] = deque()
+        self._now_s = 0.0
+
+    @property
+    def lag_s(self) -> float:
+        """Return the lag that the bridge has measured, or knows."""
+        return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
+
+    def advance(self, until_s: float) -> Floats:
+        """Advance the servo, and return the true joints (6,)."""
+        while self._pending and self._pending[0][0] <= until_s:
+            due_s, joints_rad = self._pending.popleft()
+            self._run_servo(due_s)
+            self._acting_rad = joints_rad
+        self._run_servo(until_s)
+        return np.asarray(self._servo.driven_rad + np.array(self._truth.joint_offsets_rad))
+
+    def _run_servo(self, until_s: float) -> None:
+        if until_s > self._now_s:
+            self._servo.advance(self._acting_rad, until_s - self._now_s)
+            self._now_s = until_s
+
+    def command(self, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float) -> None:
+        """Send the command of one cycle, which covers `step_s`."""
+        goal = extrapolate_goal(
+            target, now_s - valid_at_s + self.lag_s, 0.0, max_extrapolation_s=MAX_EXTRAPOLATION_S
+        )
+        geometry = self._geometry
+        self._sheet = follow_sheet(
+            self._sheet,
+            goal.motion,
+            bounds=FOLLOW_BOUNDS,
+            edges=geometry.edge_bound,
+            step_s=step_s,
+        )
+        goal_rad = geometry.joints_for_sheet(self._sheet, self._commanded_rad)
+        self._velocity = limit_velocity(
+            self._commanded_rad,
+            self._velocity,
+            goal_rad,
+            (goal_rad - self._goal_rad) / step_s,
+            tool_points=geometry.tool_points,
+            max_tool_speed=geometry.max_tool_speed,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        self._goal_rad = goal_rad
+        self._commanded_rad = self._commanded_rad + self._velocity * step_s
+        due_s, period_s = now_s + self._truth.command_latency_s, self._truth.controller_period_s
+        if period_s:
+            due_s = math.ceil(due_s / period_s) * period_s
+        self._pending.append((due_s, self._commanded_rad))
+        self._lag.on_command(now_s, self._commanded_rad)
+        self._lag.on_measurement(now_s, self._servo.joints_rad)
+
+
+class SimulatedSheet:
+    """Both arms and the sheet between them, by the simulator."""
+
+    def __init__(
+        self, scene: Scene, apparatus: Apparatus, sheet: SheetMotion, *, lag_known: bool
+    ) -> None:
+        true_scene, truth = apply_apparatus(scene, apparatus), apparatus.arms
+        self.arms = (
+            SimulatedArm(scene, "left", truth.left, sheet, lag_known=lag_known),
+            SimulatedArm(scene, "right", truth.right, sheet, lag_known=lag_known),
+        )
+        self._models = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
+        self._pull = SheetPull.of(true_scene.sheet, apparatus)
+        self.rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
+
+    def record(self, now_s: float) -> None:
+        """Add the true edges at a time, to which the servos advance."""
+        flanges = [
+            model.world_from_base @ forward(arm.advance(now_s))
+            for model, arm in zip(self._models, self.arms, strict=True)
+        ]
+        clamps = [model.flange_from_edge for model in self._models]
+        if self._pull is not None:
+            flanges = list(self._pull.displace(*flanges, *clamps, time_s=now_s))
+        for rows, flange, clamp in zip(self.rows, flanges, clamps, strict=True):
+            rows.append((round(1e9 * now_s), make_edge_row(flange, clamp)))
+
+
+def follow_in_simulated_time(
+    scene: Scene,
+    path: FingerPath,
+    apparatus: Apparatus | None = None,
+    settings: LoopSettings | None = None,
+) -> dict[str, Any]:
+    """Return how well the sheet follows a finger path; see `FollowedFinger.figures`.
+
+    servo_lag_ms: as measured by both bridges at the end.
+    """
+    truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
+    finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    parameters = PlannerParameters.model_validate(dict(given.planner))
+    planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
+    compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
+    sheet = SimulatedSheet(scene, truth, planner.motion, lag_known=given.lag_known)
+    tracked = MeasuredFinger(scene, given)
+
+    period_s = 1.0 / (truth.camera.rate_hz or scene.camera.rate_hz)
+    read_out_s = READ_OUT_S if truth.camera.read_out_s is None else truth.camera.read_out_s
+    age_s = 0.5 * scene.camera.exposure_s + read_out_s + COMPUTING_S
+    horizon_s = age_s + SENDING_S + SERVO_LAG_S
+    target, valid_at_s, commanded_s = planner.motion, 0.0, 0.0
+    times_ns: list[int] = []
+    positions: list[Floats] = []
+    following: list[bool] = []
+    for number in range(1, int((finger.duration_s + SETTLING_S) / period_s)):
+        exposed_s = number * period_s
+        position = finger.at(max(exposed_s - SETTLING_S, 0.0))[0]
+        predicted = tracked.predict_path(round(1e9 * exposed_s), position)
+        needed_s = age_s + SENDING_S + 0.5 * (sheet.arms[0].lag_s + sheet.arms[1].lag_s)
+        before_s, horizon_s = horizon_s, update_horizon_s(horizon_s, needed_s, PREDICTION_S)
+        arrives_s = exposed_s + age_s + SENDING_S
+        while commanded_s + CYCLE_S < arrives_s:
+            commanded_s += CYCLE_S
+            _run_cycle(sheet, target, valid_at_s, commanded_s, CYCLE_S)
+        step = planner.follow_finger(
+            *interpolate_path(predicted, PREDICTION_STEP_S, horizon_s),
+            compliance,
+            period_s + horizon_s - before_s,
+        )
+        target, valid_at_s = step.motion, exposed_s + horizon_s
+        _run_cycle(sheet, target, valid_at_s, arrives_s, arrives_s - commanded_s)
+        commanded_s = arrives_s
+        if exposed_s >= SETTLING_S:
+            times_ns.append(round(1e9 * exposed_s))
+            positions.append(position)
+            following.append(step.command.phase not in ("hold", "wait"))
+    points = np.array(positions)
+    left, right = (make_motion(rows, "edge") for rows in sheet.rows)
+    times = np.array(times_ns, dtype=np.int64)
+    shape = make_shape(dict(scene.object.geometry))
+    errors = sheet_errors(
+        scene,
+        SampledMotion(times, points),
+        (left, right),
+        times,
+        shape=shape,
+        surface=SheetSurface.of(scene, truth),
+    )
+    heights_m = shape.closest(apply(inverse(object_pose(scene)), points)).height_m
+    found = FollowedFinger()
+    found.add(*errors, heights_m, np.array(following))
+    return {**found.figures(), "servo_lag_ms": [1e3 * arm.lag_s for arm in sheet.arms]}
+
+
+def _run_cycle(
+    sheet: SimulatedSheet, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float
+) -> None:
+    sheet.record(now_s)
+    for arm in sheet.arms:
+        arm.command(target, valid_at_s, now_s, step_s)
