@@ -16,7 +16,7 @@ from scipy.interpolate import RectBivariateSpline
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.rigid import transform
-from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.membrane import TrueRubber, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -48,7 +48,9 @@ class SheetPlanes:
 class SagTable:
     """Sag of an unpushed sheet over stretch, lean and position, from solutions of the membrane."""
 
-    def __init__(self, rubber: Rubber, min_stretch_ratio: float, max_stretch_ratio: float) -> None:
+    def __init__(
+        self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
+    ) -> None:
         cosines = np.cos(np.pi * (np.arange(STRETCH_NODES) + 0.5) / STRETCH_NODES)
         middle = 0.5 * (min_stretch_ratio + max_stretch_ratio)
         half = 0.5 * (max_stretch_ratio - min_stretch_ratio)
@@ -96,7 +98,7 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
     return np.array(factors)
 
 
-def _solve_sag(rubber: Rubber, stretch: float, lean: float) -> RectBivariateSpline:
+def _solve_sag(rubber: TrueRubber, stretch: float, lean: float) -> RectBivariateSpline:
     """Return the sag over the position across (0..1) and y (m) of a sheet that leans back."""
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
@@ -109,7 +111,7 @@ def _solve_sag(rubber: Rubber, stretch: float, lean: float) -> RectBivariateSpli
 
 
 @lru_cache(maxsize=64)
-def _cached_table(rubber: Rubber, low: float, high: float) -> SagTable:
+def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
     return SagTable(rubber, low, high)
 
 

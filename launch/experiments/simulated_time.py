@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from flexsheet.nodes.triangulator.tracking_methods import TRACKING_METHODS
 from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
@@ -34,9 +33,8 @@ from flexsheet.launch.experiments.true_geometry import ArmModel, pose_matrix
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Side
-from flexsheet.nodes.arm_bridge.control import FOLLOW_BOUNDS
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import extrapolate_goal
+from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
@@ -48,6 +46,7 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import update_horizon_s
 from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
+from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 from flexsheet.nodes.twin import rig
