@@ -25,6 +25,7 @@ from flexsheet.launch.methods.results import replace_non_finite
 
 app = typer.Typer(add_completion=False)
 
+SYSTEM = "system"
 SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 
@@ -34,6 +35,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
         "flexsheet chart triangulation --cases",
         "flexsheet chart triangulation --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
+        "flexsheet chart system --scene launch/scenes/light-touch.yaml --blocks 6 --json",
     )
 )
 def chart(
@@ -41,20 +43,23 @@ def chart(
     family: Annotated[
         str | None,
         typer.Argument(
-            help="Method family to measure; default: all.", autocompletion=complete.families
+            help="Method family to measure; default: all. system: configurations of the graph.",
+            autocompletion=complete.families,
         ),
     ] = None,
-    scene_file: Annotated[
-        Path,
+    scene_files: Annotated[
+        list[Path] | None,
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene file for the measurements.",
+            help="Scene file for the measurements; default: cylinder.yaml. For system: repeat for "
+            "several; default: all shipped scenes.",
             autocompletion=complete.yaml_files,
         ),
-    ] = SCENE_FILE,
+    ] = None,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="Folder for the charts and results.")
+        Path,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Folder for charts and results."),
     ] = Path("runs/charts"),
     redraw: Annotated[
         bool,
@@ -64,14 +69,58 @@ def chart(
         bool,
         typer.Option("--cases", help="Print one line per case instead of one line per method."),
     ] = False,
+    blocks: Annotated[
+        int,
+        typer.Option(
+            "--blocks",
+            min=1,
+            max=1000,
+            help="For system: number of blocks; each runs every configuration once.",
+        ),
+    ] = 12,
+    seconds: Annotated[
+        float,
+        typer.Option("--seconds", min=2.0, max=600.0, help="For system: duration of a stroke, s."),
+    ] = 10.0,
+    apparatuses: Annotated[
+        int,
+        typer.Option(
+            "--apparatuses",
+            min=0,
+            max=100,
+            help="For system: number of random apparatuses; every other block has one of them.",
+        ),
+    ] = 5,
+    configurations: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--configuration",
+            metavar="NAME",
+            help="For system: configuration to measure; repeat for several; default: all.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure and draw speed against accuracy of a family's methods on this computer.
 
     Prints the maximum median time and the maximum error of each method over the cases in its range.
-    Methods on the Pareto front are marked "front".
+    Methods on the Pareto front are marked "front". `system` runs whole graphs instead, and its
+    --output continues an interrupted measurement.
     """
     logs_on_stderr()
+    if family == SYSTEM:
+        from flexsheet.launch.commands.chart_system import measure_system
+
+        measure_system(
+            scene_files or (),
+            output,
+            blocks=blocks,
+            seconds=seconds,
+            apparatuses=apparatuses,
+            configurations=configurations or (),
+            as_json=as_json,
+        )
+        return
     from flexsheet.launch.methods import charts
     from flexsheet.launch.methods.results import describe_load
     from flexsheet.launch.plans.plan import load_scene
@@ -86,7 +135,9 @@ def chart(
         if as_json:
             print_json(results)
         return
-    scene = load_scene(scene_file)
+    if scene_files and len(scene_files) > 1:
+        raise CommandError("--scene: a method family is measured on one scene", BAD_INPUT)
+    scene = load_scene(scene_files[0] if scene_files else SCENE_FILE)
     try:
         families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:
