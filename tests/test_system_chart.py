@@ -114,7 +114,7 @@ def test_the_front_excludes_what_is_worse_by_more_than_the_spread() -> None:
 
 def make_recording(
     scene: Scene, offset_m: float, control_m: float, arms_m: float
-) -> tuple[stroke.StrokeRecording, Floats]:
+) -> tuple[stroke.StrokeRecording, NDArray[np.int64]]:
     """Make a finger at the front of a plane, with a constant error along x or z of each stage.
 
     offset_m: the measured finger is that much to the right. control_m: the arms hold the sheet that

@@ -19,8 +19,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
 from flexsheet.nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel
 from flexsheet.nodes.planner.sheet_force import make_rubber
-from flexsheet.nodes.renderer.benchmarks import is_in_range
-from flexsheet.nodes.renderer.sheet_shape_benchmark import MAX_TRIANGLES_DEPTH_M
+from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
 
 NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "marker": ("triangulator", "marker"),
@@ -121,7 +120,7 @@ def choose_cheapest(scene: Scene) -> Methods:
     corrections = ("one_plane", "four_triangles", "two_pass")
     limits = {"tilt_deg": min(float(tilt_deg), 50.0), "push_mm": 1e3 * depth_m}
     correction = next((one for one in corrections if is_in_range(one, **limits)), "two_pass")
-    is_flat = depth_m <= MAX_TRIANGLES_DEPTH_M
+    is_flat = 1e3 * depth_m <= MAX_TRIANGLES_DEPTH_MM
     return Methods.model_validate(
         {
             "marker": "moments",
@@ -188,6 +187,6 @@ def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path
             file = launch_file.parent / str(value)
             if isinstance(value, str) and file.is_file():
                 given[parameter] = str(file.resolve())
-    with target.open("w") as file:
-        yaml.dump(launch, file)
+    with target.open("w") as output:
+        yaml.dump(launch, output)
     return target

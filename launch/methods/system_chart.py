@@ -37,7 +37,9 @@ from flexsheet.launch.methods.configurations import (
 )
 from flexsheet.launch.methods.results import describe_load, machine_name
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes import node_class
 from flexsheet.nodes.twin.tolerance_table import Profile
 
 Floats = NDArray[np.float64]
@@ -47,6 +49,8 @@ FIRST_SEED = 100
 """Seed of the first random apparatus: smaller ones are for development."""
 
 ORDER_SEED = 19
+FINGER_SEED = 5200
+"""Seed of the finger in the first block; no chart of a family has it."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
@@ -101,7 +105,7 @@ def plan_trials(
             trials[trial] = {
                 "kind": "system",
                 "launch_file": str(launch),
-                "settings": settings[name],
+                "settings": [*settings[name], *_set_seed(graph, block)],
                 "apparatus": choose_apparatus(block, apparatuses),
                 "seconds": seconds,
             }
@@ -113,6 +117,52 @@ def plan_trials(
         "configurations": settings,
     }
     return SceneTrials(scene_file, scene, trials, places, tuple(chosen), common)
+
+
+def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
+    """Return the settings that give all runs of a block the same random finger."""
+    finger = node_class("twin_finger")
+    return [
+        f"{node.name}.seed={FINGER_SEED + block}"
+        for node in graph.nodes.values()
+        if issubclass(node_class(node.type), finger)
+    ]
+
+
+def plan_configuration(
+    scene_file: Path,
+    configuration: Configuration,
+    folder: Path,
+    *,
+    runs: int,
+    seconds: float,
+    launch_file: Path = DEMO_FILE,
+) -> SceneTrials:
+    """Describe runs of one configuration on the nominal apparatus."""
+    folder.mkdir(parents=True, exist_ok=True)
+    launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
+    graph = load_graph(launch)
+    trial = {
+        "kind": "system",
+        "launch_file": str(launch),
+        "apparatus": None,
+        "seconds": seconds,
+    }
+    trials = {
+        f"run-{number:03d}": {
+            **trial,
+            "settings": [*configuration.settings(graph), *_set_seed(graph, number)],
+        }
+        for number in range(runs)
+    }
+    places = {name: (number, configuration.name) for number, name in enumerate(trials)}
+    common = {
+        "experiment": "proposal",
+        **describe_graph(graph, launch, ()),
+        "seconds": seconds,
+        "configuration": configuration.settings(graph),
+    }
+    return SceneTrials(scene_file, load_scene(scene_file), trials, places, (configuration,), common)
 
 
 def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
