@@ -391,7 +391,12 @@ class Tolerances(Part):
     skin_m: Positive = Field(description="skin displacement outside 1.5 finger radii")
     force_ratio: Positive
     sheet_position_m: Positive
-    latency_s: Positive
+    latency_s: Positive = Field(description="from exposure to the commands of the arms, 95 %")
+    light_latency_s: Positive = Field(
+        default=0.06,
+        description="from exposure to light, 95 %; people notice an image that is 45 ms later than "
+        "the touch (Vogels 2004), which is itself up to 15 ms late",
+    )
 
 
 class Scene(Message):

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import CYLINDER, JsonOption, SceneOption, output_file
+from flexsheet.launch.commands.options import CYLINDER, JsonOption, find_scene, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -25,6 +25,8 @@ from flexsheet.launch.methods.results import replace_non_finite
 
 app = typer.Typer(add_completion=False)
 
+SYSTEM = "system"
+
 
 @app.command(
     epilog=examples(
@@ -32,6 +34,7 @@ app = typer.Typer(add_completion=False)
         "flexsheet chart triangulation --cases",
         "flexsheet chart triangulation --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
+        "flexsheet chart system --scene launch/scenes/light-touch.yaml --blocks 6 --json",
     )
 )
 def chart(
@@ -39,10 +42,20 @@ def chart(
     family: Annotated[
         str | None,
         typer.Argument(
-            help="Method family to measure; default: all.", autocompletion=complete.families
+            help="Method family to measure; default: all. system: configurations of the graph.",
+            autocompletion=complete.families,
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_files: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--scene",
+            metavar="SCENE",
+            help="Scene file for the measurements; default: cylinder.yaml. For system: repeat for "
+            "several; default: all shipped scenes.",
+            autocompletion=complete.scenes,
+        ),
+    ] = None,
     output: Annotated[Path, output_file("Folder for the charts and results.", "FOLDER")] = Path(
         "runs/charts"
     ),
@@ -54,14 +67,67 @@ def chart(
         bool,
         typer.Option("--cases", help="Print one line per case instead of one line per method."),
     ] = False,
+    blocks: Annotated[
+        int,
+        typer.Option(
+            "--blocks",
+            metavar="N",
+            min=1,
+            max=1000,
+            help="For system: number of blocks; each runs every configuration once.",
+        ),
+    ] = 12,
+    seconds: Annotated[
+        float,
+        typer.Option(
+            "--seconds",
+            metavar="S",
+            min=2.0,
+            max=600.0,
+            help="For system: duration of a stroke, s.",
+        ),
+    ] = 10.0,
+    apparatuses: Annotated[
+        int,
+        typer.Option(
+            "--apparatuses",
+            metavar="N",
+            min=0,
+            max=100,
+            help="For system: number of random apparatuses; every other block has one of them.",
+        ),
+    ] = 5,
+    configurations: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--configuration",
+            metavar="NAME",
+            help="For system: configuration to measure; repeat for several; default: all.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure and draw speed against accuracy of a family's methods on this computer.
 
     Prints the maximum median time and the maximum error of each method over the cases in its range.
-    Methods on the Pareto front are marked "front".
+    Methods on the Pareto front are marked "front". `system` runs whole graphs instead, and its
+    --output continues an interrupted measurement.
     """
     logs_on_stderr()
+    chosen = [find_scene(one) for one in scene_files or ()]
+    if family == SYSTEM:
+        from flexsheet.launch.commands.chart_system import measure_system
+
+        measure_system(
+            chosen,
+            output,
+            blocks=blocks,
+            seconds=seconds,
+            apparatuses=apparatuses,
+            configurations=configurations or (),
+            as_json=as_json,
+        )
+        return
     from flexsheet.launch.methods import charts
     from flexsheet.launch.methods.results import describe_load
     from flexsheet.launch.plans.plan import load_scene
@@ -76,7 +142,9 @@ def chart(
         if as_json:
             print_json(results)
         return
-    scene = load_scene(scene_file)
+    if len(chosen) > 1:
+        raise CommandError("--scene: a method family is measured on one scene", BAD_INPUT)
+    scene = load_scene(chosen[0] if chosen else find_scene(CYLINDER))
     try:
         families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:

@@ -65,7 +65,7 @@ def families(incomplete: str) -> list[str]:
     """Complete the method families that `chart` can measure."""
     from flexsheet.launch.methods.charts import FAMILIES
 
-    return _filter(FAMILIES, incomplete)
+    return _filter([*FAMILIES, "system"], incomplete)
 
 
 def files(*suffixes: str) -> Callable[[str], list[str]]:

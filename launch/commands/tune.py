@@ -60,17 +60,36 @@ def tune(
         float,
         typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance reserved as margin."),
     ] = 0.2,
+    runs: Annotated[
+        int,
+        typer.Option(
+            "--runs",
+            min=0,
+            max=100,
+            help="Strokes of each proposal through the graph; 0: choose each family on its own.",
+        ),
+    ] = 3,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--runs-folder",
+            metavar="FOLDER",
+            help="Folder of the runs; the same one continues an interrupted command.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Choose the cheapest methods that meet a scene's tolerances, and write them into the scene.
 
     Measures each family on this computer over the scene's working range: seconds to minutes the
-    first time. Prints the reason for each choice. Nodes whose parameter is `auto` use the chosen
-    method. Exit code 3: a family has no method within its tolerance.
+    first time. Then adds up the errors along the chain, and runs the cheapest promising
+    configuration through the graph. It is accepted if all tolerances hold, latency and force
+    included. With --family, only those families are chosen, each on its own. Nodes whose parameter
+    is `auto` use the chosen method. Exit code 3: a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune
-    from flexsheet.launch.methods.results import describe_load, machine_name
+    from flexsheet.launch.methods.results import describe_load, machine_name, replace_non_finite
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -85,9 +104,24 @@ def tune(
         words.print(busy, style="yellow")
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)
+        composition = None
+        if runs and not family:
+            from flexsheet.launch.experiments.run import new_folder
+            from flexsheet.launch.methods.tune_system import tune_system
+
+            composition, choices = tune_system(
+                scene_file,
+                choices,
+                folder or new_folder("tune"),
+                progress,
+                margin=margin,
+                runs=runs,
+            )
     for choice in choices:
         words.print(choice.explain(), markup=False)
-    met = all(choice.met for choice in choices)
+    for line in composition.explain() if composition is not None else ():
+        words.print(line, markup=False)
+    met = all(choice.met for choice in choices) if composition is None else composition.accepted
     if as_json:
         report = {
             "scene": scene.name,
@@ -97,8 +131,9 @@ def tune(
             "margin": margin,
             "met": met,
             "families": [choice.report() for choice in choices],
+            "system": None if composition is None else composition.report(),
         }
-        print_json(report)
+        print_json(replace_non_finite(report))
     else:
         _print_choices(choices)
     if target is not None:

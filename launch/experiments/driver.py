@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Self
 
@@ -53,8 +53,11 @@ MAX_LOAD_PER_CORE = 3.0
 class Driver:
     """Publisher and subscriber of a running graph; an async context manager."""
 
-    def __init__(self, plan: ResolvedGraph, run: Run) -> None:
-        self._plan, self._run = plan, run
+    def __init__(
+        self, plan: ResolvedGraph, run: Run, pids: Callable[[], Mapping[str, int]] = dict
+    ) -> None:
+        """pids: returns the process id of each running node, for measurements."""
+        self._plan, self._run, self.pids = plan, run, pids
         self._writer: GraphWriter | None = None
         self._subscribers: list[Subscriber] = []
         self._newest: dict[str, Message] = {}

@@ -56,7 +56,7 @@ async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()
-        async with Driver(plan, graph.run) as driver:
+        async with Driver(plan, graph.run, lambda: graph.pids) as driver:
             await _run_while_graph_runs(graph, _run_procedure(driver, scene, procedure, progress))
 
 

@@ -23,7 +23,13 @@ from flexsheet.launch.experiments.offline import (
     exceeded_tolerances,
 )
 from flexsheet.launch.experiments.ports import choose_ports
-from flexsheet.launch.experiments.run import make_stroke_procedure, require_scene, run_experiment
+from flexsheet.launch.experiments.run import (
+    make_settings,
+    make_stroke_procedure,
+    require_scene,
+    run_experiment,
+)
+from flexsheet.launch.experiments.system_run import METRES_PER_PX, run_system
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import nominal_apparatus
@@ -117,10 +123,27 @@ def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
     return {"parameter": trial["parameter"], "effects": effects}
 
 
+def run_system_trial(trial: Mapping[str, Any]) -> Row:
+    """Return the speed and the errors of one configuration of the graph."""
+    launch_file = Path(trial["launch_file"])
+    coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
+    settings = [*choose_ports(launch_file), *coarse, *trial["settings"]]
+    with _bag_of(trial) as bag:
+        return run_system(
+            launch_file,
+            settings,
+            bag,
+            float(trial["seconds"]),
+            _tell,
+            apparatus=trial["apparatus"],
+        )
+
+
 KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
     "stroke": run_stroke_trial,
     "robustness": run_robustness_trial,
     "sensitivity": run_sensitivity_trial,
+    "system": run_system_trial,
 }
 
 

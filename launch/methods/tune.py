@@ -13,7 +13,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -169,7 +169,7 @@ class MethodEvaluation:
     median_s: median over the cases of the time per call. slowest_s: maximum over the cases. error:
     maximum within the method's range, at `worst_case`; infinite without a reference. outside: cases
     out of the method's range. wrong: cases with an error above the tolerance less its margin, or
-    without a reference.
+    without a reference. points: measurements of the cases.
     """
 
     method: str
@@ -181,6 +181,7 @@ class MethodEvaluation:
     cases: int
     outside: tuple[Mapping[str, Any], ...]
     wrong: tuple[Mapping[str, Any], ...]
+    points: tuple[Point, ...] = ()
 
     @property
     def meets(self) -> bool:
@@ -254,7 +255,7 @@ class Choice:
             "error": self.chosen.error,
             "spare_ratio": self.spare_ratio,
             "sentence": self.explain(),
-            "judged": [asdict(one) for one in self.evaluations],
+            "judged": [asdict(replace(one, points=())) for one in self.evaluations],
         }
 
 
@@ -299,6 +300,7 @@ def evaluate_methods(
                 cases=len(own),
                 outside=tuple(point.case for point in own if not point.in_range),
                 wrong=tuple(point.case for point in inside if not point.error <= allowed),
+                points=tuple(own),
             )
         )
     return evaluations
@@ -340,13 +342,31 @@ def tune(
         if tunable.name == "correction":
             settings.pop("two_pass")
             settings[TWO_PASS_NAMES[shape]] = "two_pass"
+        load = load_family
+        if tunable.name == "tracking" and (marker := find_choice(choices, "marker")) is not None:
+            load = partial(_load_tracking, noise_px=marker.chosen.error)
         choice = _tune_family(
-            scene, tunable, settings, margin=margin, measure=measure, progress=report
+            scene, tunable, settings, load, margin=margin, measure=measure, progress=report
         )
         if tunable.name == "sheet-shape":
             shape = choice.chosen.method
         choices.append(choice)
     return choices
+
+
+def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
+    """Return the choice of a family; None if it was not tuned."""
+    return next((one for one in choices if one.family == family), None)
+
+
+def _load_tracking(path: str, *, noise_px: float) -> Family:
+    """Return the tracking family with the noise of the chosen marker method."""
+    from flexsheet.launch.methods.benchmarks import make_finger_motions
+    from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
+
+    if not math.isfinite(noise_px):
+        return load_family(path)
+    return make_tracking_family(make_finger_motions, noise_px)
 
 
 def _report(progress: Callable[[str], None], where: str, text: str) -> None:
@@ -357,6 +377,7 @@ def _tune_family(
     scene: Scene,
     tunable: Tunable,
     settings: Mapping[str, Setting],
+    load: Callable[[str], Family],
     *,
     margin: float,
     measure: Measure | None,
@@ -364,7 +385,7 @@ def _tune_family(
 ) -> Choice:
     evaluations: list[MethodEvaluation] = []
     for path in tunable.families:
-        family = load_family(path)
+        family = load(path)
         known = {one.method for one in evaluations}
         left = {
             name: setting

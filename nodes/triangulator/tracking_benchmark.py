@@ -65,18 +65,20 @@ class MeasuredPath:
     truth: Mapping[float, Floats]
 
 
-def measure_path(scene: Scene, motion: TruePathCase, *, seed: int) -> MeasuredPath:
+def measure_path(
+    scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
+) -> MeasuredPath:
     """Simulate the measurement of a path with the scene's rig: triangulate markers with noise."""
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
-    covariance_px = MARKER_NOISE_PX**2 * np.eye(2)
+    covariance_px = noise_px**2 * np.eye(2)
     points, covariances, measured_at = [], [], []
     for time in times:
         left, right = geometry.project(motion.path(float(time)))
         found = measure(
             geometry,
-            left + MARKER_NOISE_PX * random.standard_normal(2),
-            right + MARKER_NOISE_PX * random.standard_normal(2),
+            left + noise_px * random.standard_normal(2),
+            right + noise_px * random.standard_normal(2),
             method=dlt,
             left_covariance=covariance_px,
             right_covariance=covariance_px,
@@ -109,12 +111,14 @@ def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Float
     return predicted
 
 
-def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]]) -> Family:
-    """Make the method family from true paths by name."""
+def make_tracking_family(
+    motions: Callable[[Scene], Mapping[str, TruePathCase]], noise_px: float = MARKER_NOISE_PX
+) -> Family:
+    """Make the method family from true paths by name; noise_px: of a marker's centre."""
 
     def trials(scene: Scene) -> Iterator[Trial]:
         for name, motion in motions(scene).items():
-            seen = measure_path(scene, motion, seed=1)
+            seen = measure_path(scene, motion, seed=1, noise_px=noise_px)
             in_scene = (
                 motion.resting
                 or motion.speed_m_per_s <= SPEED_MARGIN * scene.working_range.speed_m_per_s

@@ -1,0 +1,103 @@
+"""Plan and evaluate randomised blocks: paired ratios, bootstrap over blocks, front with a margin.
+
+A block contains every configuration once, in random order, so slow changes of the machine affect
+all of them alike. One configuration, the control, runs twice in a block: the ratio of its two runs
+(A/A) shows which differences are noise. Runs within a block are dependent, so intervals resample
+whole blocks (Kalibera and Jones, ISMM 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+SEED = 20261123
+"""Seed of the bootstrap, so that equal data give equal intervals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Estimate with the limits of its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def as_dict(self) -> dict[str, float]:
+        return {"value": self.value, "low": self.low, "high": self.high}
+
+
+def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
+    """Return a random order of the names for each block."""
+    random = np.random.default_rng(seed)
+    return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
+
+
+def bootstrap_median(values: Floats) -> Interval | None:
+    """Return the median over blocks (n,) with its interval; None without finite values.
+
+    NaN marks a failed run. One block has no interval: its limits are infinite.
+    """
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return None
+    median = float(np.median(known))
+    if len(known) == 1:
+        return Interval(median, -np.inf, np.inf)
+    picks = np.random.default_rng(SEED).integers(len(known), size=(RESAMPLES, len(known)))
+    tails = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)
+    low, high = np.quantile(np.median(known[picks], axis=1), tails)
+    return Interval(median, float(low), float(high))
+
+
+def compare_paired(values: Floats, control: Floats) -> Interval | None:
+    """Return the median ratio of positive values (n,) to those of the control in the same block.
+
+    Uses logarithms, so that a ratio and its inverse have the same weight.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = bootstrap_median(np.log(values / control))
+    if found is None:
+        return None
+    low, high = np.exp([found.low, found.high])
+    return Interval(float(np.exp(found.value)), float(low), float(high))
+
+
+def attribute_error(parts: Floats) -> Floats:
+    """Return the fraction (k,) of a mean square error that each of its summands causes.
+
+    parts: (k, n, d), error vectors that add up to the whole error. The fractions add up to one. A
+    part that compensates others has a negative fraction.
+    """
+    whole = parts.sum(axis=0)
+    total = float(np.square(whole).sum())
+    if total == 0.0:
+        return np.zeros(len(parts))
+    return np.asarray(np.einsum("knd,nd->k", parts, whole) / total)
+
+
+def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
+    """Return the names that no other point dominates, in the given order.
+
+    points: costs of each point, smaller is better. A point dominates another if it is better in one
+    cost by more than both intervals, and in no cost worse by more than both intervals.
+    """
+    return [
+        name
+        for name, costs in points.items()
+        if not any(dominates(other, costs) for key, other in points.items() if key != name)
+    ]
+
+
+def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
+    """Return whether a point dominates another; see `find_front`."""
+    pairs = list(zip(one, other, strict=True))
+    better = any(mine.high < theirs.low for mine, theirs in pairs)
+    return better and not any(theirs.high < mine.low for mine, theirs in pairs)

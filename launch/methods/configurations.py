@@ -1,0 +1,192 @@
+"""Name the configurations of the graph that `flexsheet chart system` compares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.launch.running.precompute import precompute_force_table, precompute_soft_body
+from flexsheet.messages.methods import Methods, SoftBodyChoice
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import node_class
+from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
+from flexsheet.nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel
+from flexsheet.nodes.planner.sheet_force import make_rubber
+from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
+
+NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
+    "marker": ("triangulator", "marker"),
+    "triangulation": ("triangulator", "triangulation"),
+    "tracking": ("triangulator", "tracking"),
+    "sheet_force": ("planner", "sheet_force"),
+    "sheet_shape": ("renderer", "sheet_shape"),
+    "correction": ("renderer", "correction"),
+}
+"""Node type and parameter that selects the method of each key of `Methods`."""
+
+NODE_DEFAULTS = Methods(
+    marker="subpixel_fit",
+    triangulation="dlt",
+    tracking="adaptive",
+    sheet_force="scaled",
+    sheet_shape="reduced_order",
+    correction="two_pass",
+    soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
+)
+"""Methods of the nodes without a choice in the scene, as in docs/tune.md."""
+
+PAPER = Methods(
+    marker="moments",
+    triangulation="dlt",
+    tracking="none",
+    sheet_force="linear",
+    sheet_shape="four_triangles",
+    correction="four_triangles",
+    soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
+)
+"""Methods of the paper: no filter, linear FEM, four triangles (sections III and IV)."""
+
+PAPER_PARAMETERS = (
+    ("planner", "prediction_horizon_s=0"),
+    ("planner", "compliance_mode=stiffness"),
+)
+"""The paper does not compensate the delay, and varies the stretch only (V-C, III-B)."""
+
+MOST_EXACT = NODE_DEFAULTS.model_copy(
+    update={
+        "sheet_force": "table",
+        "soft_body": SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045),
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """Methods of all nodes, with further parameters as (node type, "parameter=value")."""
+
+    name: str
+    methods: Methods
+    parameters: tuple[tuple[str, str], ...] = ()
+
+    def settings(self, graph: ResolvedGraph) -> list[str]:
+        """Return the settings "node.parameter=value" for the nodes of a graph."""
+        chosen = list(self.parameters)
+        for key, (node_type, parameter) in NODE_PARAMETERS.items():
+            method = getattr(self.methods, key)
+            if method is not None:
+                chosen.append((node_type, f"{parameter}={method}"))
+        if self.methods.soft_body is not None:
+            body = self.methods.soft_body
+            chosen.append(("fem_solver", f"method={body.method}"))
+            chosen.append(("fem_solver", f"skin_spacing_m={body.skin_spacing_m}"))
+        return [
+            f"{node.name}.{text}"
+            for node_type, text in chosen
+            for node in graph.nodes.values()
+            if issubclass(node_class(node.type), node_class(node_type))
+        ]
+
+    def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
+        """Compute the tables that the methods need, so that no run computes them."""
+        if self.methods.sheet_force == "table":
+            precompute_force_table(scene, None, progress)
+        body = self.methods.soft_body
+        if body is not None and body.method == "nonlinear_table":
+            precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
+
+
+def choose_cheapest(scene: Scene) -> Methods:
+    """Return the cheapest methods whose stated range contains the scene's working range.
+
+    Their errors do not matter. Where no method's range is sufficient, the one with the largest
+    range is chosen.
+    """
+    depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
+    stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
+    rubber = make_rubber(scene.sheet)
+    is_linear = not LinearSheetModel(rubber).invalid_reason(
+        stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
+    )
+    is_scaled = not ScaledSheetModel(rubber).invalid_reason(
+        stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
+    )
+    corrections = ("one_plane", "four_triangles", "two_pass")
+    limits = {"tilt_deg": min(float(tilt_deg), 50.0), "push_mm": 1e3 * depth_m}
+    correction = next((one for one in corrections if is_in_range(one, **limits)), "two_pass")
+    is_flat = 1e3 * depth_m <= MAX_TRIANGLES_DEPTH_MM
+    return Methods.model_validate(
+        {
+            "marker": "moments",
+            "triangulation": "dlt",
+            "tracking": "one_euro",
+            "sheet_force": "linear" if is_linear else "scaled" if is_scaled else "table",
+            "sheet_shape": "four_triangles" if is_flat else "reduced_order",
+            "correction": correction,
+            "soft_body": {"method": "linear", "skin_spacing_m": 0.006}
+            if depth_m <= LINEAR_DEPTH_M
+            else {"method": "nonlinear_table", "skin_spacing_m": 0.0045},
+        }
+    )
+
+
+def choose_tuned(scene: Scene) -> Methods:
+    """Return the scene's methods, and the nodes' defaults where it has no choice."""
+    chosen = scene.methods.model_dump(exclude_none=True)
+    return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
+
+
+TUNED = "tuned"
+NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
+CONTROL = TUNED
+"""Configuration that runs twice in each block."""
+
+CONTROL_AGAIN = "tuned, again"
+
+
+def list_configurations(scene: Scene) -> list[Configuration]:
+    """Return the compared configurations of a scene; without choices, tuned is the default."""
+    tuned = choose_tuned(scene)
+    found = [
+        Configuration("paper", PAPER, PAPER_PARAMETERS),
+        Configuration("cheapest in range", choose_cheapest(scene)),
+        Configuration("default", NODE_DEFAULTS),
+        Configuration(TUNED, tuned),
+        Configuration("most exact", MOST_EXACT),
+    ]
+    return [one for one in found if one.name != "default" or tuned != NODE_DEFAULTS]
+
+
+def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
+    """Return the configurations with these names, or all; the control is always among them.
+
+    Raises ExperimentError for an unknown name.
+    """
+    known = list_configurations(scene)
+    for name in names:
+        if name not in NAMES:
+            raise ExperimentError(f'unknown configuration "{name}"; {did_you_mean(name, NAMES)}')
+    return [one for one in known if not names or one.name in {*names, CONTROL}]
+
+
+def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
+    """Write a copy of a launch file with another scene; files are named by absolute paths."""
+    yaml = YAML()
+    launch = yaml.load(launch_file.read_text())
+    launch["scene"] = str(scene_file.resolve())
+    launch.pop("record", None)
+    for spec in launch["nodes"].values():
+        given = spec.get("parameters", {})
+        for parameter, value in given.items():
+            file = launch_file.parent / str(value)
+            if isinstance(value, str) and file.is_file():
+                given[parameter] = str(file.resolve())
+    with target.open("w") as output:
+        yaml.dump(launch, output)
+    return target

@@ -1,0 +1,387 @@
+"""Measure whole configurations of the running graph: speed against accuracy of the system.
+
+Every trial is a process of its own that starts the graph, see `experiments/system_run.py`. Blocks
+alternate between the nominal apparatus and random ones. Errors are the 95 % values of a run; their
+spread is the interval of the median over blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.offline import metric_tolerances
+from flexsheet.launch.experiments.robustness import apparatus_text
+from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.experiments.sweep import Row, describe_graph, run_sweep
+from flexsheet.launch.methods.blocks import (
+    CONFIDENCE,
+    Interval,
+    bootstrap_median,
+    compare_paired,
+    find_front,
+    order_blocks,
+)
+from flexsheet.launch.methods.configurations import (
+    CONTROL,
+    CONTROL_AGAIN,
+    Configuration,
+    select_configurations,
+    write_launch_file,
+)
+from flexsheet.launch.methods.results import describe_load, machine_name
+from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import node_class
+from flexsheet.nodes.twin.tolerance_table import Profile
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+FIRST_SEED = 100
+"""Seed of the first random apparatus: smaller ones are for development."""
+
+ORDER_SEED = 19
+FINGER_SEED = 5200
+"""Seed of the finger in the first block; no chart of a family has it."""
+
+ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
+LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
+QUANTILES = ("p50", "p95", "p99")
+COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
+"""Speeds that are compared with the control in the same block."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneTrials:
+    """Trials of one scene: descriptions for the sweep by name, with block and configuration."""
+
+    file: Path
+    scene: Scene
+    trials: Mapping[str, Mapping[str, Any]]
+    places: Mapping[str, tuple[int, str]]
+    configurations: tuple[Configuration, ...]
+    common: Mapping[str, Any]
+
+
+def choose_apparatus(block: int, apparatuses: int) -> str | None:
+    """Return the apparatus of a block: every other block is nominal, the others are random."""
+    if apparatuses == 0 or block % 2 == 0:
+        return None
+    seed = FIRST_SEED + (block // 2) % apparatuses
+    return apparatus_text(seed, Profile.MODERN, calibrated=True)
+
+
+def plan_trials(
+    scene_file: Path,
+    folder: Path,
+    *,
+    blocks: int,
+    seconds: float,
+    apparatuses: int,
+    launch_file: Path = DEMO_FILE,
+    configurations: Sequence[str] = (),
+) -> SceneTrials:
+    """Describe the trials of one scene in the order in which they run."""
+    scene = load_scene(scene_file)
+    chosen = select_configurations(scene, configurations)
+    folder.mkdir(parents=True, exist_ok=True)
+    launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
+    graph = load_graph(launch)
+    settings = {one.name: one.settings(graph) for one in chosen}
+    settings[CONTROL_AGAIN] = settings[CONTROL]
+    trials, places = {}, {}
+    for block, order in enumerate(order_blocks(list(settings), blocks, seed=ORDER_SEED)):
+        for name in order:
+            trial = f"block-{block:03d}-{name.replace(', ', '-').replace(' ', '-')}"
+            places[trial] = block, name
+            trials[trial] = {
+                "kind": "system",
+                "launch_file": str(launch),
+                "settings": [*settings[name], *_set_seed(graph, block)],
+                "apparatus": choose_apparatus(block, apparatuses),
+                "seconds": seconds,
+            }
+    common = {
+        "experiment": "system",
+        **describe_graph(graph, launch, ()),
+        "seconds": seconds,
+        "apparatuses": apparatuses,
+        "configurations": settings,
+    }
+    return SceneTrials(scene_file, scene, trials, places, tuple(chosen), common)
+
+
+def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
+    """Return the settings that give all runs of a block the same random finger."""
+    finger = node_class("twin_finger")
+    return [
+        f"{node.name}.seed={FINGER_SEED + block}"
+        for node in graph.nodes.values()
+        if issubclass(node_class(node.type), finger)
+    ]
+
+
+def plan_configuration(
+    scene_file: Path,
+    configuration: Configuration,
+    folder: Path,
+    *,
+    runs: int,
+    seconds: float,
+    launch_file: Path = DEMO_FILE,
+) -> SceneTrials:
+    """Describe runs of one configuration on the nominal apparatus."""
+    folder.mkdir(parents=True, exist_ok=True)
+    launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
+    graph = load_graph(launch)
+    trial = {
+        "kind": "system",
+        "launch_file": str(launch),
+        "apparatus": None,
+        "seconds": seconds,
+    }
+    trials = {
+        f"run-{number:03d}": {
+            **trial,
+            "settings": [*configuration.settings(graph), *_set_seed(graph, number)],
+        }
+        for number in range(runs)
+    }
+    places = {name: (number, configuration.name) for number, name in enumerate(trials)}
+    common = {
+        "experiment": "proposal",
+        **describe_graph(graph, launch, ()),
+        "seconds": seconds,
+        "configuration": configuration.settings(graph),
+    }
+    return SceneTrials(scene_file, load_scene(scene_file), trials, places, (configuration,), common)
+
+
+def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
+    """Compute the tables that the methods need, and run the trials that have no row yet."""
+    for one in planned.configurations:
+        one.prepare(planned.scene, progress)
+    return run_sweep(folder, planned.common, planned.trials, progress)
+
+
+def run_system_chart(
+    scene_files: Sequence[Path],
+    folder: Path,
+    progress: Progress,
+    *,
+    blocks: int,
+    seconds: float,
+    apparatuses: int,
+    launch_file: Path = DEMO_FILE,
+    configurations: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Measure all scenes; return the result of `chart system --json`."""
+    points: list[dict[str, Any]] = []
+    failed: list[dict[str, str]] = []
+    for number, file in enumerate(scene_files, start=1):
+        own = folder / file.stem
+        planned = plan_trials(
+            file,
+            own,
+            blocks=blocks,
+            seconds=seconds,
+            apparatuses=apparatuses,
+            launch_file=launch_file,
+            configurations=configurations,
+        )
+
+        def report(text: str, name: str = f"{file.stem} ({number} of {len(scene_files)})") -> None:
+            progress(f"{name}: {text}")
+
+        rows = run_scene(planned, own, report)
+        failed += [
+            {"scene": planned.scene.name, "trial": name, "error": row["error"]}
+            for name, row in rows.items()
+            if "error" in row
+        ]
+        points += summarize_scene(planned, rows)
+    if not points:
+        raise ExperimentError(f"all trials failed; see {folder}; the last: {failed[-1]['error']}")
+    return {
+        "points": points,
+        "front": [
+            {"scene": scene, "configuration": name}
+            for scene in dict.fromkeys(point["scene"] for point in points)
+            for name in find_system_front([one for one in points if one["scene"] == scene])
+        ],
+        "blocks": blocks,
+        "apparatuses": apparatuses,
+        "seconds": seconds,
+        "confidence": CONFIDENCE,
+        "machine": machine_name(),
+        "load": describe_load(),
+        "failed": failed,
+        "folder": str(folder),
+    }
+
+
+def read_value(row: Row, key: str) -> float:
+    """Return a figure of a row, such as "sheet_mm.p95"; NaN if it has none."""
+    found: Any = row
+    for part in key.split("."):
+        found = None if found is None else found.get(part)
+    return float("nan") if found is None else float(found)
+
+
+def list_tolerances(scene: Scene) -> dict[str, float]:
+    """Return the scene's tolerance of each figure, by its key in a row of a trial."""
+    limits = {f"{metric.value}.p95": limit for metric, limit in metric_tolerances(scene).items()}
+    return limits | {
+        "exposure_to_arm_ms.p95": 1e3 * scene.tolerances.latency_s,
+        "exposure_to_light_ms.p95": 1e3 * scene.tolerances.light_latency_s,
+    }
+
+
+def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
+    """Return a point for each configuration of a scene; those without a good run are missing."""
+    found: dict[str, dict[int, Row]] = {}
+    for name, row in rows.items():
+        block, configuration = planned.places[name]
+        if "error" not in row:
+            found.setdefault(configuration, {})[block] = row
+    nominal = {
+        block
+        for name, (block, _) in planned.places.items()
+        if planned.trials[name]["apparatus"] is None
+    }
+    return [
+        summarize_configuration(planned.scene, one.name, found, nominal)
+        for one in (*planned.configurations, Configuration(CONTROL_AGAIN, planned.scene.methods))
+        if found.get(one.name)
+    ]
+
+
+def summarize_configuration(
+    scene: Scene, name: str, rows: Mapping[str, Mapping[int, Row]], nominal: set[int]
+) -> dict[str, Any]:
+    """Return the point of one configuration, from rows by configuration and block.
+
+    Absolute figures are medians over the blocks of the nominal apparatus, or over all if none has a
+    row. Ratios to the control are over all blocks in which both have a row.
+    """
+    own, control = rows[name], rows.get(CONTROL, {})
+    blocks = sorted(set(own) & nominal) or sorted(own)
+    random = [own[block] for block in sorted(set(own) - nominal)]
+
+    def estimate(key: str) -> Interval | None:
+        return bootstrap_median(np.array([read_value(own[block], key) for block in blocks]))
+
+    def summarize_latency(key: str) -> dict[str, float] | None:
+        found = {quantile: estimate(f"{key}.{quantile}") for quantile in QUANTILES}
+        known = {quantile: one.value for quantile, one in found.items() if one is not None}
+        return known or None
+
+    tolerances = list_tolerances(scene)
+    intervals = {key: estimate(key) for key in tolerances}
+    ratios = {key: one and scale(one, 1.0 / tolerances[key]) for key, one in intervals.items()}
+    failing = [key for key, one in ratios.items() if one is not None and upper_limit(one) > 1.0]
+    cores = estimate("cpu_cores")
+    shared = sorted(set(own) & set(control))
+    return {
+        "scene": scene.name,
+        "configuration": name,
+        "cpu_cores": None if cores is None else cores.value,
+        "cpu_cores_by_node": _median_by_key([own[block]["cpu_cores_by_node"] for block in blocks]),
+        **{key: summarize_latency(key) for key in LATENCIES},
+        **{key: _value(intervals[f"{key}.p95"]) for key in ERRORS},
+        "meets_tolerances": not failing,
+        "failing": failing,
+        "spread": {
+            key: one.as_dict()
+            for key, one in {"cpu_cores": cores, **intervals}.items()
+            if one is not None
+        },
+        "tolerance_ratios": {key: one.as_dict() for key, one in ratios.items() if one is not None},
+        "ratio_to_control": {
+            key: one.as_dict()
+            for key in COMPARED
+            if (
+                one := compare_paired(
+                    *(
+                        np.array([read_value(of[block], key) for block in shared])
+                        for of in (own, control)
+                    )
+                )
+            )
+            is not None
+        },
+        "budget": _median_by_key([own[block]["budget"] for block in blocks]),
+        "random_apparatuses": {
+            "runs": len(random),
+            "within_tolerances": sum(
+                all(not read_value(row, key) > limit for key, limit in tolerances.items())
+                for row in random
+            ),
+            **{
+                key: {"median": float(np.median(values)), "max": float(values.max())}
+                for key in ERRORS
+                if len(values := _known([read_value(row, f"{key}.p95") for row in random]))
+            },
+        },
+        "runs": len(own),
+    }
+
+
+def upper_limit(one: Interval) -> float:
+    """Return the upper limit of an interval; its value where one block gave no interval."""
+    return one.high if np.isfinite(one.high) else one.value
+
+
+def scale(one: Interval, factor: float) -> Interval:
+    """Return an interval in another unit."""
+    return Interval(one.value * factor, one.low * factor, one.high * factor)
+
+
+def _value(one: Interval | None) -> float | None:
+    return None if one is None else one.value
+
+
+def _known(values: Sequence[float]) -> Floats:
+    array = np.array(values, dtype=np.float64)
+    return array[np.isfinite(array)]
+
+
+def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    keys = dict.fromkeys(key for row in rows for key in row)
+    return {key: float(np.median([row[key] for row in rows if key in row])) for key in keys}
+
+
+def worst_ratio(point: Mapping[str, Any]) -> Interval:
+    """Return the largest error of a point over its tolerance; latencies do not count."""
+    ratios = [
+        Interval(**one)
+        for key, one in point["tolerance_ratios"].items()
+        if key.partition(".")[0] in ERRORS
+    ]
+    return max(ratios, key=lambda one: one.value)
+
+
+def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the configurations of a scene that no other one dominates.
+
+    Costs are the exposure to arm latency, the processor cores, and the worst error over tolerance.
+    """
+    costs = {}
+    for point in points:
+        if point["configuration"] == CONTROL_AGAIN:
+            continue
+        spread = point["spread"]
+        costs[point["configuration"]] = [
+            Interval(**spread["exposure_to_arm_ms.p95"]),
+            Interval(**spread["cpu_cores"]),
+            worst_ratio(point),
+        ]
+    return find_front(costs)

@@ -1,0 +1,155 @@
+"""Draw the chart of the system: speed across, error over tolerance up, and the error budget."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flexsheet.launch.methods.blocks import Interval
+from flexsheet.launch.methods.configurations import CONTROL_AGAIN
+from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
+from flexsheet.launch.methods.system_chart import ERRORS, worst_ratio
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NAMES = {
+    "sheet_mm": "sheet",
+    "image_mm": "image",
+    "force_percent": "force",
+    "fingertip_mm": "fingertip",
+}
+MIN_RATIO = 0.03
+"""Smallest drawn error over tolerance."""
+
+ROW_HEIGHT = 4.2
+
+
+def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
+    """Draw one row per scene: speed against error, and each error of each configuration.
+
+    A filled point meets all tolerances, a cross fails one. Bars are 95 % intervals.
+    """
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(point["scene"] for point in result["points"]))
+    front = {(one["scene"], one["configuration"]) for one in result["front"]}
+    with page_style():
+        figure = Figure(figsize=(13, ROW_HEIGHT * len(scenes) + 0.6), layout="constrained")
+        rows = figure.subplots(len(scenes), 2, squeeze=False, width_ratios=(3, 4))
+        for (left, right), scene in zip(rows, scenes, strict=True):
+            points = [
+                one
+                for one in result["points"]
+                if one["scene"] == scene and one["configuration"] != CONTROL_AGAIN
+            ]
+            names = {name for of, name in front if of == scene}
+            _draw_front(left, scene, points, names)
+            _draw_errors(right, points)
+        save_svg(figure, path)
+
+
+def _draw_front(
+    axes: Axes, scene: str, points: Sequence[Mapping[str, Any]], front: set[str]
+) -> None:
+    """Draw the worst error over its tolerance, over the latency from exposure to arm."""
+    corners = []
+    for colour, point in zip(COLOURS, points, strict=False):
+        name, latency = point["configuration"], point["exposure_to_arm_ms"]
+        worst = worst_ratio(point)
+        x, y = latency["p50"], max(worst.value, MIN_RATIO)
+        axes.errorbar(
+            x,
+            y,
+            xerr=[[0.0], [latency["p99"] - x]],
+            yerr=_bars(worst, y),
+            color=colour,
+            marker="o" if point["meets_tolerances"] else "X",
+            markersize=9 if name in front else 6,
+            markerfacecolor=colour if name in front else "none",
+            linewidth=1,
+            capsize=2,
+        )
+        label = name if point["meets_tolerances"] else f"{name}: FAILS {_failing(point)}"
+        axes.annotate(label, (x, y), (6, 6), textcoords="offset points", fontsize=8, color=colour)
+        if name in front:
+            corners.append((x, y))
+    if len(corners) > 1:
+        axes.step(*zip(*sorted(corners), strict=True), where="post", color=INK, alpha=0.4)
+    axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
+    allowed_ms = _allowed_ms(points)
+    if allowed_ms is not None:
+        axes.axvline(allowed_ms, color=INK, linestyle="--", linewidth=1)
+        axes.axvspan(0.0, allowed_ms, ymax=1.0, color=COLOURS[2], alpha=0.06)
+    axes.set_yscale("log")
+    axes.set_xlim(left=0.0)
+    axes.margins(x=0.25, y=0.2)
+    axes.set_xlabel("exposure to arm command, ms (point: median, bar: to 99 %)")
+    axes.set_ylabel("worst error / its tolerance")
+    axes.set_title(f"{scene}: dashed lines are the tolerances", fontsize=10)
+    axes.grid(visible=True, which="both", alpha=0.15)
+
+
+def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the scene's tolerance of the latency to the arm."""
+    key = "exposure_to_arm_ms.p95"
+    for point in points:
+        if key in point["spread"] and point["tolerance_ratios"][key]["value"] > 0.0:
+            ratio = point["tolerance_ratios"][key]["value"]
+            return float(point["spread"][key]["value"] / ratio)
+    return None
+
+
+def _failing(point: Mapping[str, Any]) -> str:
+    short = {"exposure_to_arm_ms": "latency", "exposure_to_light_ms": "light", **NAMES}
+    return ", ".join(short[key.partition(".")[0]] for key in point["failing"])
+
+
+def _bars(one: Interval, y: float) -> list[list[float]] | None:
+    """Return the lengths of the error bars down and up; None without an interval."""
+    if not np.isfinite([one.low, one.high]).all():
+        return None
+    return [[max(y - max(one.low, MIN_RATIO), 0.0)], [max(one.high - y, 0.0)]]
+
+
+def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
+    """Draw every error over its tolerance; the sheet's bar is divided into its stages."""
+    width = 0.8 / max(len(points), 1)
+    for number, (colour, point) in enumerate(zip(COLOURS, points, strict=False)):
+        for column, key in enumerate(ERRORS):
+            ratio = point["tolerance_ratios"].get(f"{key}.p95")
+            if ratio is None:
+                continue
+            at = column + (number - 0.5 * (len(points) - 1)) * width
+            height = ratio["value"]
+            stages = point["budget"] if key == "sheet_mm" else {"": 1.0}
+            bottom = 0.0
+            for shade, share in enumerate(max(one, 0.0) for one in stages.values()):
+                part = height * share / sum(max(one, 0.0) for one in stages.values())
+                axes.bar(
+                    at, part, 0.9 * width, bottom, color=colour, alpha=(0.9, 0.55, 0.25)[shade]
+                )
+                bottom += part
+            interval = Interval(**ratio)
+            bars = _bars(interval, height)
+            if bars is not None:
+                axes.errorbar(at, height, yerr=bars, color=INK, linewidth=1, capsize=2)
+        axes.bar(0.0, 0.0, color=colour, label=_label(point))
+    axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
+    axes.set_xticks(range(len(ERRORS)), [NAMES[key] for key in ERRORS])
+    axes.set_ylabel("95 % error / tolerance")
+    stages = next((point["budget"] for point in points if point["budget"]), {})
+    axes.set_title("sheet, from dark to light: " + ", ".join(stages), fontsize=9)
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_ylim(bottom=0.0)
+    axes.grid(visible=True, axis="y", alpha=0.2)
+    axes.legend(fontsize=7)
+
+
+def _label(point: Mapping[str, Any]) -> str:
+    light = point["exposure_to_light_ms"]
+    shown = "no image" if light is None else f"light {light['p50']:.0f}/{light['p99']:.0f} ms"
+    return f"{point['configuration']}: {point['cpu_cores']:.2f} cores, {shown}"

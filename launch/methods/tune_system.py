@@ -1,0 +1,248 @@
+"""Tune a scene as a whole: compose the measured methods, and run proposals through the graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.offline import metric_tolerances
+from flexsheet.launch.experiments.sweep import run_sweep
+from flexsheet.launch.methods.charts import measure_family
+from flexsheet.launch.methods.composition import (
+    P95_OVER_RMS,
+    Combination,
+    Composition,
+    Figures,
+    StageOption,
+    SystemMetric,
+    compose,
+    name_methods,
+)
+from flexsheet.launch.methods.configurations import Configuration, choose_tuned
+from flexsheet.launch.methods.system_chart import plan_configuration, read_value
+from flexsheet.launch.methods.tune import (
+    REPEATS,
+    Choice,
+    MethodEvaluation,
+    evaluate_methods,
+    find_choice,
+)
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.fem_solver.benchmarks import FORCE
+from flexsheet.nodes.methods import Point, Trial
+from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
+
+RENDERED_HZ = 15.0
+"""Frames per second of the renderer, in `launch/demo.yaml`."""
+
+IMAGES = 2
+"""Images per exposure, each of which is searched for the marker."""
+
+STROKE_S = 10.0
+LEAD = "lead_ms"
+
+MeasureTracking = Callable[[Scene, float], Sequence[MethodEvaluation]]
+
+
+def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
+    """Return all tolerances of a scene, in the units of the metrics."""
+    limits = {SystemMetric(one.value): limit for one, limit in metric_tolerances(scene).items()}
+    return limits | {
+        SystemMetric.SKIN: 1e3 * scene.tolerances.skin_m,
+        SystemMetric.TO_ARM: 1e3 * scene.tolerances.latency_s,
+        SystemMetric.TO_LIGHT: 1e3 * scene.tolerances.light_latency_s,
+    }
+
+
+def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
+    """Measure the tracking methods with the noise of a marker method."""
+    from flexsheet.launch.methods.benchmarks import make_finger_motions
+
+    family = make_tracking_family(make_finger_motions, noise_px)
+    points = measure_family(family, scene, repeats=REPEATS, select=_is_in_scene)
+    settings = {name: name for name in family.methods}
+    return evaluate_methods(points, settings, tolerance=family.tolerance(scene))
+
+
+def _is_in_scene(trial: Trial) -> bool:
+    return trial.in_scene
+
+
+def make_stages(
+    scene: Scene, choices: Sequence[Choice], measure: MeasureTracking = measure_tracking
+) -> dict[str, list[StageOption]]:
+    """Return the options of each tuned family, with the metrics that they affect.
+
+    Tracking is measured with the noise of each marker method. Its error at the exposure is that of
+    the fingertip, and at the longest horizon that of the sheet. The correction was measured with
+    the chosen sheet shape only.
+    """
+    stages: dict[str, list[StageOption]] = {}
+    for choice in choices:
+        if choice.family == "tracking":
+            stages["tracking"] = _list_tracking(scene, choices, choice, measure)
+        else:
+            stages[choice.family] = [
+                _make_option(scene, choices, choice, one) for one in choice.evaluations
+            ]
+    return stages
+
+
+def _make_option(
+    scene: Scene, choices: Sequence[Choice], choice: Choice, one: MethodEvaluation
+) -> StageOption:
+    rate_hz, took_ms = scene.camera.rate_hz, 1e3 * one.median_s
+    spreads: dict[SystemMetric, float] = {}
+    biases: dict[SystemMetric, float] = {}
+    given: dict[str, str] = {}
+    match choice.family:
+        case "marker":
+            rate_hz *= IMAGES
+            took_ms *= IMAGES
+            biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
+        case "triangulation":
+            biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
+        case "sheet-force":
+            biases = {SystemMetric.FORCE: one.error}
+        case "correction":
+            rate_hz = RENDERED_HZ
+            spreads = {SystemMetric.IMAGE: P95_OVER_RMS * one.error}
+            biases = {SystemMetric.TO_LIGHT: took_ms}
+            shape = find_choice(choices, "sheet-shape")
+            if shape is not None and one.setting == "two_pass":
+                given = {"sheet-shape": shape.chosen.method}
+        case "soft-body":
+            force = _largest(one.points, lambda point: point.extra_metrics.get(FORCE, math.nan))
+            biases = {
+                SystemMetric.SKIN: one.error,
+                SystemMetric.FORCE: force,
+                SystemMetric.TO_LIGHT: took_ms,
+            }
+    return StageOption(
+        one.method,
+        rate_hz * one.median_s,
+        spreads,
+        biases,
+        given,
+        in_range=not one.outside and math.isfinite(one.error),
+    )
+
+
+def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
+    """Return the largest absolute value over the points in range; 0 without a value."""
+    found = [abs(value(point)) for point in points if point.in_range]
+    return max((one for one in found if math.isfinite(one)), default=0.0)
+
+
+def _list_tracking(
+    scene: Scene, choices: Sequence[Choice], tracking: Choice, measure: MeasureTracking
+) -> list[StageOption]:
+    marker = find_choice(choices, "marker")
+    if marker is None:
+        return [_make_tracking(scene, one, {}) for one in tracking.evaluations]
+    found = []
+    for source in marker.evaluations:
+        if not math.isfinite(source.error):
+            continue
+        known = source.method == marker.chosen.method
+        evaluations = tracking.evaluations if known else measure(scene, source.error)
+        found += [_make_tracking(scene, one, {"marker": source.method}) for one in evaluations]
+    return found
+
+
+def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]) -> StageOption:
+    leads = [point.case[LEAD] for point in one.points]
+    first, last = min(leads), max(leads)
+    fingertip, sheet = (
+        P95_OVER_RMS * _largest([p for p in one.points if p.case[LEAD] == lead], _error)
+        for lead in (first, last)
+    )
+    took_ms = 1e3 * one.median_s
+    return StageOption(
+        one.method,
+        scene.camera.rate_hz * one.median_s,
+        {SystemMetric.FINGERTIP: fingertip, SystemMetric.SHEET: sheet},
+        {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms},
+        given,
+        in_range=not one.outside,
+    )
+
+
+def _error(point: Point) -> float:
+    return point.error
+
+
+def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
+    """Return the choices with the methods of a composition."""
+    return [
+        replace(
+            choice,
+            chosen=next(one for one in choice.evaluations if one.method == methods[choice.family]),
+        )
+        for choice in choices
+    ]
+
+
+def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
+    """Return the scene's methods with the choices; defaults where there is none."""
+    chosen = {choice.key: choice.chosen.setting for choice in choices}
+    return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
+
+
+def tune_system(
+    scene_file: Path,
+    choices: Sequence[Choice],
+    folder: Path,
+    progress: Callable[[str], None],
+    *,
+    margin: float,
+    runs: int,
+    measure: MeasureTracking = measure_tracking,
+) -> tuple[Composition, list[Choice]]:
+    """Compose the measured methods; return the composition, and the choices that it makes.
+
+    runs: strokes of each proposal; the largest 95 % value counts. Raises ExperimentError if no run
+    of a proposal succeeds.
+    """
+    scene = load_scene(scene_file)
+    progress("measuring the tracking with the noise of each marker method")
+    stages = make_stages(scene, choices, measure)
+
+    def run_graph(combination: Combination) -> Figures:
+        chosen = choose_methods(choices, name_methods(combination))
+        configuration = Configuration("proposal", make_methods(scene, chosen))
+        name = "-".join(name_methods(combination).values()).replace(" ", "").replace(",", "")
+        return run_proposal(scene_file, configuration, folder / name, progress, runs=runs)
+
+    composition = compose(stages, list_tolerances(scene), run_graph, margin=margin)
+    return composition, choose_methods(choices, name_methods(composition.chosen))
+
+
+def run_proposal(
+    scene_file: Path,
+    configuration: Configuration,
+    folder: Path,
+    progress: Callable[[str], None],
+    *,
+    runs: int,
+) -> Figures:
+    """Run a configuration through the graph; return the largest 95 % value of each metric."""
+    planned = plan_configuration(scene_file, configuration, folder, runs=runs, seconds=STROKE_S)
+    configuration.prepare(planned.scene, progress)
+    rows = run_sweep(folder, planned.common, planned.trials, progress)
+    good = [row for row in rows.values() if "error" not in row]
+    if not good:
+        last: Any = next(iter(rows.values()))
+        raise ExperimentError(f"no run of the graph succeeded; see {folder}; {last['error']}")
+    figures = {
+        metric: max(read_value(row, f"{metric.value}.p95") for row in good)
+        for metric in SystemMetric
+        if metric is not SystemMetric.SKIN
+    }
+    return {metric: value for metric, value in figures.items() if math.isfinite(value)}
