@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import CYLINDER, JsonOption, find_scene, output_file
+from flexsheet.launch.commands.options import CYLINDER, JsonOption, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -22,6 +22,7 @@ from flexsheet.launch.commands.output import (
     words,
 )
 from flexsheet.launch.methods.results import replace_non_finite
+from flexsheet.launch.plans.shipped import SCENES, find_file
 
 app = typer.Typer(add_completion=False)
 
@@ -114,7 +115,7 @@ def chart(
     --output continues an interrupted measurement.
     """
     logs_on_stderr()
-    chosen = [find_scene(one) for one in scene_files or ()]
+    chosen = [find_file(one, SCENES) for one in scene_files or ()]
     if family == SYSTEM:
         from flexsheet.launch.commands.chart_system import measure_system
 
@@ -144,7 +145,7 @@ def chart(
         return
     if len(chosen) > 1:
         raise CommandError("--scene: a method family is measured on one scene", BAD_INPUT)
-    scene = load_scene(chosen[0] if chosen else find_scene(CYLINDER))
+    scene = load_scene(chosen[0] if chosen else find_file(CYLINDER, SCENES))
     try:
         families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.experiments import compliance, image, stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Progress, require_scene, run_experiment
+from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.methods.blocks import attribute_error
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -278,15 +279,21 @@ def split_sheet_error(
         foot = shape.closest(apply(object_from_world, finger.interpolate(times_ns)))
         return foot, foot.point - offset_m * foot.normal
 
-    def present(edges: tuple[stroke.SampledMotion, stroke.SampledMotion], foot: Nearest) -> Floats:
+    def present(
+        edges: tuple[stroke.SampledMotion, stroke.SampledMotion],
+        foot: Nearest,
+        surface: SheetSurface | None,
+    ) -> Floats:
         planes = stroke.compute_sheet_planes(edges, world_from_object, times_ns)
-        return stroke.project_presented_point(foot, *planes)
+        if surface is not None:
+            planes = surface.find_tangent_planes(planes, foot.point, world_from_object[1, :3])
+        return stroke.project_presented_point(foot, planes.points, planes.normals)
 
     true_foot, wanted = find_contact(recording.finger)
     measured_foot, aimed = find_contact(recording.fingertip)
-    whole = wanted - present(recording.true_edges, true_foot)
+    whole = wanted - present(recording.true_edges, true_foot, recording.true_surface)
     fingertip = wanted - aimed
-    control = aimed - present(recording.measured_edges, measured_foot)
+    control = aimed - present(recording.measured_edges, measured_foot, recording.surface)
     return np.stack([fingertip, control, whole - fingertip - control])
 
 
