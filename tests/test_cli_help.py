@@ -84,6 +84,7 @@ def test_a_command_explains_itself_with_examples_that_parse(name: str) -> None:
         ("prepare --help", "precompute --help"),
         ("service install --help", "systemd install --help"),
         ("arms ready --help", "arms enable --help"),
+        ("arms stand-down --help", "arms disable --help"),
         ("node describe --help", "node info --help"),
     ],
 )

@@ -24,8 +24,8 @@ from typer.testing import CliRunner
 
 from flexsheet.launch import cli
 from flexsheet.launch.plans.apparatus import load_apparatus
-from flexsheet.launch.plans.documents import read_document, validate
-from flexsheet.launch.plans.launch_file import LaunchFile
+from flexsheet.launch.plans.documents import validate
+from flexsheet.launch.plans.launch_file import LaunchFile, read_launch_file
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
@@ -135,7 +135,7 @@ def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -
     file = folder / "block.yaml"
     if keys <= set(LaunchFile.model_fields):
         file.write_text(text if "nodes" in keys else f"{text}\nnodes: {{}}\n")
-        spec = validate(LaunchFile, read_document(file))
+        spec = validate(LaunchFile, read_launch_file(file))
         check_nodes({name: one.model_dump() for name, one in spec.nodes.items()})
         if {"scene", "nodes"} <= keys:
             load_graph(file)

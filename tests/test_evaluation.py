@@ -324,7 +324,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
     names = ",".join([*sizes, "arms.*.servo_lag_s", "eyes.sway_m", "finger.hand_mass_kg"])
-    arguments = ["experiment", "sensitivity", "--parameters", names, "--output", str(tmp_path)]
+    arguments = ["experiment", "sensitivity", "--parameter", names, "--output", str(tmp_path)]
     printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
     result = json.loads(printed.stdout)
     keys = {"parameter", "sigma", "sheet_mm", "image_mm", "force_percent", "fingertip_mm"}

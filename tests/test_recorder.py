@@ -107,6 +107,26 @@ async def test_it_never_writes_over_a_bag(tmp_path: Path) -> None:
     assert names_in(tmp_path) == ["a-2.mcap", "a.mcap"]
 
 
+@pytest.mark.parametrize("limit", [{"max_bag_duration_s": 10.0}, {"max_bag_bytes": 1}])
+async def test_a_bag_is_split_and_no_message_is_lost(
+    tmp_path: Path, limit: dict[str, float]
+) -> None:
+    """The next bag begins with the latched messages, so that each bag can be played alone."""
+    clock = VirtualClock(clock_id="clock")
+    node = recorder(clock, bag=tmp_path / "a.mcap", **limit)
+    await node.setup()
+    for number in (1, 2):
+        node.deliver("in/estop", *estop_message(number))
+        clock.move_to(clock.now_ns() + 11_000_000_000)
+        node.watch_disk()
+    await node.close()
+    recorded = [
+        [header.sequence for _, _, header, _ in BagReader(tmp_path / name)]
+        for name in ("a.mcap", "a-2.mcap", "a-3.mcap")
+    ]
+    assert recorded == [[1], [1, 2], [2]]
+
+
 def test_free_paths_count_up(tmp_path: Path) -> None:
     for expected in ("a.mcap", "a-2.mcap", "a-3.mcap"):
         path = free_path(tmp_path / "a.mcap")

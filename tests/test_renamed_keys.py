@@ -3,7 +3,6 @@ name."""
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -11,10 +10,8 @@ import numpy as np
 import pytest
 from pydantic import create_model
 from ruamel.yaml import YAML
-from typer.main import get_command
 
 from flexsheet.launch.bags.replay import read_runs
-from flexsheet.launch.commands import arms
 from flexsheet.launch.plans import renamed_keys
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -248,12 +245,3 @@ def test_an_old_arming_gets_an_error_that_names_the_new_one(tmp_path: Path, old:
     YAML().dump({"nodes": nodes}, file)
     with pytest.raises(BadInputError, match=f'it is now "{renamed_keys.VALUES["arming"][old]}"'):
         load_graph(file)
-
-
-@pytest.mark.parametrize(("old", "new"), [("ready", "enable"), ("stand-down", "disable")])
-def test_an_old_command_of_the_arms_is_a_hidden_alias(old: str, new: str) -> None:
-    commands: dict[str, Any] = getattr(get_command(arms.app), "commands")  # noqa: B009
-    assert commands[old].hidden
-    assert not commands[new].hidden
-    callbacks = [inspect.unwrap(commands[name].callback) for name in (old, new)]
-    assert callbacks[0] is callbacks[1]

@@ -204,8 +204,14 @@ def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option; the former form "A,B" is several values, too."""
-    return [name.strip() for one in given or () for name in one.split(",") if name.strip()]
+    """Return the values of a repeated option; the former form "A,B" is several values, too.
+
+    Raises BadParameter for values without a name.
+    """
+    names = [name.strip() for one in given or () for name in one.split(",") if name.strip()]
+    if given and not names:
+        raise typer.BadParameter("the value is empty; omit the option to select all")
+    return names
 
 
 _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "list[str]": "TEXT"}

@@ -109,6 +109,8 @@ class BagRecording:
     def _is_full(self, bag: BagWriter) -> bool:
         limits, age_s = self._parameters, (self._clock.now_ns() - self._bag_started_ns) * 1e-9
         size_bytes = bag.path.stat().st_size
+        if bag.messages == 0:
+            return False
         return (limits.max_bag_bytes is not None and size_bytes >= limits.max_bag_bytes) or (
             limits.max_bag_duration_s is not None and age_s >= limits.max_bag_duration_s
         )
