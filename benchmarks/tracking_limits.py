@@ -547,7 +547,11 @@ def main() -> None:
         printed: dict[str, Any] = {
             name: [asdict(row) for row in rows] for name, rows in results.items()
         }
-        print(json.dumps({"machine": MACHINE, "failures": printed}))
+        slowest = {
+            name: max((row.recovery_ms[1] for row in rows if row.recovery_ms), default=None)
+            for name, rows in results.items()
+        }
+        print(json.dumps({"machine": MACHINE, "max_recovery_ms": slowest, "failures": printed}))
     else:
         print(tables(results))
 

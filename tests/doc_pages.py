@@ -138,6 +138,12 @@ def prose(page: Path) -> list[tuple[int, str]]:
     return lines
 
 
+def count_words(page: Path) -> int:
+    """Return the number of words outside of code blocks and comments."""
+    text = re.sub(r"<!--.*?-->", "", "\n".join(line for _, line in prose(page)), flags=re.DOTALL)
+    return sum(bool(re.search(r"\w", word)) for word in text.split())
+
+
 def links(page: Path) -> list[Link]:
     """Yield the links and images outside of code."""
     return [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from tests.doc_pages import (
     ROOT,
     anchors,
     as_built,
+    count_words,
     headings,
     links,
     name,
     nav_pages,
     pages,
+    prose,
     site_docs,
     site_pages,
 )
@@ -30,6 +33,11 @@ EVERYBODYS = {"scene", "display", "estop", "status"}
 """Topics that the drawings of the graph omit, as their page explains."""
 
 START = DOCS / "index.md"
+
+MAX_PAGE_WORDS = 900
+MAX_README_WORDS = 450
+MAX_WORDS = 30_000
+PURPOSE = re.compile(r"This (page|tutorial|guide) ")
 
 
 def targets(page: Path) -> set[Path]:
@@ -71,6 +79,19 @@ def test_a_page_has_one_title(page: Path) -> None:
     lines = page.read_text().splitlines()
     assert lines[0].startswith("# "), f"{name(page)} does not begin with its title"
     assert headings(page)
+
+
+@pytest.mark.parametrize("page", site_pages(), ids=name)
+def test_a_page_is_short_and_begins_with_its_purpose(page: Path) -> None:
+    assert count_words(page) <= MAX_PAGE_WORDS
+    first = next(line for _, line in prose(page)[1:] if line.strip())
+    assert PURPOSE.match(first), f"{name(page)}: begin with: This page describes ..."
+
+
+def test_the_documentation_is_short() -> None:
+    assert count_words(ROOT / "README.md") <= MAX_README_WORDS
+    by_hand = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *site_pages()]
+    assert sum(map(count_words, by_hand)) <= MAX_WORDS
 
 
 def test_drawings_are_up_to_date() -> None:
