@@ -57,7 +57,7 @@ MAX_FORCE_DEPTHS_M = (0.004, 0.016)
 """Depths of the pushes whose force is compared; limited to half and all of the scene's depth."""
 
 MIN_FORCE_N = 0.1
-"""Smallest force to which an error is related; nobody feels a fraction of a smaller one."""
+"""Minimum force to which an error is related; nobody feels a fraction of a smaller one."""
 
 MAX_IMAGE_DEPTH_M = 0.03
 RENDERER_SPACING_M = 0.0025
