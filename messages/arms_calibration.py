@@ -47,7 +47,7 @@ class ArmBase(Part):
         "covariance was multiplied by its square"
     )
     max_change_m: NonNegative = Field(
-        description="largest change of the base's position when one pose is left out"
+        description="maximum change of the base's position when one pose is left out"
     )
     max_change_rad: NonNegative
     corner_sigma_px: NonNegative = Field(

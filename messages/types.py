@@ -534,7 +534,7 @@ class CpuPressure(MessagePart):
     """
 
     busy: bool = Field(description="`wait_ratio` is above a quarter")
-    wait_ratio: NonNegative = Field(description="largest waiting time of a node over elapsed time")
+    wait_ratio: NonNegative = Field(description="maximum waiting time of a node over elapsed time")
     node: str = Field(description="node with this waiting time")
     programs: tuple[ProgramCpu, ...] = Field(
         default=(),

@@ -292,11 +292,11 @@ def test_each_parameter_is_evaluated_or_says_why_not() -> None:
     assert set(TOLERANCES) >= sensitivity.TIMING
     for parameter in TOLERANCES:
         found = sensitivity.evaluation_of(parameter, with_graph=False)
-        assert (found is sensitivity.Evaluation.NOT_SIMULATED) == (parameter in NOT_SIMULATED)
+        assert (found is sensitivity.EvaluationKind.NOT_SIMULATED) == (parameter in NOT_SIMULATED)
         assert parameter.partition(".")[0] in sensitivity.AFFECTED
     assert (
         sensitivity.evaluation_of("arms.*.servo_lag_s", with_graph=True)
-        is sensitivity.Evaluation.GRAPH
+        is sensitivity.EvaluationKind.GRAPH
     )
 
 

@@ -51,7 +51,7 @@ def write_hand(
     height_m: of the finger above the object. mode: of the left arm. phase: of the target.
     """
     with BagWriter(path, {"recording": {"clock_id": "clock"}}) as writer:
-        desk = sessions.Desk(writer, ())
+        desk = sessions.MessageWriter(writer, ())
         desk.write("scene", sessions.SCENE, 0.0)
         for i in range(-10, round((SECONDS + 0.2) * RATE_HZ)):
             seconds = i / RATE_HZ

@@ -91,7 +91,7 @@ def test_every_renaming_leads_to_a_name_of_today(
     model: str | tuple[str, str], renamed: dict[str, str]
 ) -> None:
     name, field = (model, None) if isinstance(model, str) else model
-    kinds = [*(topic.message for topic in TOPICS.values()), *CALIBRATIONS]
+    kinds: list[Any] = [*(topic.message for topic in TOPICS.values()), *CALIBRATIONS]
     schemas = [kind.model_json_schema() for kind in kinds]
     parts = [part for schema in schemas for part in (schema, *schema.get("$defs", {}).values())]
     models = [part["properties"] for part in parts if part.get("title") == name]

@@ -217,7 +217,7 @@ def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
         cpu=CpuPressure(busy=False, wait_ratio=0.1, node="planner"),
     )  # fmt: skip
     with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
-        desk = sessions.Desk(writer, ())
+        desk = sessions.MessageWriter(writer, ())
         desk.write("arm_left", arm, 0.0)
         desk.write("host", quiet, 0.5, writer="launch")
         desk.write("arm_left", lost, 1.0)
@@ -237,7 +237,7 @@ def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
 def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
     bag = tmp_path / "start.mcap"
     with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
-        desk = sessions.Desk(writer, ())
+        desk = sessions.MessageWriter(writer, ())
         for number, mode in enumerate(("starting", "idle", "follow")):
             desk.write("arm_left", arm_state("left", mode=mode), 0.1 * number)
     numbers = compute_numbers(read_session(bag))

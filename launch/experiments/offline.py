@@ -64,7 +64,7 @@ MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
 turns back over the evaluated one."""
 
 MIN_FORCE_N = 0.1
-"""Smallest force to which an error is related; nobody feels a fraction of a smaller one."""
+"""Minimum force to which an error is related; nobody feels a fraction of a smaller one."""
 
 MAX_IMAGE_DEPTH_M = 0.03
 RENDERER_SPACING_M = 0.0025

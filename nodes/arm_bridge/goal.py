@@ -41,7 +41,7 @@ WAIT_FROM_RAD = 0.12
 """Difference of the edges at which the leading arm waits; the limiter stops both at 0.2 rad."""
 
 MAX_PREDICTION_S = 0.15
-"""Largest time of a target ahead of now: the horizon of fingertip predictions and a margin."""
+"""Maximum time of a target ahead of now: the horizon of fingertip predictions and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
 """Longest trajectory that is followed.  An arm then moves this long without a message."""
@@ -81,7 +81,7 @@ class GoalTiming:
 
     servo_lag_s: time from sending a command until it acts.
     target_period_s: time from a target's arrival until the next is due.
-    max_extrapolation_s: longest extrapolation of a target.
+    max_extrapolation_s: maximum extrapolation of a target.
     """
 
     servo_lag_s: float

@@ -47,7 +47,7 @@ MAX_FIXED_ERROR_RATIO = 1.4
 """Maximum error between both bounds, as a multiple of the first: 1.05 degrees, 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""Largest rotation of J4 or J1 in one step near a singularity: half their speed at 140 Hz."""
+"""Maximum rotation of J4 or J1 in one step near a singularity: half their speed at 140 Hz."""
 
 _ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
 ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
@@ -63,7 +63,7 @@ MAX_WRIST_M = float(
         + 2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.cos(_LOWEST[2] - ELBOW_ANGLE_RAD)
     )
 )
-"""Largest distance of the wrist centre from the shoulder (0.4185 m), at the end of J3."""
+"""Maximum distance of the wrist centre from the shoulder (0.4185 m), at the end of J3."""
 
 
 Shoulder = Literal["front", "back"]

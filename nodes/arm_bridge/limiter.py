@@ -28,14 +28,14 @@ its mean speed.  The ripple is largest where wrist joints rotate fast against ea
 each ripples with its own speed (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""Largest duration whose travel one command may cover.  After a longer gap the arm would catch up
+"""Maximum duration whose travel one command may cover.  After a longer gap the arm would catch up
 faster than the tool speed allows."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""Shortest and longest duration of a command; speeds over less are rounding errors."""
+"""Minimum and maximum duration of a command; speeds over less are rounding errors."""
 
 MIN_BLEND = 0.02
-"""Smallest blend from decelerating to the desired velocity that is tried."""
+"""Minimum blend from decelerating to the desired velocity that is tried."""
 
 ROUNDING_FACTOR = 1.0 + 1e-6
 """Factor by which rounding errors may exceed a limit."""

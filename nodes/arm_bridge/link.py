@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""Longest time for which counters may be unchanged.  Two exchanges within a controller's cycle of
+"""Maximum time for which counters may be unchanged.  Two exchanges within a controller's cycle of
 7.1 ms may return the same counters; 50 ms are seven cycles."""
 
 _COUNTER_PERIOD = 2**32

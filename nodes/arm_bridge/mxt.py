@@ -44,7 +44,7 @@ TYPE_JOINTS_MEASURED = 8
 FLAG_RIGHT, FLAG_ABOVE, FLAG_NONFLIP = 4, 2, 1
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
-"""Largest plausible angle of a joint; an answer with a larger one is invalid."""
+"""Maximum plausible angle of a joint; an answer with a larger one is invalid."""
 
 PACKET = (
     BlockField("command", "H", 1, "0 none, 1 move, 255 end"),

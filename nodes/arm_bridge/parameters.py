@@ -25,7 +25,7 @@ class ArmBridgeParameters(NodeParameters):
     )
     driver: Driver = Field(default="modbus", description="protocol of the arm's controller")
     timeout_s: Positive | None = Field(
-        default=None, description="longest wait for an answer; null: the driver's default"
+        default=None, description="maximum wait for an answer; null: the driver's default"
     )
     servo_lag_s: NonNegative = Field(
         default=0.03,
@@ -53,7 +53,7 @@ class ArmBridgeParameters(NodeParameters):
         "after which it stops",
     )
     max_extrapolation_s: Positive = Field(
-        default=0.06, description="longest extrapolation of a target"
+        default=0.06, description="maximum extrapolation of a target"
     )
     max_tracking_error_rad: Positive = Field(
         default=0.12, description="maximum lag of a measured joint behind its command"

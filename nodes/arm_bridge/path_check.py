@@ -47,7 +47,7 @@ START_BOUNDS = SheetBounds(
 
 REHEARSAL_STEP_S = 0.05
 MAX_REHEARSAL_S = 60.0
-"""Longest simulated motion; with START_BOUNDS it crosses the workspace in less."""
+"""Maximum simulated motion; with START_BOUNDS it crosses the workspace in less."""
 
 CORNER_EVERY = 4
 """Steps between two corners of the checked path; it deviates by less than 1 mm between them."""
@@ -63,13 +63,13 @@ ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.
 """
 
 MAX_ALIGN_STEP_RAD = 0.02
-"""Largest joint step between two checked points of an alignment."""
+"""Maximum joint step between two checked points of an alignment."""
 
 MAX_ALIGN_RAD = 1.0
-"""Largest joint motion of an alignment; beyond it the arm would change its branch."""
+"""Maximum joint motion of an alignment; beyond it the arm would change its branch."""
 
 ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
-"""Largest speed of any point of an edge, and of any joint, during an alignment."""
+"""Maximum speed of any point of an edge, and of any joint, during an alignment."""
 
 PEAK_TO_MEAN_SPEED = 1.5
 """Ratio of the largest to the mean speed of the smoothstep 3 x^2 - 2 x^3."""

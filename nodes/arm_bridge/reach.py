@@ -73,7 +73,7 @@ SPEED_STEP_S = 1e-4
 """Step of the central differences for joint speeds."""
 
 MAX_STEP_RAD = 0.05
-"""Largest joint step between two poses of a path; a jump exceeds it at any spacing."""
+"""Maximum joint step between two poses of a path; a jump exceeds it at any spacing."""
 
 MIN_FRACTION = 1e-6
 

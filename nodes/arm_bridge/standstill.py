@@ -17,13 +17,13 @@ SETTLED_COUNT = 100
 with a lag of 0.7 s has reached the arm's position."""
 
 STANDSTILL_RAD = 1e-3
-"""Largest difference of unchanged measurements; encoder noise is 200 times smaller."""
+"""Maximum difference of unchanged measurements; encoder noise is 200 times smaller."""
 
 JOINT_LEVER_M = np.array([0.6, 0.6, 0.4, 0.2, 0.2, 0.15])
 """Upper bound of the distance from each joint's axis to the arm's edge of the sheet."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""Largest distance of the edge from its command at a restart from the measurement.  Joint servos
+"""Maximum distance of the edge from its command at a restart from the measurement.  Joint servos
 with a lag of 15 ms or more cover 5 mm with less than 0.25 m/s."""
 
 JUMP_MARGIN_RAD = 0.002

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MAX_GAP_S = 1.0
-"""Longest time that one sample covers; a longer pause contains no information."""
+"""Maximum duration of one sample; a longer pause contains no information."""
 
 CLEAR_RATIO = 0.8
 """Fraction of the threshold below which a suspicion ends, so that it does not flicker."""

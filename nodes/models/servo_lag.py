@@ -50,10 +50,10 @@ MIN_COMMANDS = 4
 """Number of stored commands, and the fewest with which a measurement is compared."""
 
 MIN_STEP_S = 0.02
-"""Shortest time between two measurements in use; more would cost time and tell little."""
+"""Minimum time between two measurements in use; more would cost time without new information."""
 
 MAX_JOINT_RAD = 10.0
-"""Largest angle of a joint; larger ones are errors."""
+"""Maximum angle of a joint; larger ones are errors."""
 
 MAX_GAP_S = 0.05
 """Gap between commands after which the motion is not known, and the history starts again."""

@@ -66,7 +66,7 @@ TARGET_ERROR_RATIO = 0.10
 """Relative error of the rendered force that is aimed for."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""Smallest relative difference of stiffness that users notice.  The first: with the deformation of
+"""Minimum relative difference of stiffness that users notice.  The first: with the deformation of
 the skin as a cue (Bergmann Tiest & Kappers 2009); the second: without work or terminal force as a
 cue (Tan et al. 1995)."""
 

@@ -8,7 +8,7 @@ RESTART_COUNT = 3
 """Number of late fingertips in a row, with rising stamps, that indicate a clock step."""
 
 MIN_STEP_NS = 1_000_000
-"""Shortest interval between two exposures; no camera is faster."""
+"""Minimum interval between two exposures; no camera is faster."""
 
 AGE_WEIGHT = 0.05
 """Weight of the newest age in the mean; at 60 Hz the mean spans a third of a second."""

@@ -75,7 +75,7 @@ COMBINE_EVERY_POINTS = 4
 """Number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""Least gain of the filtered position: the innovation's mean square is known to about a tenth."""
+"""Minimum gain of the filtered position: the innovation's mean square is known to about a tenth."""
 
 START_POINTS = 32
 """Number of points at the start of a track for which gains are those of a Kalman filter that knows

@@ -14,7 +14,7 @@ from flexsheet.nodes.twin.finger import SineSum
 Floats = NDArray[np.float64]
 
 MIN_SWAY_FREQUENCY_RATIO = 0.1
-"""Lowest frequency of the sway, relative to the highest."""
+"""Minimum frequency of the sway, relative to the highest."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,8 +36,8 @@ HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop"
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
-EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", "soft body",
-          "frame drawn")  # fmt: skip
+ARM_EVENTS = ("left arm command", "right arm command")
+EVENTS = ("fingertip", "sheet target", *ARM_EVENTS, "soft body", "frame drawn")
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ def latencies(session: Session) -> Chart | None:
         p50, p99 = 1e3 * spread.quantiles_s(0.5), 1e3 * spread.quantiles_s(0.99)
         axes.plot(seconds, p99, "-", linewidth=0.9, color=COLOURS[4], label="99 %")
         axes.plot(seconds, p50, "-", linewidth=1.4, color=COLOURS[0], label="median")
-        if session.scene is not None and "arm" in event:
+        if session.scene is not None and event in ARM_EVENTS:
             allowed_ms = 1e3 * session.scene.tolerances.latency_s
             axes.axhline(allowed_ms, linestyle="--", color=INK, linewidth=1.0, label="tolerance")
         axes.set_ylim(0.0, 1.15 * float(np.nanquantile(p99, 0.98)))
