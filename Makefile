@@ -97,6 +97,7 @@ bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.recovery
+	$(BIN)/python -m benchmarks.scenes --markdown
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_size --output docs/charts
 	$(BIN)/python -m benchmarks.frame_cpu

@@ -407,7 +407,7 @@ def test_every_choice_has_a_scene_key() -> None:
     for tunable in tune.TUNABLES:
         for setting in tunable.settings.values():
             assert Methods.model_validate({tunable.key: setting})
-    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields) - {"kinematics"}
+    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields) - {"compliance"}
 
 
 def test_families_ask_for_the_scenes_own_cases_only() -> None:
