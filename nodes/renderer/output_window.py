@@ -146,7 +146,7 @@ class ProjectorWindow:
         self._note_size(size, self._presenter.framebuffer_px)
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Store the image of eye `number` for the next `show`."""
+        """Store image `number` for the next `show`."""
         if self._presenter is None:
             return
         if self._filling is None:
@@ -158,9 +158,8 @@ class ProjectorWindow:
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
-        slot.tag, slot.mode, slot.swap_eyes = tag, display.stereo, display.swap_eyes
-        if display.stereo == "mono":
-            slot.swap_eyes = False
+        slot.tag, slot.mode = tag, display.stereo
+        slot.swap_eyes = display.swap_eyes and display.stereo == "frame_sequential"
         self.context.finish()
         self._presenter.put(slot)
 
