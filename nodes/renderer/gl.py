@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -425,8 +426,19 @@ def shader_text(name: str, **macros: int) -> str:
     return re.sub(r"^#version.*$", lambda line: line[0] + defined, text, flags=re.MULTILINE)
 
 
+def limit_driver_threads() -> None:
+    """Leave half of the cores, or both of two, to other nodes, if a software driver draws.
+
+    A driver that waits for threads on busy cores needs more time, and half as much again of a
+    processor. The environment variable LP_NUM_THREADS takes precedence.
+    """
+    cores = len(os.sched_getaffinity(0))
+    os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
+
+
 def headless_context() -> moderngl.Context:
     """Return an OpenGL 3.3 context without a window; raise NoOpenGLError."""
+    limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}
     try:

@@ -9,7 +9,7 @@ import glfw
 import moderngl
 
 from flexsheet.messages.types import Display
-from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.gl import headless_context, limit_driver_threads
 from flexsheet.nodes.renderer.monitors import (
     find_monitor,
     hidden_window,
@@ -105,6 +105,7 @@ class ProjectorWindow:
         swap; 0: no wait, with tearing. Raises WindowError if there is no display or no such
         monitor.
         """
+        limit_driver_threads()
         start_glfw()
         self._monitor = None if monitor is None else find_monitor(monitor)
         self._swap_interval, self._now_ns, self._shown = swap_interval, now_ns, shown

@@ -46,7 +46,9 @@ class RendererParameters(NodeParameters):
         "periods of the camera, from 0.1 to 0.5 s.",
     )
     spacing_m: Positive = Field(
-        default=0.0025, description="Distance between vertices of the drawn surface."
+        default=0.004,
+        description="Distance between vertices of the drawn surface; no finer than the soft body's "
+        "skin is needed.",
     )
     samples: int = Field(
         default=SAMPLES,

@@ -136,11 +136,9 @@ class TwoPassProjector:
 
     def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
         """Return the sheet's vertex array; its buffers are reused for the same triangles."""
-        if self._buffers is None or self._drawn is None or sheet is not self._drawn:
+        if self._buffers is None or sheet is not self._drawn:
             vertices = np.ascontiguousarray(sheet.vertices, np.float32)
-            before = None if self._drawn is None else self._drawn.triangles
-            same = before is sheet.triangles or np.array_equal(before, sheet.triangles)
-            if self._buffers is None or not same:
+            if self._buffers is None or not self._has_triangles(sheet.triangles):
                 self._release_sheet()
                 triangles = np.ascontiguousarray(sheet.triangles, np.int32)
                 self._buffers = self._context.buffer(vertices), self._context.buffer(triangles)
@@ -154,6 +152,11 @@ class TwoPassProjector:
                 program, content, self._buffers[1]
             )
         return self._arrays[program.glo]
+
+    def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
+        """Return whether the buffers have these triangles; equal grids share one array."""
+        drawn = None if self._drawn is None else self._drawn.triangles
+        return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))
 
     def _release_sheet(self) -> None:
         for part in (*self._arrays.values(), *(self._buffers or ())):
