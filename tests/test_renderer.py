@@ -188,6 +188,18 @@ def test_missing_egl_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None
         headless_context()
 
 
+@pytest.mark.parametrize(("cores", "given", "threads"), [(2, "", "0"), (8, "", "4"), (8, "3", "3")])
+def test_a_software_driver_leaves_cores_to_other_nodes(
+    monkeypatch: pytest.MonkeyPatch, cores: int, given: str, threads: str
+) -> None:
+    monkeypatch.setenv("LP_NUM_THREADS", given)
+    if not given:
+        monkeypatch.delenv("LP_NUM_THREADS")
+    monkeypatch.setattr(gl.os, "sched_getaffinity", lambda process: set(range(cores)))
+    gl.limit_driver_threads()
+    assert gl.os.environ["LP_NUM_THREADS"] == threads
+
+
 @pytest.mark.parametrize("swap_eyes", [False, True])
 @pytest.mark.parametrize("correction", ["one_plane", "two_pass"])
 def test_both_eyes_share_an_image(
