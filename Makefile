@@ -12,7 +12,7 @@ SKIPPED := $(CURDIR)/build/skipped.txt
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test test-long lint cached bench bench-peers faults deploy-trial soak fuzz limits pages charts \
+.PHONY: setup demo try test test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits pages charts \
 	docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
@@ -104,6 +104,11 @@ bench: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
+
+# Frame time, frames per second and lag with this machine's graphics card, as a point of docs/charts;
+# exit code 3 without one.
+bench-gpu: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.frame_rate --output docs/charts
 
 # Other messaging libraries in turns with ours (a network of its own: root).
 bench-peers: setup

@@ -16,6 +16,7 @@ from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Eye
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.eye_predictor import MAX_SHIFT_M, EyePredictor
+from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.twin.error_map import ErrorMap
 from tests.test_eye import EyeBench, frame
 
@@ -32,7 +33,7 @@ class Tracked:
     def __init__(self) -> None:
         self.clock = VirtualClock(START_NS, clock_id="clock")
         self.input = Input[Eye](find_topic("eye"), self.clock)
-        self.predictor = EyePredictor(max_age_s=0.1)
+        self.predictor = EyePredictor(MaxAge(0.1))
         self.count = 0
 
     def send(self, position: np.ndarray, *, valid: bool = True, later_ns: int = PERIOD_NS) -> None:

@@ -13,7 +13,15 @@ from ruamel.yaml import YAML
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Display, Frame, SheetTarget, Skin, SoftBody
+from flexsheet.messages.types import (
+    Correction,
+    Display,
+    Frame,
+    SheetTarget,
+    Skin,
+    SoftBody,
+    StereoMode,
+)
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer import gl
@@ -26,12 +34,12 @@ from flexsheet.nodes.renderer.correction import (
 from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.node import Renderer, RendererParameters
 from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
-from flexsheet.nodes.renderer.output import pack
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 from tests.node_harness import NodeHarness
+from tests.packing import pack
 
 ROOT = Path(__file__).parents[1]
 MS = 1_000_000
@@ -180,25 +188,41 @@ def test_missing_egl_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None
         headless_context()
 
 
-def test_packing() -> None:
-    left = np.zeros((4, 6, 3), np.uint8)
-    right = np.full((4, 6, 3), 200, np.uint8)
-    assert pack(left, right, "mono") is left
-    assert pack(left, right, "mono", swap_eyes=True) is right
-    beside = pack(left, right, "side_by_side")
-    assert beside.shape == left.shape
-    assert beside[:, :3].max() == 0
-    assert beside[:, 3:].min() == 200
-    above = pack(left, right, "top_bottom", swap_eyes=True)
-    assert above[:2].min() == 200
-    assert above[2:].max() == 0
-    anaglyph = pack(left, right, "anaglyph")
-    assert anaglyph[..., 0].max() == 0
-    assert anaglyph[..., 1:].min() == 200
-    with pytest.raises(ValueError, match="equal sizes"):
-        pack(left, right[:2], "anaglyph")
-    with pytest.raises(ValueError, match="must be even"):
-        pack(left[:3], right[:3], "top_bottom")
+@pytest.mark.parametrize(("cores", "given", "threads"), [(2, "", "0"), (8, "", "4"), (8, "3", "3")])
+def test_a_software_driver_leaves_cores_to_other_nodes(
+    monkeypatch: pytest.MonkeyPatch, cores: int, given: str, threads: str
+) -> None:
+    monkeypatch.setenv("LP_NUM_THREADS", given)
+    if not given:
+        monkeypatch.delenv("LP_NUM_THREADS")
+    monkeypatch.setattr(gl.os, "sched_getaffinity", lambda process: set(range(cores)))
+    gl.limit_driver_threads()
+    assert gl.os.environ["LP_NUM_THREADS"] == threads
+
+
+@pytest.mark.parametrize("swap_eyes", [False, True])
+@pytest.mark.parametrize("correction", ["one_plane", "two_pass"])
+def test_both_eyes_share_an_image(
+    stage: SceneRenderer, correction: Correction, swap_eyes: bool
+) -> None:
+    """Each mode is what packing the images of single eyes gives, up to the blur of outlines."""
+    stage.deform(None)
+    sheet, look = stage.sheet_at_rest(), DrawStyle(False, "object")
+    shown = Display(correction=correction, stereo="mono")
+    pair = stage.eyes(Display(correction=correction, stereo="side_by_side"))
+    single = [stage.draw(shown, sheet, look, read=True, eyes=eye[None]) for eye in pair]
+    left, right = (image for image in single if image is not None)
+    modes: tuple[StereoMode, ...] = ("side_by_side", "top_bottom", "anaglyph", "frame_sequential")
+    for mode in modes:
+        display = Display(correction=correction, stereo=mode, swap_eyes=swap_eyes)
+        image = stage.draw(display, sheet, look, read=True)
+        assert image is not None
+        wanted = pack(left, right, mode, swap_eyes=swap_eyes).astype(int)
+        off = np.abs(wanted - image).max(axis=2)[wanted.max(axis=2) > 0]
+        assert np.median(off) <= 1, mode
+        assert (off > 40).mean() < 0.02, mode
+        other = pack(left, right, mode, swap_eyes=not swap_eyes).astype(int)
+        assert np.abs(other - image).mean() > 4.0 * np.abs(wanted - image).mean()
 
 
 def test_surface_is_closed_round_and_outward() -> None:

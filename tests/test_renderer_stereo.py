@@ -19,6 +19,7 @@ from flexsheet.messages.types import Correction, Display, Eye, Frame, SoftBody, 
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
 from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.lens import clip_lens
+from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet_mesh import flat_mesh, refine_mesh
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
@@ -266,6 +267,34 @@ def test_the_indentation_is_extrapolated_to_the_display_time() -> None:
         assert at_ns == 1038 * MS
         assert body is not None
         assert np.allclose(body.displacement_world_m, 1.033e-3, atol=1e-8)
+
+
+def test_an_indentation_of_a_slow_camera_is_extrapolated() -> None:
+    dent = SkinExtrapolator()
+    for at_ms in (1000, 1067, 1134):  # 15 Hz
+        dent.add(*answer(at_ms, 1e-6 * at_ms))
+    body, at_ns = dent.extrapolate(1180 * MS, "here")
+    assert body is not None
+    assert at_ns == 1180 * MS
+    assert np.allclose(body.displacement_world_m, 1.18e-3, atol=1e-8)
+    dent.add(*answer(1300, 1.3e-3))  # after a gap
+    assert dent.extrapolate(1340 * MS, "here")[1] == 1300 * MS
+
+
+@pytest.mark.parametrize(("rate_hz", "wanted_s"), [(60, 0.1), (15, 4 / 15), (2, 0.5)])
+def test_messages_of_a_slow_camera_may_be_older(rate_hz: float, wanted_s: float) -> None:
+    limit = MaxAge()
+    assert limit.seconds == 0.1
+    for number in (1, 2, 3, 6, 7, 11):  # as a busy renderer receives them
+        at_ns = round(1e9 * number / rate_hz)
+        limit.add(Header(number, at_ns, at_ns, "here", "triangulator", 1))
+    assert limit.seconds == pytest.approx(wanted_s)
+    limit.add(Header(1, 0, 0, "here", "triangulator", 2))  # a restarted node
+    assert limit.seconds == pytest.approx(wanted_s)
+    fixed = MaxAge(0.3)
+    fixed.add(Header(1, 0, 0, "here", "triangulator", 1))
+    fixed.add(Header(2, 1, 1, "here", "triangulator", 1))
+    assert fixed.seconds == 0.3
 
 
 def test_an_indentation_of_another_method_is_not_extrapolated() -> None:

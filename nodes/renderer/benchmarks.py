@@ -22,9 +22,8 @@ from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
-from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.gl import DrawStyle, Image, headless_context
 from flexsheet.nodes.renderer.object_surface import make_surface
-from flexsheet.nodes.renderer.output import Image
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Header
 from flexsheet.messages.types import Eye
 from flexsheet.nodes.node import Input
+from flexsheet.nodes.renderer.max_age import MaxAge
 
 Floats = NDArray[np.float64]
 
@@ -32,11 +33,11 @@ MAX_SHIFT_M = 0.03
 class EyePredictor:
     """Predictor of the eyes by their measured velocity, a line through the last positions.
 
-    max_age_s: age beyond which the eyes count as not tracked.
+    max_age: age beyond which the eyes count as not tracked.
     """
 
-    def __init__(self, *, max_age_s: float) -> None:
-        self._max_age_s = max_age_s
+    def __init__(self, max_age: MaxAge) -> None:
+        self._max_age = max_age
         self._positions: deque[tuple[int, Floats]] = deque()
         self._clock: tuple[str, int] | None = None
 
@@ -47,7 +48,9 @@ class EyePredictor:
         if not eye.valid:
             known.clear()
             return
-        if known and (clock != self._clock or not 0 < at_ns - known[-1][0] < 1e9 * self._max_age_s):
+        if known and (
+            clock != self._clock or not 0 < at_ns - known[-1][0] < 1e9 * self._max_age.seconds
+        ):
             known.clear()
         self._clock = clock
         known.append((at_ns, np.asarray(eye.centre_world_m, dtype=np.float64)))
@@ -60,7 +63,7 @@ class EyePredictor:
         An invalid message is returned as it is.
         """
         eye, age_s = tracked.message, tracked.age_s()
-        if eye is None or age_s > self._max_age_s:
+        if eye is None or age_s > self._max_age.seconds:
             return None
         ahead_s = min(max(age_s + horizon_s, 0.0), MAX_AHEAD_S)
         shift = ahead_s * self._velocity()

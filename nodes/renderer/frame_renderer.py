@@ -21,6 +21,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
 from flexsheet.nodes.renderer.eye_predictor import EyePredictor
+from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
 from flexsheet.nodes.renderer.output_window import OutputWindow
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
@@ -58,15 +59,15 @@ class FrameRenderer:
         latency: DisplayLatencyEstimator,
         clock: Clock,
         *,
-        max_age_s: float,
+        max_age: MaxAge,
     ) -> None:
         self.scene_renderer = scene_renderer
         self.note = ""
         self.late = self.superseded = 0
         self._output, self._ports, self._latency, self._clock = screen, ports, latency, clock
-        self._max_age_s = max_age_s
-        self._sheet_predictor = SheetPosePredictor(max_age_s=max_age_s)
-        self._eye_predictor = EyePredictor(max_age_s=max_age_s)
+        self._max_age = max_age
+        self._sheet_predictor = SheetPosePredictor(max_age)
+        self._eye_predictor = EyePredictor(max_age)
         self._extrapolator = SkinExtrapolator()
         self._number = 0
         self._drawn_of: tuple[object, ...] = ()
@@ -100,7 +101,7 @@ class FrameRenderer:
         source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
         tracked = self._eye_predictor.predict(ports.eye, horizon_s)
         eyes, across, eye_note = select_eyes(scene_renderer.scene.eyes, tracked)
-        finger_tip = predict_fingertip(ports.fingertip, horizon_s, max_age_s=self._max_age_s)
+        finger_tip = predict_fingertip(ports.fingertip, horizon_s, max_age_s=self._max_age.seconds)
         sheet = self._sheet_predictor.update(
             scene_renderer,
             ports.arm_left,
@@ -179,7 +180,7 @@ class FrameRenderer:
         Returns the exposure time of the data and the time of the deformation, ns.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
-        skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age_s
+        skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds
         if skin is not None and scene_renderer.mesh_id != skin.mesh_id:
             scene_renderer.set_skin(skin)
         body, shaped_for_ns = self._extrapolator.extrapolate(
@@ -189,7 +190,7 @@ class FrameRenderer:
             body, shaped_for_ns = None, 0
         scene_renderer.deform(body)
         header = ports.soft_body.header if fresh else ports.fingertip.header
-        recent = fresh or ports.fingertip.age_s() <= self._max_age_s
+        recent = fresh or ports.fingertip.age_s() <= self._max_age.seconds
         return (header.source_ns if recent and header is not None else now_ns), shaped_for_ns
 
 

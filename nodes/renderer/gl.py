@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
@@ -28,10 +31,12 @@ FAR_M = 5.0
 SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
-SCREEN_PATTERNS = {"grid": 1, "checker": 2, "white": 3}
-"""Patterns on the imaginary screen and their numbers in the shader."""
+SCREEN_PATTERNS = ("grid", "checker", "white")
+"""Patterns on the imaginary screen."""
+SOFT_LOOK, FLAT_LOOK = 0, 1
+LOOKS = {"coordinate_ramp_x": 2, "coordinate_ramp_y": 3, "grid": 4, "checker": 5, "white": 6}
+"""Numbers of the patterns in the shader."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
-RAMP_AXES = {"coordinate_ramp_x": 1, "coordinate_ramp_y": 2}
 MARK_RADIUS_M = 0.003
 
 
@@ -47,7 +52,8 @@ class EyeView:
     """Geometry of one eye's image.
 
     eye, projector: (3,), world. screen: None for no correction. clip_from_screen: (3, 3), see
-    `correction.clip_from_screen`. lens: None for no distortion.
+    `correction.clip_from_screen`. lens: None for no distortion. grey: whether to draw without
+    colour.
     """
 
     eye: Floats
@@ -55,6 +61,7 @@ class EyeView:
     screen: ProjectionScreen | None
     clip_from_screen: Floats
     lens: ClipLens | None = None
+    grey: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +72,37 @@ class DrawStyle:
     pattern: str
     fingertip_mark: Floats | None = None
     target_mark: Floats | None = None
+
+    @property
+    def is_marked(self) -> bool:
+        return self.fingertip_mark is not None or self.target_mark is not None
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePart:
+    """Part of the projector's image that one eye sees.
+
+    viewport: left, bottom, width, height, px. channels: red, green and blue that are drawn.
+    """
+
+    viewport: tuple[int, int, int, int]
+    channels: tuple[bool, bool, bool] = (True, True, True)
+
+    @property
+    def is_grey(self) -> bool:
+        return not all(self.channels)
+
+    @contextmanager
+    def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
+        """Draw only in this part of a frame; other channels of it keep their values."""
+        whole = frame.viewport
+        frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
+        if self.is_grey:
+            frame.clear(0.0, 0.0, 0.0, 1.0)  # of the depth, too, that the other eye drew
+        try:
+            yield
+        finally:
+            frame.viewport, frame.color_mask = whole, (True, True, True, True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +131,9 @@ class Canvas:
         """Allocate the frame; samples: per pixel, limited by the driver's maximum."""
         self.width_px, self.height_px = width_px, height_px
         self.context = context
-        vertex, fragment = shader_text("object.vert.glsl"), shader_text("object.frag.glsl")
-        self._program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
-        self._uniforms = Uniforms(self._program)
+        self._programs = Programs(context, "object")
+        self._material: dict[str, object] = {}
+        self._texture = TEXTURES["none"]
         samples = min(samples, self.context.max_samples)
         size = (width_px, height_px)
         self._frame = self.context.framebuffer(
@@ -106,6 +144,7 @@ class Canvas:
         self.resolved = self.context.framebuffer(picture)
         # The same image with a depth buffer, for drawing without multisampling.
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
+        self.target = self._frame
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._object: _MeshBuffers | None = None
         self._image: moderngl.Texture | None = None
@@ -125,7 +164,7 @@ class Canvas:
             frame.release()
         if self._image is not None:
             self._image.release()
-        self._program.release()
+        self._programs.release()
 
     def set_material(self, material: SurfaceMaterial) -> None:
         """Set the object's colour and texture."""
@@ -139,13 +178,13 @@ class Canvas:
             self._image.build_mipmaps()
             self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._image.repeat_x = self._image.repeat_y = False
-        self._uniforms.set(
-            object_colour=material.colour,
-            texture_kind=TEXTURES[material.texture],
-            texture_pitch_m=material.pitch_m,
-            image_from_world=tuple(material.image_from_world.T.ravel().tolist()),
-            object_from_world=tuple(material.object_from_world.T.ravel().tolist()),
-        )
+        self._texture = TEXTURES[material.texture]
+        self._material = {
+            "object_colour": material.colour,
+            "texture_pitch_m": material.pitch_m,
+            "image_from_world": tuple(material.image_from_world.T.ravel().tolist()),
+            "object_from_world": tuple(material.object_from_world.T.ravel().tolist()),
+        }
 
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
@@ -172,38 +211,60 @@ class Canvas:
 
     def draw(self, view: EyeView, look: DrawStyle) -> None:
         """Draw an image and wait for completion."""
-        self.draw_into(self._frame, view, look)
-        self.finish()
+        self.begin(multisampled=True)
+        self.draw_into(self.target, view, look)
+        self.resolve()
+        self.context.finish()
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
         """Draw without resolving the samples, as a lower bound of the time of all methods."""
-        self.draw_into(self._frame, view, look)
+        self.begin(multisampled=True)
+        self.draw_into(self.target, view, look)
         self.context.finish()
+
+    def begin(self, *, multisampled: bool) -> None:
+        """Clear the image that is drawn into `target`."""
+        self.target = self._frame if multisampled else self._single
+        self.target.clear(0.0, 0.0, 0.0, 1.0)
 
     def draw_into(self, frame: moderngl.Framebuffer, view: EyeView, look: DrawStyle) -> None:
-        """Draw the object, or the pattern, into a frame."""
-        frame.use()
-        frame.clear(0.0, 0.0, 0.0, 1.0)
+        """Draw the object, or the pattern, into a cleared frame."""
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
-        if look.pattern != "black" and mesh is not None:
-            # A projector behind the screen draws a mirrored image, which reverses front faces.
-            mirrored = _determinant(view.clip_from_screen) < 0.0
-            self.context.front_face = "cw" if mirrored else "ccw"
-            set_view(self._uniforms, view)
-            self._set_look(look)
-            if self._image is not None:
-                self._image.use()
-            mesh.array(self._program).render(moderngl.TRIANGLES)
+        if look.pattern == "black" or mesh is None:
+            return
+        frame.use()
+        # A projector behind the screen draws a mirrored image, which reverses front faces.
+        mirrored = _determinant(view.clip_from_screen) < 0.0
+        self.context.front_face = "cw" if mirrored else "ccw"
+        program, uniforms = self._program(view, look)
+        set_view(uniforms, view)
+        uniforms.set(
+            **self._material,
+            grid_pitch_m=GRID_PITCH_M,
+            light_direction=tuple(LIGHT.tolist()),
+            fingertip_mark=_mark(look.fingertip_mark),
+            target_mark=_mark(look.target_mark),
+        )
+        if self._image is not None:
+            self._image.use()
+        mesh.array(program).render(moderngl.TRIANGLES)
 
-    def begin(self) -> None:
-        """Clear and bind the frame that is read, for drawing without multisampling."""
-        self._single.use()
-        self._single.clear(0.0, 0.0, 0.0, 1.0)
+    def _program(self, view: EyeView, look: DrawStyle) -> tuple[moderngl.Program, Uniforms]:
+        """Return the program for a view and a style."""
+        number = LOOKS.get(look.pattern, FLAT_LOOK if look.flat else SOFT_LOOK)
+        return self._programs.get(
+            LOOK=number,
+            TEXTURE=self._texture if number == SOFT_LOOK else 0,
+            MARKS=number in (SOFT_LOOK, FLAT_LOOK) and look.is_marked,
+            CORRECTED=view.screen is not None,
+            LENS=view.lens is not None,
+            GREY=view.grey,
+        )
 
-    def finish(self) -> None:
-        """Resolve the frame's samples and wait for completion."""
-        self.context.copy_framebuffer(self.resolved, self._frame)
-        self.context.finish()
+    def resolve(self) -> None:
+        """Resolve the samples of a multisampled image into the one that is read."""
+        if self.target is self._frame:
+            self.context.copy_framebuffer(self.resolved, self._frame)
 
     def read(self) -> Image:
         """Return the last image: (height, width, 3), top row first."""
@@ -215,25 +276,13 @@ class Canvas:
         """Return the shader's A' of each vertex and its validity, 0 or 1, (vertices, 4)."""
         if self._object is None:
             raise RuntimeError("set_mesh must be called before shifted_points")
-        program = self.context.program(
-            vertex_shader=shader_text("object.vert.glsl"), varyings=("shifted",)
-        )
+        text = shader_text("object.vert.glsl", CORRECTED=view.screen is not None, LENS=False)
+        program = self.context.program(vertex_shader=text, varyings=("shifted",))
         set_view(Uniforms(program), view)
         self._frame.use()  # transform feedback without a window requires a bound frame
         captured = self.context.buffer(reserve=self._object.count * 16)
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
-
-    def _set_look(self, look: DrawStyle) -> None:
-        self._uniforms.set(
-            flat_shading=look.flat,
-            screen_pattern=SCREEN_PATTERNS.get(look.pattern, 0),
-            grid_pitch_m=GRID_PITCH_M,
-            ramp_axis=RAMP_AXES.get(look.pattern, 0),
-            light_direction=tuple(LIGHT.tolist()),
-            fingertip_mark=_mark(look.fingertip_mark),
-            target_mark=_mark(look.target_mark),
-        )
 
 
 def _mark(point: Floats | None) -> tuple[float, ...]:
@@ -255,13 +304,35 @@ class Uniforms:
                 self._program[name] = last[name] = value
 
 
+class Programs:
+    """Variants of a shader program by the macros of their texts, compiled when first used."""
+
+    def __init__(self, context: moderngl.Context, name: str) -> None:
+        self._context, self._name = context, name
+        self._variants: dict[tuple[int, ...], tuple[moderngl.Program, Uniforms]] = {}
+
+    def get(self, **macros: int) -> tuple[moderngl.Program, Uniforms]:
+        """Return the program with macros, always the same ones in the same order."""
+        key = tuple(macros.values())
+        if key not in self._variants:
+            program = self._context.program(
+                vertex_shader=shader_text(f"{self._name}.vert.glsl", **macros),
+                fragment_shader=shader_text(f"{self._name}.frag.glsl", **macros),
+            )
+            self._variants[key] = program, Uniforms(program)
+        return self._variants[key]
+
+    def release(self) -> None:
+        for program, _ in self._variants.values():
+            program.release()
+
+
 def set_view(uniforms: Uniforms, view: EyeView) -> None:
     """Set the vertex shader's uniforms for a view."""
     screen = view.screen
     uniforms.set(
         eye=tuple(view.eye.tolist()),
         projector=tuple(view.projector.tolist()),
-        corrected=screen is not None,
         grazing_sine=GRAZING_SINE,
         near_m=NEAR_M,
         far_m=FAR_M,
@@ -273,9 +344,12 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
             sheet_normals=[tuple(row) for row in screen.normals.tolist()],
             sector_normals=[tuple(row) for row in sector_normals(screen, view.eye).tolist()],
         )
-    uniforms.set(lens_reach=0.0 if view.lens is None else view.lens.reach)
     if view.lens is not None:
-        uniforms.set(lens=view.lens.focal_centre, lens_distortion=view.lens.distortion)
+        uniforms.set(
+            lens=view.lens.focal_centre,
+            lens_distortion=view.lens.distortion,
+            lens_reach=view.lens.reach,
+        )
 
 
 class _MeshBuffers:
@@ -344,14 +418,27 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
     return points, triangulate_grid(cells + 1, cells + 1)
 
 
-def shader_text(name: str) -> str:
-    """Return the text of a shader file with its lines `#include "name"` expanded."""
+def shader_text(name: str, **macros: int) -> str:
+    """Return the text of a shader file with macros and its lines `#include "name"` expanded."""
     text = files("flexsheet.nodes.renderer").joinpath(name).read_text()
-    return re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
+    text = re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
+    defined = "".join(f"\n#define {macro} {int(value)}" for macro, value in macros.items())
+    return re.sub(r"^#version.*$", lambda line: line[0] + defined, text, flags=re.MULTILINE)
+
+
+def limit_driver_threads() -> None:
+    """Leave half of the cores, or both of two, to other nodes, if a software driver draws.
+
+    A driver that waits for threads on busy cores needs more time, and half as much again of a
+    processor. The environment variable LP_NUM_THREADS takes precedence.
+    """
+    cores = len(os.sched_getaffinity(0))
+    os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
 
 
 def headless_context() -> moderngl.Context:
     """Return an OpenGL 3.3 context without a window; raise NoOpenGLError."""
+    limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}
     try:

@@ -1,12 +1,15 @@
 // The projector's lens: Brown's distortion in OpenCV's convention (k1, k2, p1, p2, k3). It maps an
 // image without distortion, in homogeneous clip coordinates, to the one that enters the lens.
-// `lens_reach`, the maximum squared slope, prevents folding beyond it.
+// `lens_reach`, the maximum squared slope, prevents folding beyond it.  LENS: 1: with distortion.
 uniform vec4 lens;  // focal lengths and principal point, in clip coordinates
 uniform float lens_distortion[5];
-uniform float lens_reach;  // 0: no distortion
+uniform float lens_reach;
 
 vec3 through_lens(vec3 clip) {
-    if (lens_reach == 0.0 || clip.z <= 0.0) return clip;
+#if !LENS
+    return clip;
+#else
+    if (clip.z <= 0.0) return clip;
     vec2 slope = (clip.xy / clip.z - lens.zw) / lens.xy;
     float k1 = lens_distortion[0], k2 = lens_distortion[1], k3 = lens_distortion[4];
     vec2 p = vec2(lens_distortion[2], lens_distortion[3]);
@@ -15,4 +18,5 @@ vec3 through_lens(vec3 clip) {
     float radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
     vec2 bent = slope * radial + 2.0 * p * slope.x * slope.y + p.yx * (r2 + 2.0 * slope * slope);
     return vec3((bent * lens.xy + lens.zw) * clip.z, clip.z);
+#endif
 }

@@ -24,6 +24,7 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
 from flexsheet.nodes.renderer.frame_renderer import FrameRenderer, RendererInputs
+from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.output_window import OutputWindow, open_output
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
@@ -65,6 +66,7 @@ class Renderer(Node):
         self._output = self._new_output()
         self._frame_renderer: FrameRenderer | None = None
         self._shown = Display(correction="two_pass", stereo="side_by_side")
+        self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
         self._idle_period_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
@@ -105,7 +107,7 @@ class Renderer(Node):
         )
         ports = RendererInputs(**{name: self.inputs[name] for name in RendererInputs.__slots__})
         self._frame_renderer = FrameRenderer(
-            scene_renderer, self._output, ports, latency, self.clock, max_age_s=given.max_age_s
+            scene_renderer, self._output, ports, latency, self.clock, max_age=self._max_age
         )
 
     def on_display(self, display: Display, header: Header) -> None:
@@ -121,7 +123,8 @@ class Renderer(Node):
             self._frame_renderer.on_eye(eye, header)
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
-        if self.soft_body.age_s() > self.parameters.max_age_s:
+        self._max_age.add(header)
+        if self.soft_body.age_s() > self._max_age.seconds:
             self._draw_if_due()
 
     @periodic("rate_hz")
@@ -160,6 +163,7 @@ class Renderer(Node):
         self._draw(self._frame_renderer, now_ns)
         # If drawing is slower than the rate, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
+        self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
     def _draw(self, frame_renderer: FrameRenderer, begun_ns: int) -> None:

@@ -1,16 +1,17 @@
 #version 330
 
 // Patterns on the imaginary screen, the object colour-coded with its expected position, or the
-// object with soft shading; docs/renderer.md has the formulas.
+// object with soft shading; docs/renderer.md has the formulas.  A program has one LOOK and TEXTURE,
+// because a software driver computes all branches of a shader for each pixel.
 
-uniform bool flat_shading;
-uniform int screen_pattern;  // 0: the object, 1: grid, 2: checker, 3: white
+// LOOK: 0: soft shading, 1: flat, 2 or 3: each point coloured by the x or y at which the eye should
+// see it, 4: grid, 5: checker, 6: white
+// TEXTURE: 0: none, 1: speckle, 2: grid, 3: image
+// MARKS: 1: with the marks of fingertip and target
+// GREY: 1: without colour
 uniform float grid_pitch_m;
-uniform int ramp_axis;  // 1 or 2: colour each point by the x or y at which the eye should see it
 uniform vec3 eye;
-uniform vec3 light_direction;
 uniform vec3 object_colour;
-uniform int texture_kind;  // 0: none, 1: speckle, 2: grid, 3: image
 uniform float texture_pitch_m;
 uniform mat4 object_from_world;
 uniform mat4 image_from_world;
@@ -20,8 +21,8 @@ uniform vec4 target_mark;
 
 in vec3 rest_point;
 in vec3 true_point;
-in vec3 surface_normal;
-in float sunk_m;
+in vec3 light;
+in vec3 sheen;
 in float valid;
 
 out vec4 colour;
@@ -29,35 +30,29 @@ out vec4 colour;
 const float RAMP_PERIOD_M = 0.02;
 const float RAMP_RANGE_M = 0.24;
 
-const float WRAP = 0.35;  // light extends past the edge of the lit side: cosine down to -0.35
-const float AMBIENT = 0.25;
-const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // subsurface red light near the terminator
-const float HALF_DARK_M = 0.025;  // depth at which half of the light is lost
-const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // light there is redder
 const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // aligned with no face
-const float SHEEN = 0.10;
-const float SHEEN_EXPONENT = 20.0;
 
-// Lines a pitch apart, at zero and its multiples, with edges antialiased over a pixel.
+// Lines a pitch apart, at zero and its multiples: the share of a pixel that they cover.
 vec2 lines(vec2 place, float pitch, float half_width) {
     vec2 from_line = abs(fract(place / pitch + 0.5) - 0.5) * pitch;
-    vec2 softness = fwidth(place);
-    return 1.0 - smoothstep(vec2(half_width), vec2(half_width) + softness, from_line);
+    vec2 half_px = max(0.5 * fwidth(place), 1e-9);
+    vec2 covered = min(from_line + half_px, half_width) - max(from_line - half_px, -half_width);
+    return clamp(0.5 * covered / half_px, 0.0, 1.0);
 }
 
 vec3 on_screen(vec2 place) {
-    if (screen_pattern == 1) {
-        vec2 line = lines(place, grid_pitch_m, 0.0005);
-        return vec3(max(line.x, line.y));
-    }
-    if (screen_pattern == 2) {
-        // A steep triangle wave: +1 on even squares, -1 on odd ones, antialiased over a pixel.
-        vec2 wave = 1.0 - 2.0 * abs(2.0 * fract(place / (2.0 * grid_pitch_m) + 0.25) - 1.0);
-        vec2 steep = 0.5 * grid_pitch_m / max(fwidth(place), vec2(1e-9));
-        vec2 side = clamp(wave * steep, -1.0, 1.0);
-        return vec3(0.5 + 0.5 * side.x * side.y);
-    }
+#if LOOK == 4
+    vec2 line = lines(place, grid_pitch_m, 0.0005);
+    return vec3(max(line.x, line.y));
+#elif LOOK == 5
+    // A steep triangle wave: +1 on even squares, -1 on odd ones, antialiased over a pixel.
+    vec2 wave = 1.0 - 2.0 * abs(2.0 * fract(place / (2.0 * grid_pitch_m) + 0.25) - 1.0);
+    vec2 steep = 0.5 * grid_pitch_m / max(fwidth(place), vec2(1e-9));
+    vec2 side = clamp(wave * steep, -1.0, 1.0);
+    return vec3(0.5 + 0.5 * side.x * side.y);
+#else
     return vec3(1.0);
+#endif
 }
 
 // One pseudo-random number from 0 to 1 for each cell of a lattice.
@@ -69,14 +64,16 @@ float scattered(ivec3 cell, uint which) {
 }
 
 vec3 albedo() {
-    if (texture_kind == 0) return object_colour;
-    if (texture_kind == 3)
-        return texture(image, (image_from_world * vec4(rest_point, 1.0)).xy).rgb;
+#if TEXTURE == 0
+    return object_colour;
+#elif TEXTURE == 3
+    return texture(image, (image_from_world * vec4(rest_point, 1.0)).xy).rgb;
+#else
     vec3 place = (object_from_world * vec4(rest_point, 1.0)).xyz;
-    if (texture_kind == 2) {
-        vec2 line = lines(place.xy, texture_pitch_m, 0.0004);
-        return mix(object_colour, 0.45 * object_colour, max(line.x, line.y));
-    }
+#if TEXTURE == 2
+    vec2 line = lines(place.xy, texture_pitch_m, 0.0004);
+    return mix(object_colour, 0.45 * object_colour, max(line.x, line.y));
+#else
     // A ball at a random position in each cell of half a pitch; where the surface cuts one, there
     // is a spot.
     vec3 in_cells = ASLANT * place / (0.5 * texture_pitch_m);
@@ -88,18 +85,8 @@ vec3 albedo() {
     float softness = length(fwidth(place)) / (0.5 * texture_pitch_m);
     float spot = 1.0 - smoothstep(radius - softness, radius + softness, away);
     return mix(object_colour, 0.5 * object_colour, spot * clamp(0.3 / softness, 0.0, 1.0));
-}
-
-vec3 soft() {
-    vec3 normal = surface_normal / max(length(surface_normal), 1e-6);
-    vec3 to_eye = normalize(eye - true_point);
-    float facing = dot(normal, light_direction);
-    float wrapped = max((facing + WRAP) / (1.0 + WRAP), 0.0);
-    float turning = wrapped * max(1.0 - wrapped, 0.0) * 4.0;
-    vec3 dark = pow(vec3(1.0 / (1.0 + max(sunk_m, 0.0) / HALF_DARK_M)), DARKENING);
-    float sheen = pow(max(dot(normal, normalize(light_direction + to_eye)), 0.0), SHEEN_EXPONENT);
-    vec3 light = vec3(AMBIENT + (1.0 - AMBIENT) * wrapped) + GLOW * turning;
-    return albedo() * light * dark + SHEEN * sheen * dark;
+#endif
+#endif
 }
 
 // Coverage of this point by a ring between two radii, antialiased over a pixel.
@@ -113,22 +100,25 @@ float ring(vec4 mark, float inner) {
 
 void main() {
     if (valid < 0.9999) discard;  // a triangle with a vertex that could not be corrected
-    if (screen_pattern > 0) {
-        colour = vec4(on_screen(rest_point.xy), 1.0);
-        return;
-    }
-    if (ramp_axis > 0) {
-        // The position on the imaginary screen, coded: fine by a phase in red and green, coarse in
-        // blue.
-        vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
-        float place = ramp_axis == 1 ? seen.x : seen.y;
-        float phase = 6.283185307 * place / RAMP_PERIOD_M;
-        float coarse = clamp(place / RAMP_RANGE_M + 0.5, 0.0, 1.0);
-        colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
-        return;
-    }
-    vec3 painted = flat_shading ? vec3(1.0) : soft();
+#if LOOK >= 4
+    colour = vec4(on_screen(rest_point.xy), 1.0);
+#elif LOOK >= 2
+    // The position on the imaginary screen, coded: fine by a phase in red and green, coarse in
+    // blue.
+    vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
+    float place = LOOK == 2 ? seen.x : seen.y;
+    float phase = 6.283185307 * place / RAMP_PERIOD_M;
+    float coarse = clamp(place / RAMP_RANGE_M + 0.5, 0.0, 1.0);
+    colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
+#else
+    vec3 painted = LOOK == 1 ? vec3(1.0) : albedo() * light + sheen;
+#if MARKS
     painted = mix(painted, vec3(0.1, 0.35, 0.9), ring(target_mark, 0.6));
     painted = mix(painted, vec3(0.85, 0.1, 0.1), ring(fingertip_mark, -1.0));
+#endif
     colour = vec4(painted, 1.0);
+#endif
+#if GREY
+    colour.rgb = vec3(dot(colour.rgb, vec3(0.299, 0.587, 0.114)));
+#endif
 }

@@ -1,10 +1,10 @@
 #version 330
 
-// Equations (1)-(6) of the paper per vertex, as in nodes/renderer/correction.py.
+// Equations (1)-(6) of the paper per vertex, as in nodes/renderer/correction.py, and soft shading;
+// docs/renderer.md has the formulas.  CORRECTED: 1: with the equations.
 
 uniform vec3 eye;
 uniform vec3 projector;
-uniform bool corrected;
 uniform vec3 sheet_point;
 uniform vec3 sheet_normals[4];
 uniform vec3 sector_normals[4];
@@ -12,6 +12,7 @@ uniform mat3 clip_from_screen;
 uniform float grazing_sine;
 uniform float near_m;
 uniform float far_m;
+uniform vec3 light_direction;
 
 #include "lens.glsl"
 
@@ -22,10 +23,18 @@ in vec3 normal;
 
 out vec3 rest_point;
 out vec3 true_point;  // A
-out vec3 surface_normal;
-out float sunk_m;  // depth below the surface at rest
+out vec3 light;  // factor of the surface's own colour
+out vec3 sheen;
 out float valid;
 out vec4 shifted;  // A', and 1 where it is valid
+
+const float WRAP = 0.35;  // light extends past the edge of the lit side: cosine down to -0.35
+const float AMBIENT = 0.25;
+const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // subsurface red light near the terminator
+const float HALF_DARK_M = 0.025;  // depth at which half of the light is lost
+const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // light there is redder
+const float SHEEN = 0.10;
+const float SHEEN_EXPONENT = 20.0;
 
 const vec3 n_o = vec3(0.0, 0.0, 1.0);  // the imaginary screen is z = 0: r_o is the origin
 
@@ -44,8 +53,9 @@ int triangle_of(vec3 line) {
 
 vec4 shift(vec3 a) {
     bool ok = dot(eye - a, n_o) > near_m;
-    if (!corrected) return vec4(a, ok ? 1.0 : 0.0);
-
+#if !CORRECTED
+    return vec4(a, ok ? 1.0 : 0.0);
+#else
     vec3 n_s = sheet_normals[triangle_of(a - eye)];
     float toward_eye = dot(eye - a, n_s);
     ok = ok && toward_eye > grazing_sine * length(eye - a);
@@ -61,6 +71,20 @@ vec4 shift(vec3 a) {
 
     float s3 = dot(a - c_shifted, n_o) / dot(eye - c_shifted, n_o);
     return ok ? vec4(s3 * eye + (1.0 - s3) * c_shifted, 1.0) : vec4(a, 0.0);
+#endif
+}
+
+// Set `light` and `sheen`, which are smooth enough to be interpolated between vertices.
+void shade() {
+    vec3 outward = normal / max(length(normal), 1e-6);
+    vec3 to_eye = normalize(eye - position);
+    float sunk_m = dot(rest_position - position, rest_normal);  // depth below the surface at rest
+    float wrapped = max((dot(outward, light_direction) + WRAP) / (1.0 + WRAP), 0.0);
+    float turning = wrapped * max(1.0 - wrapped, 0.0) * 4.0;
+    vec3 dark = pow(vec3(1.0 / (1.0 + max(sunk_m, 0.0) / HALF_DARK_M)), DARKENING);
+    float aligned = max(dot(outward, normalize(light_direction + to_eye)), 0.0);
+    light = (vec3(AMBIENT + (1.0 - AMBIENT) * wrapped) + GLOW * turning) * dark;
+    sheen = SHEEN * pow(aligned, SHEEN_EXPONENT) * dark;
 }
 
 void main() {
@@ -68,8 +92,7 @@ void main() {
     valid = shifted.w;
     rest_point = rest_position;
     true_point = position;
-    surface_normal = normal;
-    sunk_m = dot(rest_position - position, rest_normal);
+    shade();
 
     // From A' through the eye's pinhole onto z = 0, homogeneous: w is the depth before the eye.
     float w = eye.z - shifted.z;

@@ -1,4 +1,4 @@
-"""Select the eyes of a frame and pack the images of both eyes for the projector."""
+"""Select the eyes of a frame and the part of the projector's image for each."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Eyes
 from flexsheet.messages.types import Eye, StereoMode
+from flexsheet.nodes.renderer.gl import ImagePart
 
-Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 WhichEye = Literal["both", "left", "right"]
 
@@ -72,7 +72,7 @@ def select_drawn_eyes(
     """Return the eyes (1 or 2, 3) of a pair (2, 3) for which a frame's images are drawn.
 
     With swap_eyes, a frame for one eye contains the other eye's image, for glasses of the opposite
-    phase. Images of both eyes are swapped by `pack`.
+    phase. Images of both eyes are swapped by `image_parts`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)
@@ -80,35 +80,23 @@ def select_drawn_eyes(
     return pair[:1] if mode == "mono" else pair
 
 
-def pack(left: Image, right: Image, mode: StereoMode, *, swap_eyes: bool = False) -> Image:
-    """Pack two images into one image (height, width, 3) of the same size.
+def image_parts(mode: StereoMode, size: tuple[int, int], *, swap_eyes: bool) -> list[ImagePart]:
+    """Return the parts of the projector's image for the eyes that share it: one or two.
 
-    mono, frame_sequential: the left image. side_by_side, top_bottom: both, halved in width or
-    height by averaging, left first. anaglyph: red of the left, green and blue of the right, both
-    in grey. swap_eyes: exchange the images first. Raises ValueError if the sizes differ or are odd.
+    side_by_side, top_bottom: half the width or height each, left eye first or above. anaglyph: the
+    whole, red for the left eye and green and blue for the right one, without colour. swap_eyes:
+    exchange the parts.
     """
-    if left.shape != right.shape:
-        raise ValueError(f"images to pack must have equal sizes: {left.shape} and {right.shape}")
-    if swap_eyes:
-        left, right = right, left
-    if mode in ("mono", "frame_sequential"):
-        return left
-    if mode == "anaglyph":
-        packed = np.empty_like(left)
-        packed[..., 0] = _gray(left)
-        packed[..., 1:] = _gray(right)[..., None]
-        return packed
-    axis = 1 if mode == "side_by_side" else 0
-    return np.concatenate([_halved(left, axis), _halved(right, axis)], axis=axis)
-
-
-def _gray(image: Image) -> Image:
-    gray: Image = np.rint(image @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
-    return gray
-
-
-def _halved(image: Image, axis: int) -> Image:
-    if image.shape[axis] % 2:
-        raise ValueError(f"image size {image.shape[1]}x{image.shape[0]} must be even for halving")
-    even, odd = (image[:, i::2] if axis == 1 else image[i::2] for i in (0, 1))
-    return ((even.astype(np.uint16) + odd + 1) // 2).astype(np.uint8)
+    width, height = size
+    across, up = width // 2, height // 2
+    match mode:
+        case "side_by_side":
+            parts = [ImagePart((left, 0, across, height)) for left in (0, across)]
+        case "top_bottom":
+            parts = [ImagePart((0, bottom, width, up)) for bottom in (up, 0)]
+        case "anaglyph":
+            whole = (0, 0, width, height)
+            parts = [ImagePart(whole, (red, not red, not red)) for red in (True, False)]
+        case _:
+            parts = [ImagePart((0, 0, width, height))]
+    return parts[::-1] if swap_eyes else parts

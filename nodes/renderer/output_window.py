@@ -9,7 +9,7 @@ import glfw
 import moderngl
 
 from flexsheet.messages.types import Display
-from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.gl import headless_context, limit_driver_threads
 from flexsheet.nodes.renderer.monitors import (
     find_monitor,
     hidden_window,
@@ -105,6 +105,7 @@ class ProjectorWindow:
         swap; 0: no wait, with tearing. Raises WindowError if there is no display or no such
         monitor.
         """
+        limit_driver_threads()
         start_glfw()
         self._monitor = None if monitor is None else find_monitor(monitor)
         self._swap_interval, self._now_ns, self._shown = swap_interval, now_ns, shown
@@ -146,7 +147,7 @@ class ProjectorWindow:
         self._note_size(size, self._presenter.framebuffer_px)
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Store the image of eye `number` for the next `show`."""
+        """Store image `number` for the next `show`."""
         if self._presenter is None:
             return
         if self._filling is None:
@@ -158,9 +159,8 @@ class ProjectorWindow:
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
-        slot.tag, slot.mode, slot.swap_eyes = tag, display.stereo, display.swap_eyes
-        if display.stereo == "mono":
-            slot.swap_eyes = False
+        slot.tag, slot.mode = tag, display.stereo
+        slot.swap_eyes = display.swap_eyes and display.stereo == "frame_sequential"
         self.context.finish()
         self._presenter.put(slot)
 

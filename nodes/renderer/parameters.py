@@ -40,11 +40,15 @@ class RendererParameters(NodeParameters):
         description="Time from the swap (without a window: the end of drawing) to the middle of "
         "the frame's display: half a frame plus the projector's delay.",
     )
-    max_age_s: Positive = Field(
-        default=0.1, description="Maximum age of poses, fingertips, eyes and soft bodies."
+    max_age_s: Positive | None = Field(
+        default=None,
+        description="Maximum age of poses, fingertips, eyes and soft bodies. null: four measured "
+        "periods of the camera, from 0.1 to 0.5 s.",
     )
     spacing_m: Positive = Field(
-        default=0.0025, description="Distance between vertices of the drawn surface."
+        default=0.004,
+        description="Distance between vertices of the drawn surface; no finer than the soft body's "
+        "skin is needed.",
     )
     samples: int = Field(
         default=SAMPLES,

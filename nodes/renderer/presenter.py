@@ -27,13 +27,6 @@ REDRAW_COUNT = 4
 """Number of swaps after a resize, because drivers may resize their buffers two swaps later."""
 
 _NO_WINDOW: Any = None
-MODES: dict[StereoMode, int] = {
-    "mono": 0,
-    "frame_sequential": 0,
-    "side_by_side": 1,
-    "top_bottom": 2,
-    "anaglyph": 3,
-}
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
@@ -43,7 +36,9 @@ image that a newer one replaced."""
 
 @dataclass(slots=True)
 class Slot:
-    """Textures of the left and right eye's image, and how to show them."""
+    """Textures of an image, or in frame_sequential of the left and right eye's, and how to show
+    them.
+    """
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
     frames: tuple[moderngl.Framebuffer, moderngl.Framebuffer]
@@ -150,12 +145,12 @@ class Presenter:
         if slot.mode == "frame_sequential" and self._quad_buffered:
             for buffer, texture in ((GL_BACK_LEFT, left), (GL_BACK_RIGHT, right)):
                 quad.choose_buffer(buffer)
-                quad.draw(self.framebuffer_px, 0, texture, texture)
+                quad.draw(self.framebuffer_px, texture)
         else:
             if self._alternates(slot):
                 left = right if self._right_is_next else left
                 self._right_is_next = not self._right_is_next
-            quad.draw(self.framebuffer_px, MODES[slot.mode], left, right)
+            quad.draw(self.framebuffer_px, left)
         glfw.swap_buffers(self._window)
         quad.wait_until_done()
         swapped_ns = self._now_ns()
@@ -166,7 +161,7 @@ class Presenter:
 
 
 class _WindowQuad:
-    """Drawing of the slots' textures over the whole window.
+    """Drawing of a slot's texture over the whole window.
 
     Blocking GL functions are called through ctypes, which releases the interpreter lock.
     """
@@ -174,10 +169,9 @@ class _WindowQuad:
     def __init__(self, slots: list[Slot]) -> None:
         self._context = moderngl.create_context(require=330)
         self._program = self._context.program(
-            vertex_shader=shader_text("pack.vert.glsl"),
-            fragment_shader=shader_text("pack.frag.glsl"),
+            vertex_shader=shader_text("window.vert.glsl"),
+            fragment_shader=shader_text("window.frag.glsl"),
         )
-        self._program["left"], self._program["right"] = 0, 1
         self._array = self._context.vertex_array(self._program, [])
         self._size = slots[0].textures[0].size
         self._textures = {
@@ -189,22 +183,14 @@ class _WindowQuad:
         self.choose_buffer = _function("glDrawBuffer", None, ctypes.c_uint)
         self._reset_status = _function("glGetGraphicsResetStatus", ctypes.c_uint)
 
-    def draw(
-        self,
-        framebuffer_px: tuple[int, int],
-        mode: int,
-        left: moderngl.Texture,
-        right: moderngl.Texture,
-    ) -> None:
-        """Draw the textures unscaled in the centre of the window."""
+    def draw(self, framebuffer_px: tuple[int, int], texture: moderngl.Texture) -> None:
+        """Draw a texture unscaled in the centre of the window."""
         origin = (np.array(framebuffer_px) - self._size) // 2
         screen = self._context.screen
         screen.viewport = (0, 0, *framebuffer_px)
         screen.use()
-        self._program["mode"] = mode
         self._program["origin"] = tuple(int(value) for value in origin)
-        self._textures[left.glo].use(0)
-        self._textures[right.glo].use(1)
+        self._textures[texture.glo].use()
         self._array.render(moderngl.TRIANGLES, vertices=3)
 
     def is_lost(self) -> bool:

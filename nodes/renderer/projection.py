@@ -18,9 +18,9 @@ from flexsheet.nodes.renderer.gl import (
     Canvas,
     DrawStyle,
     EyeView,
-    Uniforms,
+    ImagePart,
+    Programs,
     set_view,
-    shader_text,
 )
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
@@ -54,32 +54,45 @@ class ScreenRectangle:
         )
 
 
-class TwoPassProjector:
-    """Two-pass renderer with the frame of the first pass and the sheet's buffers."""
+@dataclass(frozen=True, slots=True)
+class EyePicture:
+    """Frames of the first pass: multisampled, and resolved into a texture."""
 
-    def __init__(
-        self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
-    ) -> None:
-        """Allocate the frame of the eye's image; samples: as in `Canvas`."""
-        self._context = context
-        samples = min(samples, context.max_samples)
-        size = (width_px, height_px)
-        self._frame = context.framebuffer(
+    samples: moderngl.Framebuffer
+    resolved: moderngl.Framebuffer
+    image: moderngl.Texture
+
+    @staticmethod
+    def make(context: moderngl.Context, size: tuple[int, int], samples: int) -> EyePicture:
+        """Allocate the frames of an image (width, height), px."""
+        image = context.texture(size, 4)
+        image.repeat_x = image.repeat_y = False
+        multisampled = context.framebuffer(
             context.renderbuffer(size, 4, samples=samples),
             context.depth_renderbuffer(size, samples=samples),
         )
-        self._image = context.texture(size, 4)
-        self._image.repeat_x = self._image.repeat_y = False
-        self._resolved = context.framebuffer([self._image])
-        self._program = context.program(
-            vertex_shader=shader_text("sheet.vert.glsl"),
-            fragment_shader=shader_text("sheet.frag.glsl"),
-        )
-        self._uniforms = Uniforms(self._program)
+        return EyePicture(multisampled, context.framebuffer([image]), image)
+
+    def release(self) -> None:
+        """Release the frames."""
+        for frame in (self.samples, self.resolved):
+            for attachment in (*frame.color_attachments, frame.depth_attachment):
+                if attachment is not None:
+                    attachment.release()
+            frame.release()
+
+
+class TwoPassProjector:
+    """Two-pass renderer with the frames of the first pass and the sheet's buffers."""
+
+    def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
+        """Compile the shaders; samples: as in `Canvas`."""
+        self._context, self._samples = context, min(samples, context.max_samples)
+        self._pictures: dict[tuple[int, int], EyePicture] = {}
+        self._programs = Programs(context, "sheet")
         self._drawn: SheetMesh | None = None
-        self._vertices: moderngl.Buffer | None = None
-        self._array: moderngl.VertexArray | None = None
-        self._triangles: NDArray[np.int32] | None = None
+        self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
+        self._arrays: dict[int, moderngl.VertexArray] = {}
 
     def draw(
         self,
@@ -88,61 +101,71 @@ class TwoPassProjector:
         view: EyeView,
         look: DrawStyle,
         window: ScreenRectangle,
+        *,
+        part: ImagePart,
+        size: tuple[int, int],
     ) -> None:
-        """Draw one eye's image onto the sheet, into the canvas's frame, and wait for completion."""
-        seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen, lens=None)
-        canvas.draw_into(self._frame, seen, look)
-        self._context.copy_framebuffer(self._resolved, self._frame)
-        array = self._sheet_array(sheet)
-        set_view(self._uniforms, view)
-        self._uniforms.set(window=(window.left, window.bottom, window.width, window.height))
-        self._image.use()
-        canvas.begin()
+        """Draw one eye's image onto the sheet, into a part of the canvas's target.
+
+        size: width and height of the eye's image, px.
+        """
+        if size not in self._pictures:
+            self._pictures[size] = EyePicture.make(self._context, size, self._samples)
+        picture = self._pictures[size]
+        seen = replace(
+            view, screen=None, clip_from_screen=window.clip_from_screen, lens=None, grey=False
+        )
+        picture.samples.clear(0.0, 0.0, 0.0, 1.0)
+        canvas.draw_into(picture.samples, seen, look)
+        self._context.copy_framebuffer(picture.resolved, picture.samples)
+        program, uniforms = self._programs.get(LENS=view.lens is not None, GREY=view.grey)
+        array = self._sheet_array(sheet, program)
+        set_view(uniforms, view)
+        uniforms.set(window=(window.left, window.bottom, window.width, window.height))
+        picture.image.use()
         # The projector is behind the sheet, so back faces must be drawn.
         self._context.disable(moderngl.CULL_FACE)
         for plane in range(CLIP_PLANES):
             self._context.enable_direct(CLIP_DISTANCE_0 + plane)
-        array.render(moderngl.TRIANGLES)
+        with part.of(canvas.target):
+            canvas.target.use()
+            array.render(moderngl.TRIANGLES)
         for plane in range(CLIP_PLANES):
             self._context.disable_direct(CLIP_DISTANCE_0 + plane)
         self._context.enable(moderngl.CULL_FACE)
-        self._context.finish()
 
-    def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
+    def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
         """Return the sheet's vertex array; its buffers are reused for the same triangles."""
-        if self._array is not None and sheet is self._drawn:
-            return self._array
-        vertices, previous = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
-        same = previous is sheet.triangles or (
-            previous is not None and np.array_equal(previous, sheet.triangles)
-        )
-        if self._array is None or self._vertices is None or not same:
-            self._release_sheet()
-            self._vertices = self._context.buffer(vertices, dynamic=True)
-            triangles = self._context.buffer(np.ascontiguousarray(sheet.triangles, np.int32))
-            content = [(self._vertices, "3f", "position")]
-            self._array = self._context.vertex_array(self._program, content, triangles)
-            self._triangles = sheet.triangles
-        else:
-            self._vertices.orphan()
-            self._vertices.write(vertices)
-        self._drawn = sheet
-        return self._array
+        if self._buffers is None or sheet is not self._drawn:
+            vertices = np.ascontiguousarray(sheet.vertices, np.float32)
+            if self._buffers is None or not self._has_triangles(sheet.triangles):
+                self._release_sheet()
+                triangles = np.ascontiguousarray(sheet.triangles, np.int32)
+                self._buffers = self._context.buffer(vertices), self._context.buffer(triangles)
+            else:
+                self._buffers[0].orphan()
+                self._buffers[0].write(vertices)
+            self._drawn = sheet
+        if program.glo not in self._arrays:
+            content = [(self._buffers[0], "3f", "position")]
+            self._arrays[program.glo] = self._context.vertex_array(
+                program, content, self._buffers[1]
+            )
+        return self._arrays[program.glo]
+
+    def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
+        """Return whether the buffers have these triangles; equal grids share one array."""
+        drawn = None if self._drawn is None else self._drawn.triangles
+        return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))
 
     def _release_sheet(self) -> None:
-        if self._array is not None:
-            if self._array.index_buffer is not None:
-                self._array.index_buffer.release()
-            self._array.release()
-        if self._vertices is not None:
-            self._vertices.release()
+        for part in (*self._arrays.values(), *(self._buffers or ())):
+            part.release()
+        self._arrays, self._buffers = {}, None
 
     def release(self) -> None:
         """Release all buffers, but not the context."""
         self._release_sheet()
-        for frame in (self._frame, self._resolved):
-            for attachment in (*frame.color_attachments, frame.depth_attachment):
-                if attachment is not None:
-                    attachment.release()
-            frame.release()
-        self._program.release()
+        for picture in self._pictures.values():
+            picture.release()
+        self._programs.release()

@@ -31,11 +31,13 @@ from flexsheet.nodes.renderer.gl import (
     Canvas,
     DrawStyle,
     EyeView,
+    Image,
+    ImagePart,
     SurfaceMaterial,
 )
 from flexsheet.nodes.renderer.lens import clip_lens
 from flexsheet.nodes.renderer.object_surface import DeformationTransfer, make_surface
-from flexsheet.nodes.renderer.output import Image, both_eyes, pack
+from flexsheet.nodes.renderer.output import both_eyes, image_parts
 from flexsheet.nodes.renderer.projection import ScreenRectangle, TwoPassProjector
 from flexsheet.nodes.renderer.sheet import SheetPose, screen_for
 from flexsheet.nodes.renderer.sheet_mesh import (
@@ -128,13 +130,9 @@ class SceneRenderer:
         self.occluded_fraction = 0.0
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
-        across_px = OVERSAMPLING * projector_homography(scene)[0, 0]
-        self._projection = TwoPassProjector(
-            context,
-            round(abs(across_px) * window.width),
-            round(abs(across_px) * window.height),
-            samples=samples,
-        )
+        px_per_m = OVERSAMPLING * abs(float(projector_homography(scene)[0, 0]))
+        self._eye_size_px = px_per_m * window.width, px_per_m * window.height
+        self._projection = TwoPassProjector(context, samples=samples)
         self._deformation: DeformationTransfer | None = None
         self._drawn_body: SoftBody | None = None
         self.mesh_id: str | None = None
@@ -239,9 +237,10 @@ class SceneRenderer:
     ) -> Image | None:
         """Draw the projector's image and return it, (height, width, 3), if `read`.
 
-        eyes: (1 or 2, 3), one image each; None: the scene's. drawn: called with the number of each
-        eye when its image is in `canvas.resolved`, before the next eye overwrites it. Raises
-        ValueError for a sheet pose that is not finite.
+        eyes: (1 or 2, 3); None: the scene's. Two eyes share the image, except in frame_sequential,
+        where the left eye's is returned. drawn: called with the number of each image when it is in
+        `canvas.resolved`, before the next image overwrites it. Raises ValueError for a sheet pose
+        that is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite")
@@ -251,10 +250,14 @@ class SceneRenderer:
             return self.draw_onto(display, mesh, look, read=read, eyes=eyes, drawn=drawn)
         screen = screen_for(display.correction, sheet)
 
-        def draw_eye(eye: Floats) -> None:
-            self.canvas.draw(self.view(eye, screen), look)
+        def draw_eye(eye: Floats, part: ImagePart) -> None:
+            with part.of(self.canvas.target):
+                view = self.view(eye, screen, grey=part.is_grey)
+                self.canvas.draw_into(self.canvas.target, view, look)
 
-        return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
+        return self._draw_eyes(
+            display, draw_eye, multisampled=True, read=read, eyes=eyes, drawn=drawn
+        )
 
     def draw_onto(
         self,
@@ -268,39 +271,58 @@ class SceneRenderer:
     ) -> Image | None:
         """Draw as `draw`, with the two-pass method and a mesh of the sheet."""
 
-        def draw_eye(eye: Floats) -> None:
+        whole = self.canvas.width_px, self.canvas.height_px
+
+        def draw_eye(eye: Floats, part: ImagePart) -> None:
             window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
-            self._projection.draw(self.canvas, mesh, self.view(eye), look, window)
+            # An eye with half the pixels of the image needs a picture of half the size.
+            size = (
+                round(self._eye_size_px[0] * part.viewport[2] / whole[0]),
+                round(self._eye_size_px[1] * part.viewport[3] / whole[1]),
+            )
+            view = self.view(eye, grey=part.is_grey)
+            self._projection.draw(self.canvas, mesh, view, look, window, part=part, size=size)
 
-        return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
+        return self._draw_eyes(
+            display, draw_eye, multisampled=False, read=read, eyes=eyes, drawn=drawn
+        )
 
-    def view(self, eye: Floats, screen: ProjectionScreen | None = None) -> EyeView:
+    def view(
+        self, eye: Floats, screen: ProjectionScreen | None = None, *, grey: bool = False
+    ) -> EyeView:
         """Return the view of an eye's image; screen: to correct for, or None."""
         projector = self._world_from_projector[:3, 3]
-        return EyeView(eye, projector, screen, self._clip_from_screen, self._lens)
+        return EyeView(eye, projector, screen, self._clip_from_screen, self._lens, grey)
 
     def _draw_eyes(
         self,
         display: Display,
-        draw_eye: Callable[[Floats], None],
+        draw_eye: Callable[[Floats, ImagePart], None],
         *,
+        multisampled: bool,
         read: bool,
         eyes: Floats | None,
         drawn: Callable[[int], None],
     ) -> Image | None:
+        canvas = self.canvas
         if eyes is None:
             eyes = self.eyes(display)[: 1 if display.stereo == "mono" else 2]
-        images = []
-        for number, eye in enumerate(eyes):
-            draw_eye(eye)
+        size = canvas.width_px, canvas.height_px
+        mode = display.stereo if len(eyes) > 1 else "mono"
+        parts = image_parts(mode, size, swap_eyes=display.swap_eyes)
+        shown, image = int(len(eyes) > len(parts) and display.swap_eyes), None
+        for number, first in enumerate(range(0, len(eyes), len(parts))):
+            canvas.begin(multisampled=multisampled)
+            # Without a wait between the eyes, a software driver computes one while the other is
+            # filled.
+            for eye, part in zip(eyes[first:], parts, strict=False):
+                draw_eye(eye, part)
+            canvas.resolve()
             drawn(number)
-            if read:
-                images.append(self.canvas.read())
-        if not read:
-            return None
-        if len(images) == 1:
-            return images[0]
-        return pack(images[0], images[-1], display.stereo, swap_eyes=display.swap_eyes)
+            if read and number == shown:
+                image = canvas.read()
+        canvas.context.finish()
+        return image
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
         """Return the sheet's mesh by the method `sheet_shape`.

@@ -1,6 +1,6 @@
 #version 330
 
-// Colour a point of the sheet with what the eye should see there.
+// Colour a point of the sheet with what the eye should see there.  GREY: 1: without colour.
 
 uniform vec3 eye;
 uniform vec3 projector;
@@ -29,4 +29,7 @@ void main() {
         + texture(picture, place + 0.375 * right - 0.125 * up).rgb
         + texture(picture, place - 0.375 * right + 0.125 * up).rgb;
     colour = vec4(0.25 * light_of, 1.0);
+#if GREY
+    colour.rgb = vec3(dot(colour.rgb, vec3(0.299, 0.587, 0.114)));
+#endif
 }

@@ -9,6 +9,7 @@ from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input
+from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
@@ -18,12 +19,12 @@ Floats = NDArray[np.float64]
 class SheetPosePredictor:
     """Predictor of the sheet's pose from the measured flange poses.
 
-    Without valid poses newer than `max_age_s`, the last valid sheet is returned and `note` contains
+    Without valid poses newer than `max_age`, the last valid sheet is returned and `note` contains
     the reason; otherwise `note` is empty.
     """
 
-    def __init__(self, *, max_age_s: float) -> None:
-        self._max_age_s = max_age_s
+    def __init__(self, max_age: MaxAge) -> None:
+        self._max_age = max_age
         self._sheet: SheetPose | None = None
         self.note = ""
 
@@ -43,9 +44,13 @@ class SheetPosePredictor:
         finger_tip: (3,) at that time, or None. eye: (3,), the point of view.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
-        if left.message is not None and right.message is not None and age_s <= self._max_age_s:
+        if (
+            left.message is not None
+            and right.message is not None
+            and age_s <= self._max_age.seconds
+        ):
             arms = scene_renderer.scene.arms
-            moving = target.message is not None and target.age_s() <= self._max_age_s
+            moving = target.message is not None and target.age_s() <= self._max_age.seconds
             sheet = estimate_sheet(
                 left.message.world_from_flange @ pose_matrix(arms.left.flange_from_edge),
                 right.message.world_from_flange @ pose_matrix(arms.right.flange_from_edge),
@@ -61,7 +66,7 @@ class SheetPosePredictor:
             return sheet
         why = "sheet edge-on or facing away"
         if sheet is None:
-            fresh = age_s <= self._max_age_s
+            fresh = age_s <= self._max_age.seconds
             why = "implausible flange poses" if fresh else f"arm poses {age_s:.2f} s old"
         self.note = f"{why}: {NodeNote.LAST_SHEET_PLANE.phrase}"
         if self._sheet is None:

@@ -16,6 +16,9 @@ HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
 """Time between the two responses. A shorter time amplifies noise, a longer one causes lag."""
 
+MAX_PERIOD_S = 0.12
+"""Maximum time between successive responses of a slower solver, whose last two are used."""
+
 MAX_EXTRAPOLATION_S = 0.06
 """Maximum extrapolation time."""
 
@@ -49,11 +52,21 @@ class SkinExtrapolator:
         ahead_s = min((at_ns - newest_ns) * 1e-9, MAX_EXTRAPOLATION_S)
         if clock_id != self._clock_id or ahead_s <= 0.0:
             return newest, newest_ns
-        for before_ns, before in self._history:
-            base_s = (newest_ns - before_ns) * 1e-9
+        found = self._before(newest_ns)
+        if found is None:
+            return newest, newest_ns
+        before, base_s = found
+        moved = newest.displacement_world_m - before.displacement_world_m
+        predicted = newest.displacement_world_m + moved * moved.dtype.type(ahead_s / base_s)
+        body = newest.model_copy(update={"displacement_world_m": predicted})
+        return body, newest_ns + round(ahead_s * 1e9)
+
+    def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
+        """Return the older response and the time (s) from it to the newest."""
+        older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
+        for base_s, body in older:
             if MIN_BASE_S <= base_s <= MAX_BASE_S:
-                moved = newest.displacement_world_m - before.displacement_world_m
-                predicted = newest.displacement_world_m + moved * moved.dtype.type(ahead_s / base_s)
-                body = newest.model_copy(update={"displacement_world_m": predicted})
-                return body, newest_ns + round(ahead_s * 1e9)
-        return newest, newest_ns
+                return body, base_s
+        if older and MAX_BASE_S < older[-1][0] <= MAX_PERIOD_S:
+            return older[-1][1], older[-1][0]
+        return None
