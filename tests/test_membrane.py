@@ -208,6 +208,7 @@ def test_a_tilted_sheet_sags_as_the_parabola_of_its_tension(
         density_kg_per_m3=1200.0,
         edge_distance_m=0.24 * stretch,
         across=across,
+        along=local[..., 1] / 0.24,
     )
     rms_sag, rms_error = (
         float(np.sqrt(np.mean(value**2))) for value in (local[..., 2], local[..., 2] - parabola)

@@ -160,7 +160,7 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""What is checked only with a value of this parameter."""
+"""Name of each optional check, by the parameter that enables it."""
 
 
 def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:

@@ -152,9 +152,8 @@ class SheetTrajectoryPlanner:
             compliance.stretch_ratio,
             0.0,
         )
-        behind_m = self._normal_offset_m + self._sag_m(
-            target, float(command.contact.position_sheet_m[0])
-        )
+        x, y = command.contact.position_sheet_m
+        behind_m = self._normal_offset_m + self._sag_m(target, float(x), float(y))
         self._advance(offset_along_normal(target, behind_m, offset_rate_m_per_s), step_s)
         return self._make_step(command)
 
@@ -190,8 +189,8 @@ class SheetTrajectoryPlanner:
         """Return how often an oscillation of finger and sheet was stopped."""
         return self._offset.watchdog.triggers
 
-    def _sag_m(self, sheet: SheetMotion, x_m: float) -> float:
-        """Return the deflection of the sheet by its weight along its normal, x_m from its centre.
+    def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:
+        """Return the deflection of the sheet by its weight along its normal, at (x_m, y_m).
 
         The sheet's edges are placed behind its tangent plane by this, so that its surface is in it.
         """
@@ -203,6 +202,7 @@ class SheetTrajectoryPlanner:
                 density_kg_per_m3=self._density_kg_per_m3,
                 edge_distance_m=distance_m,
                 across=min(max(x_m / distance_m + 0.5, 0.0), 1.0),
+                along=y_m / self._rubber.height_m,
             )
         )
 

