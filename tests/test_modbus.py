@@ -366,7 +366,7 @@ async def test_a_repeated_answer_is_not_believed() -> None:
         for _ in range(3):
             await exchange(link)
         controller.fault = "repeated"
-        with pytest.raises(ArmAnswerError, match="answer to command 3, awaited 4"):
+        with pytest.raises(ArmAnswerError, match="expected the answer to command 4, found 3"):
             await exchange(link)
         assert not link.connected
 
