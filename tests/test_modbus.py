@@ -203,7 +203,7 @@ async def test_an_answer_to_another_command_closes_the_connection(
     async with linked() as (link, controller):
         await exchange(link)
         monkeypatch.setattr(controller, "receive_command", lambda registers: True)
-        with pytest.raises(ArmAnswerError, match="answer to command 1, awaited 2"):
+        with pytest.raises(ArmAnswerError, match="expected the answer to command 2, found 1"):
             await exchange(link)
         assert not link.connected
 
@@ -346,7 +346,7 @@ async def test_an_answer_late_on_the_servers_side_is_detected_by_its_echo() -> N
         set_timeout(link, DEADLINE_S)
         await asyncio.wait_for(late.closed.wait(), DEADLINE_S)
         late.closed.clear()
-        with pytest.raises(ArmAnswerError, match="answer to command 1, awaited 2"):
+        with pytest.raises(ArmAnswerError, match="expected the answer to command 2, found 1"):
             await exchange(link)
         assert not link.connected
         assert late.connections == 2
@@ -362,7 +362,7 @@ async def test_a_repeated_answer_is_not_believed() -> None:
         for _ in range(3):
             await exchange(link)
         controller.fault = "repeated"
-        with pytest.raises(ArmAnswerError, match="answer to command 3, awaited 4"):
+        with pytest.raises(ArmAnswerError, match="expected the answer to command 4, found 3"):
             await exchange(link)
         assert not link.connected
 
