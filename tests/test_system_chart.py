@@ -372,3 +372,30 @@ def test_the_command_draws_the_chart_and_continues(
     again = run_chart(tmp_path)
     assert len(trials) == 7  # only the failed trial ran again
     assert again["failed"] == []
+
+
+def test_a_stopped_trial_leaves_no_worker_that_holds_its_pipes() -> None:
+    import subprocess
+    import sys
+
+    child = "import subprocess, sys; print(subprocess.Popen(['sleep', '1000']).pid, flush=True); "
+    process = subprocess.Popen(
+        [sys.executable, "-c", child + "import time; time.sleep(1000)"],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    sweep._end(process)
+    assert process.returncode is not None
+    assert not _is_running(worker)
+
+
+def _is_running(pid: int) -> bool:
+    import psutil
+
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False

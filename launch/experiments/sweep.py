@@ -9,6 +9,7 @@ file and the apparatus files under the same paths.
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -216,11 +217,12 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
 
 def _end(process: subprocess.Popen[str]) -> None:
     process.terminate()
-    try:
-        process.communicate(timeout=END_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=END_S)
+    # Its workers would keep its pipes open, and outlast it.
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
 
 
 def raise_if_all_failed(rows: Mapping[str, Row], folder: Path) -> None:

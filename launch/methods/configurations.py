@@ -12,7 +12,11 @@ from ruamel.yaml import YAML
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.plans.plan_model import ResolvedGraph
-from flexsheet.launch.running.precompute import precompute_force_table, precompute_soft_body
+from flexsheet.launch.running.precompute import (
+    precompute_deflection_shapes,
+    precompute_force_table,
+    precompute_soft_body,
+)
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
@@ -95,6 +99,8 @@ class Configuration:
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
         """Compute the tables that the methods need, so that no run computes them."""
+        if self.methods.sheet_shape == "reduced_order":
+            precompute_deflection_shapes(scene, None, progress)
         if self.methods.sheet_force == "table":
             precompute_force_table(scene, None, progress)
         body = self.methods.soft_body
