@@ -28,7 +28,7 @@ from flexsheet.launch.methods.blocks import (
 from flexsheet.launch.methods.configurations import (
     CONTROL,
     CONTROL_AGAIN,
-    MOST_EXACT,
+    FINEST,
     choose_cheapest,
     list_configurations,
     select_configurations,
@@ -218,7 +218,7 @@ def test_a_configuration_sets_the_methods_of_all_nodes(planned: system_chart.Sce
     graph = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     assert graph.scene is not None
     assert graph.scene["name"] == "light-touch"
-    assert graph.nodes["triangulator"].parameters["tracking"] == MOST_EXACT.tracking
+    assert graph.nodes["triangulator"].parameters["tracking"] == FINEST.tracking
     assert graph.nodes["fem_solver"].parameters["method"] == "nonlinear_table"
     assert graph.nodes["planner"].parameters["sheet_force"] == "table"
 

@@ -63,7 +63,7 @@ PAPER_PARAMETERS = (
 )
 """The paper does not compensate the delay, and varies the stretch only (V-C, III-B)."""
 
-MOST_EXACT = NODE_DEFAULTS.model_copy(
+FINEST = NODE_DEFAULTS.model_copy(
     update={
         "sheet_force": "table",
         "soft_body": SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045),
@@ -164,7 +164,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
         Configuration("cheapest in range", choose_cheapest(scene)),
         Configuration("default", NODE_DEFAULTS),
         Configuration(TUNED, tuned),
-        Configuration("most exact", MOST_EXACT),
+        Configuration("most exact", FINEST),
     ]
     return [one for one in found if one.name != "default" or tuned != NODE_DEFAULTS]
 
