@@ -256,7 +256,7 @@ def example(kind: Any) -> Any:
     if origin is tuple:
         many = len(arguments) == 2 and arguments[1] is ...
         return tuple(example(one) for one in (arguments[:1] if many else arguments))
-    return {str: "x", int: 1, float: 0.5, bool: True}[kind]
+    return {str: "x", int: 1, float: 0.15, bool: True}[kind]
 
 
 def _example_of(info: Any) -> Any:

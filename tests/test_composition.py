@@ -218,6 +218,7 @@ def test_the_largest_95_percent_value_of_all_runs_counts(
         return {"sheet_mm": {"p95": value}, "exposure_to_arm_ms": {"p95": 10 * value}}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
+    monkeypatch.setattr(Configuration, "prepare", lambda *_: None)
     configuration = Configuration("proposal", NODE_DEFAULTS)
     silent: Callable[[str], None] = lambda text: None  # noqa: E731
     scene_file = SCENES / "light-touch.yaml"

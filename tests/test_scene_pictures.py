@@ -28,7 +28,11 @@ from flexsheet.nodes.twin.true_object import TrueBody
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]
-SCENES = sorted((Path(__file__).parents[1] / "launch" / "scenes").glob("*.yaml"))
+SCENES = [
+    path
+    for path in sorted((Path(__file__).parents[1] / "launch" / "scenes").glob("*.yaml"))
+    if load_scene(path).projector is not None
+]
 SHIFT_M = np.array([0.004, 0.006, -0.008])
 
 
@@ -145,7 +149,7 @@ def test_the_simulated_body_follows_the_same_indentation(case: Case) -> None:
             lowest(case, displacement),
             abs=1e-3,
         )
-    with pytest.raises(ValueError, match="displacement of 5 vertices"):
+    with pytest.raises(ValueError, match=r"displacement: expected [0-9]+ vertices, found 5"):
         true.displaced(vertices, triangles, displacement[:5])
     with pytest.raises(ValueError, match="no triangles"):
         true.displaced(vertices + 1.0, triangles[:0], displacement)

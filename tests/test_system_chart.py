@@ -34,7 +34,7 @@ from flexsheet.launch.methods.configurations import (
     select_configurations,
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Methods, Scene
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 
@@ -192,7 +192,8 @@ def test_the_cheapest_methods_are_those_whose_range_contains_the_scene() -> None
 
 
 def test_a_scene_without_choices_is_tuned_to_the_defaults() -> None:
-    names = [one.name for one in list_configurations(load_scene(SCENES / "cylinder.yaml"))]
+    scene = load_scene(SCENES / "cylinder.yaml").model_copy(update={"methods": Methods()})
+    names = [one.name for one in list_configurations(scene)]
     assert "default" not in names
     assert len(names) == 4
     scene = load_scene(LIGHT)

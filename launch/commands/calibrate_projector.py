@@ -20,11 +20,12 @@ from flexsheet.launch.commands.output import (
     words,
 )
 from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import require_projector
 
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.gray_code import Image
     from flexsheet.launch.calibration.projector import ProjectorFit
-    from flexsheet.messages.scene import Projector, Scene, StereoCamera, require_projector
+    from flexsheet.messages.scene import Projector, Scene, StereoCamera
 
     Views = tuple[list[Image], list[Image]]
 

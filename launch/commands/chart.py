@@ -81,11 +81,11 @@ def chart(
     seconds: Annotated[
         float,
         typer.Option(
-            "--seconds",
-            metavar="S",
+            "--duration",
+            metavar="SECONDS",
             min=2.0,
             max=600.0,
-            help="For system: duration of a stroke, s.",
+            help="For system: duration of a stroke.",
         ),
     ] = 10.0,
     apparatuses: Annotated[

@@ -250,7 +250,7 @@ class ArmControl:
         """
         if silent and self.last_measured_rad is None:
             # It has never answered, so it may still be starting, which is no fault.
-            self.reason = f"waiting for the arm: {text}"
+            self.reason = f"{NodeNote.WAITING_FOR_ARM.phrase}: {text}"
             return False
         if silent and self.on_answer_missed(text):
             return False
@@ -438,7 +438,9 @@ class ArmControl:
             self._must_idle = self._must_idle and measured is None
             return self._send("idle", self.commanded_rad, geometry, step_s)
         self.handle(Event.CONNECTED)
-        self._silence = NodeNote.OTHER_ARM_SILENT.phrase if other else "waiting for the other arm"
+        self._silence = (
+            NodeNote.OTHER_ARM_SILENT.phrase if other else NodeNote.WAITING_FOR_OTHER_ARM.phrase
+        )
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
         self._check_measurement(geometry, other, measured)
@@ -521,7 +523,7 @@ class ArmControl:
             self.reason = NodeNote.TARGET_OR_ARM_LATE.phrase
         else:
             self._together = self._together or other.mode == "follow"
-            self.reason = "" if self._together else "waits for the other arm"
+            self.reason = "" if self._together else NodeNote.FOLLOWS_OTHER_ARM.phrase
         if self._alignment is not None:
             return self._align(self._alignment, geometry, other, step_s)
         if is_late:
@@ -630,7 +632,7 @@ class ArmControl:
             other.world_from_flange @ geometry.other_flange_from_edge,
             left=geometry.left,
         )
-        self.reason = "waits for the other arm"
+        self.reason = NodeNote.FOLLOWS_OTHER_ARM.phrase
         return self._send("move", self.commanded_rad, geometry, step_s)
 
     def _align(

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmMode, ArmState
 from flexsheet.nodes.arm_bridge.goal import MAX_PREDICTION_S, MAX_TRAJECTORY_S
 from flexsheet.nodes.models.rigid import is_rigid
@@ -96,5 +97,5 @@ class OtherArm:
         if self.mode in ("disconnected", "fault", "estop"):
             return f"other arm: {self.mode}"
         if self.mode == "starting":
-            return "waiting for the other arm"
+            return NodeNote.WAITING_FOR_OTHER_ARM.phrase
         return None
