@@ -5,6 +5,7 @@ The module is separate from the resolver (`launch.plans.plan`), so that tools st
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal
@@ -224,10 +225,17 @@ class ResolvedGraph(StrictModel):
         """Return the nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
-    def processes_on(self, host: str | None) -> list[ResolvedProcess]:
-        """Return the processes of one host, or of all, in the order of their first nodes."""
+    def processes_on(
+        self, host: str | None, *, without: Collection[str] = ()
+    ) -> list[ResolvedProcess]:
+        """Return the processes of one host, or of all, in the order of their first nodes.
+
+        without: names of nodes that are not started.
+        """
         members: dict[str, list[ResolvedNode]] = {}
         for node in self.nodes_on(host):
+            if node.name in without:
+                continue
             members.setdefault(node.process or node.name, []).append(node)
         return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 

@@ -275,7 +275,7 @@ class RunningGraph:
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
         self.nodes = [node for node in plan.nodes_on(host) if node.name not in without]
-        self._processes = {one.name: one for one in plan.processes_on(host)}
+        self._processes = {one.name: one for one in plan.processes_on(host, without=without)}
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
