@@ -4,7 +4,8 @@ The first statements give SIGINT its default action, which ends a process withou
 Python's own handler raises an exception wherever the code is: in an import it prints a traceback,
 in a callback of the garbage collector it is ignored.  `launch.cli` restores the handler for
 commands that clean up; graphs and nodes handle SIGINT in their event loop (`nodes.signals`).  A
-SIGINT that is ignored or blocked by inheritance is enabled again; docs/launch-files.md says why.
+SIGINT that is ignored or blocked by inheritance is enabled again; docs/nodes-and-processes.md says
+why.
 """
 
 from __future__ import annotations
