@@ -153,7 +153,10 @@ def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Flo
         step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
         joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
     if not np.abs(_pose_error(base_from_flange, forward(joints))).max() <= 1e-6:
-        raise ValueError(f"the arm cannot reach a flange at {base_from_flange[:3, 3]} m (base)")
+        raise ValueError(
+            f"the arm cannot reach the flange pose at {base_from_flange[:3, 3]} m (base frame); "
+            "move the base or the flange"
+        )
     return joints
 
 
@@ -426,7 +429,7 @@ class ArmServer:
             return ExcCodes.DEVICE_FAILURE
         if fault == "slow" and written:
             await asyncio.sleep(LATE_S)
-        # In a combined read and write, the write comes first and has updated the arm.
+        # A combined read and write request calls this first for the write, which advances the arm.
         if written or function_code != _READ_AND_WRITE:
             self._before()
         if written:

@@ -1,8 +1,8 @@
 """Measure the image error at each point of the object, by means of position codes drawn on it.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y` every point of the drawn object has a
-colour that encodes the x or y at which the eye should see it on the imaginary screen (z = 0). Red
-and green are the cosine and sine of a phase; blue encodes the coarse position. The image error is
+In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point of the object
+encodes the x or y at which the eye should see it on the imaginary screen (z = 0). Red and
+green are the cosine and sine of a phase; blue encodes the coarse position. The image error is
 the position at which the eye sees a point minus the position that its colour encodes.
 """
 
@@ -19,7 +19,7 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 PERIOD_M, RANGE_M = 0.02, 0.24
-"""Period of the phase, and range of the coarse position, as in `object.frag.glsl`."""
+"""Period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
 
 PURE = 0.06
 """Maximum deviation of red and green from the circle of codes, relative to its radius. A pixel that

@@ -383,14 +383,18 @@ class _Silhouette:
         gray = picture.astype(np.float64).mean(axis=2)
         bright = gray[gray > 25.0]
         if len(bright) < 400:
-            raise NotMeasurableError(f"only {len(bright)} pixels of the image are lit")
+            raise NotMeasurableError(
+                f"only {len(bright)} pixels of the image are lit; at least 400 are required"
+            )
         self.white = float(np.quantile(bright, 0.9))
         mask = (gray > 0.5 * self.white).astype(np.uint8)
         _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
         largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
         left, top, width, height, area = statistics[largest]
         if area < 400:
-            raise NotMeasurableError(f"the largest bright region has only {area} pixels")
+            raise NotMeasurableError(
+                f"the largest bright region has only {area} pixels; at least 400 are required"
+            )
         if left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
             raise NotMeasurableError("the object reaches the border of the image")
         # Remove other regions. The margin keeps the partly bright pixels at the edge.

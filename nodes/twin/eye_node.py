@@ -55,7 +55,7 @@ class TwinEyeParameters(SimulatorParameters):
         description="age of the tracked `eye`, s, above which the eyes of the scene are used",
     )
     min_interval_s: Positive = Field(
-        default=5.0, description="minimum time before a frame of the same label is rendered, s"
+        default=5.0, description="minimum time before the same label is rendered again, s"
     )
     viewpoint: Viewpoint = Field(
         default="centre",

@@ -148,7 +148,7 @@ class RoundedLines:
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """See `Path`."""
+        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
         before, area_before = self._corner(time_s - ROUNDING_S)
         after, area_after = self._corner(time_s + ROUNDING_S)
         span = 2.0 * ROUNDING_S
@@ -196,7 +196,7 @@ class SmoothPath:
         return np.asarray(corners.max(axis=0))
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """See `Path`."""
+        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
         if time_s <= 0.0:
             return self.points[0], np.zeros(3)
         if time_s >= self.times_s[-1]:
@@ -212,7 +212,7 @@ class SmoothPath:
 
 
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
-    """Make the path through points (n, 3) at times (n,).
+    """Check points (n, 3) and times (n,), and make the path through them.
 
     Raises FingerPathError for a path without points or with times that do not increase.
     """

@@ -2,11 +2,12 @@
 
 Creep follows quasi-linear viscoelasticity (Fung, Biomechanics, 1981). The force is the sum of all
 past changes of the elastic force, each multiplied by a relaxation function of its age. The function
-is a sum of exponentials with one time constant per decade of time, so that the force falls by a
-constant fraction per decade. It is one at the age `REFERENCE_S`, at which the modulus is measured.
+is a sum of exponentials with one time constant per decade of time. The force therefore falls by a
+constant fraction per decade. The function is one at the age `REFERENCE_S`, at which the modulus is
+measured.
 
-Hysteresis, which does not depend on the rate, multiplies the force by 1 + h while the elastic force
-rises and by 1 - h while it falls. After a reversal the factor changes gradually, over a relative
+Hysteresis does not depend on the rate. It multiplies the force by 1 + h while the elastic force
+rises, and by 1 - h while it falls. After a reversal the factor changes gradually, over a relative
 change of the force by `REVERSAL_RATIO`.
 """
 

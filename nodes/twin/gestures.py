@@ -20,8 +20,8 @@ The gestures follow published measurements of human motion:
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
   motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
-  0.03 mm with the hand supported, twice that with the hand held out, and 4 to 5 times that with the
-  arm held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
+  0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
+  held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
 - Most of the motion of a finger that is held still is slower, 1-3.5 Hz and below (Carignan,
   Daneault and Duval 2009, Exp. Brain Res. 201:299). It is called wander here.
 
@@ -55,10 +55,10 @@ HOVER_M = 0.04
 APPROACH_S = 0.8
 REST_S = 0.3
 TOUCH_M = 0.001
-"""Depth of a light touch."""
+"""Depth below the surface of a light touch."""
 
 PRESS_M = 0.002
-"""Depth of a tap."""
+"""Depth below the surface of a tap."""
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35

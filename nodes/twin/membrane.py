@@ -51,11 +51,11 @@ MAX_FRICTION_ROUNDS = 12
 FRICTION_TOLERANCE = 0.01
 """Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
-"""Acceleration in the world frame, whose y axis points up."""
+"""Gravitational acceleration in the world frame, whose y axis points up."""
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised when the membrane's equilibrium is not found; the message gives the residual."""
+    """Raised when the membrane's equilibrium is not found; the text gives the residual force."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -205,8 +205,8 @@ class _Mesh:
     def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return the deformation at the Gauss points.
 
-        It consists of the gradient F (elements, points, 3, 2) and the components [C11, C22, C12] of
-        the right Cauchy-Green tensor C = F^T F (elements, points, 3).
+        It consists of the gradient F (elements, points, 3, 2) and [C11, C22, C12] (elements,
+        points, 3) of the right Cauchy-Green tensor C = F^T F.
         """
         at_nodes = positions[self.elements].transpose(0, 2, 1)[:, None]
         f = at_nodes @ self.gradient

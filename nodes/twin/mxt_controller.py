@@ -215,7 +215,7 @@ class MxtController:
             self._moved = False
 
     def _move(self, send_type: int, data: Floats, flags: int) -> None:
-        """Accept a set-point; raise MxtError for one that ends the program."""
+        """Check and store a set-point; raise MxtError if it is invalid, which ends the program."""
         if self._master is None:
             raise MxtError("a move ahead of the first packet")
         before = self.wanted_rad if self._moved else self.servo.joints_rad

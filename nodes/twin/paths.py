@@ -56,9 +56,8 @@ def map_to_surface(scene: Scene, places: Floats) -> Floats:
 def touchable(scene: Scene) -> tuple[float, float]:
     """Return the lengths (m), along and around the object, over which a finger can stroke.
 
-    They extend equally to both sides of the front. They are limited by the ends of the object (to
-    0.8 of its length), by the maximum tilt of the working range, and by the usable part of the
-    sheet.
+    They extend equally to both sides of the front. They are limited by 0.8 of the length of an
+    object with ends, the maximum tilt of the working range, and the usable part of the sheet.
     """
     return _ground_of(scene).touchable_m
 
@@ -153,8 +152,8 @@ class Ground:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point that faces the user.
 
-    That is the point nearest to a distant user. If that point lies on an end of the object, it is
-    instead the point that the user sees in the direction of the object's origin.
+    That is the point nearest to a distant user. If that point lies on an end of the object, the
+    point that the user sees in the direction of the object's origin is taken instead.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:

@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
-"""Rows and columns of a part of an image."""
+"""Rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
 """Function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""

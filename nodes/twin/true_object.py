@@ -27,7 +27,7 @@ PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
 """Maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""Number of nearest skin vertices whose triangles are searched for the nearest point."""
+"""Number of skin vertices near a point whose triangles are searched for its nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
