@@ -238,7 +238,7 @@ def test_a_file_holds_all_of_a_draw(scene: Scene, tmp_path: Path) -> None:
         ),
         (
             "scene: cylinder\nfinger: {radius_offset_m: -0.01}\n",
-            ("2: finger.radius_offset_m: -0.01 makes the radius", "more than"),
+            ("2: finger.radius_offset_m: -0.01 makes the finger radius", "more than"),
         ),
         ("scene: cylinder\nfinger: {hand_mass_kg: 1}\n", ("hand_mass_kg", "all three or none")),
         ("scene: cylinder\nfinger: {tremor_width_hz: 30}\n", ("tremor_width_hz", "less than")),

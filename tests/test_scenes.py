@@ -100,7 +100,7 @@ def test_on_a_cylinder_and_a_sphere_points_have_a_closed_form() -> None:
 
 def test_an_object_that_turns_no_side_to_the_user_has_no_path() -> None:
     plane = {"shape": "plane", "width_m": 0.2, "height_m": 0.2}
-    with pytest.raises(FingerPathError, match="turns no side"):
+    with pytest.raises(FingerPathError, match="no side of the object faces the user"):
         touchable(scene_with(plane, rpy_rad=(2.0, 0.0, 0.0)))
 
 

@@ -1,8 +1,9 @@
-"""Simulate the arms: RV-1A manipulators with servo lag behind Modbus TCP servers.
+"""Simulate the arms: Mitsubishi RV-1A manipulators with servo lag behind Modbus TCP servers.
 
-This module was written from `docs/modbus.md` and the arm's dimensions only, and shares nothing with
-the bridge that it tests.  The forward kinematics is a product of exponentials (Brockett 1984; Lynch
-and Park, Modern Robotics, ch. 4), the inverse kinematics a Gauss-Newton method on it.
+This module was written from `docs/modbus.md` and the dimensions of the arm only. It shares no code
+with the bridge (the node that sends commands to an arm), because it serves to test the bridge. The
+forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park, Modern Robotics, ch.
+4). The inverse kinematics is a Gauss-Newton method on it.
 """
 
 from __future__ import annotations
@@ -38,40 +39,44 @@ Fault = Literal[
     "frozen",
     "lagging",
 ]
-"""Faults of an arm on request.
+"""Faults that a test can switch on in a simulated arm. MXT is the protocol of `mxt_controller.py`.
 
 silent: does not answer.
-slow: answers LATE_S late.
-exception: answers with a Modbus exception (real-time: a packet of another type).
-bad_crc: damages its answers (real-time: truncates them).
-old_version: uses an older register map.
+slow: answers with the delay LATE_S.
+exception: answers with a Modbus exception (MXT: with a packet of another data type).
+bad_crc: answers with a wrong checksum (MXT: with a truncated packet).
+old_version: answers with the version of an older register map.
 repeated: repeats the counter of the previous answer.
 frozen: answers, but its joints do not move.
-lagging: does everything LATE_S late.
+lagging: executes commands with the delay LATE_S.
 """
 
 LATE_S = 0.05
 
-# A client that disconnects within an answer is not worth a log entry; the library dumps packets.
+# Without this, the library would log whole packets whenever a client disconnects.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
 
 JITTER_STREAM = 1
-"""Number of the random stream of cycles; the noise of measured joints has the seed itself."""
+"""Second element of the random seed for the jitter of cycles, which makes it independent of the
+noise of measured joints."""
 
 
 def check_loopback(address: str) -> str:
-    """Return an address that only this computer reaches; ValueError otherwise, since an arm obeys
-    any client."""
+    """Return the address; raises ValueError unless only this computer can reach it.
+
+    The simulated arms have no authentication: they obey any client.
+    """
     if not ipaddress.ip_address(address).is_loopback:
         raise ValueError(
-            f"{address} is beyond loopback, and whoever reaches an arm's server moves the arm"
+            f"{address} is not a loopback address, but any client can move a simulated arm; "
+            "use 127.0.0.1"
         )
     return address
 
 
-# Screw axes at the zero pose (all frames parallel to the base): direction, and a point on the axis.
+# Axes of the joints at joint angles of zero, in the base frame: direction, and a point on the axis.
 _AXES = np.array(
     [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], dtype=np.float64
 )
@@ -100,7 +105,8 @@ def _skew(axis: Floats) -> Floats:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-# Each joint's turn is 1 + sin C + (1 - cos) C C (Rodrigues) about a point: (6, 4, 4) of C, and C C.
+# The motion of a joint by an angle q is 1 + sin(q) C + (1 - cos(q)) C C (Rodrigues), where C is the
+# matrix (4, 4) of the twist of its axis. These are C (_CROSS) and C C (_SQUARE) of all joints.
 _CROSS, _SQUARE = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
 for _joint, (_axis, _point) in enumerate(zip(_AXES, _POINTS, strict=True)):
     _CROSS[_joint, :3] = np.column_stack([_skew(_axis), -_skew(_axis) @ _point])
@@ -111,23 +117,27 @@ _HOME[:3, 3] = _FLANGE_AT_ZERO
 
 
 def forward(joints_rad: Floats) -> Floats:
-    """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
+    """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,).
+
+    It is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the flange pose M
+    at joint angles of zero.
+    """
     turns = _rotations(joints_rad)
     one, two, three = turns[::2] @ turns[1::2]
     return np.asarray(one @ two @ three @ _HOME)
 
 
 def _rotations(joints_rad: Floats) -> Floats:
-    """exp(S q) of each joint (6, 4, 4)."""
+    """Return the motions exp(S q) (6, 4, 4) of all joints about their axes at zero angles."""
     angles = joints_rad[:, None, None]
     return np.asarray(_UNIT + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
 
 
 def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Floats:
-    """Solve the joints (6,) within their ranges for a flange pose, by damped Gauss-Newton from a
-    guess.
+    """Solve the joint angles (6,), within their ranges, for a flange pose (4, 4).
 
-    Raises ValueError unless it converges to a micrometre and a microradian.
+    The method is damped Gauss-Newton from `guess_rad`. Raises ValueError unless it converges to a
+    micrometre and a microradian.
     """
     joints = guess_rad.copy()
     for _ in range(200):
@@ -143,12 +153,15 @@ def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Flo
         step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
         joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
     if not np.abs(_pose_error(base_from_flange, forward(joints))).max() <= 1e-6:
-        raise ValueError(f"the arm cannot reach a flange at {base_from_flange[:3, 3]} m (base)")
+        raise ValueError(
+            f"the arm cannot reach the flange pose at {base_from_flange[:3, 3]} m (base frame); "
+            "move the base or the flange"
+        )
     return joints
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Return translation (m) and small rotation (rad) from the present pose to the wanted one."""
+    """Return translation (m) and small rotation (rad), as (6,), from present to wanted pose."""
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -157,12 +170,15 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip like numpy.clip, in a fifth of its time for six numbers."""
+    """Clip values like numpy.clip, which takes five times as long for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
 def decelerate(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
-    """Return joint velocities (..., 6) after braking: scaled in proportion, along their path."""
+    """Return the joint velocities (..., 6) after braking for a duration.
+
+    All joints are slowed by the same factor, so that the arm stays on its path.
+    """
     stopping_s = (np.abs(velocity_rad_per_s) / ACCELERATION_RAD_PER_S2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
     return np.asarray(velocity_rad_per_s * left)
@@ -172,10 +188,10 @@ def decelerate(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
 class Servo:
     """Six joint servos of second order with critical damping.
 
+    joints_rad: joint angles (6,) by the encoders, which are at the motors.
     lag_s: lag of a joint behind a set-point of constant velocity.
-    joints_rad: positions of the encoders at the motors.
-    driven_rad: positions behind the gears.  Their backlash of `backlash_rad` delays a joint when
-        its motor reverses.
+    driven_rad: joint angles (6,) at the output of the gears. After a reversal they stay constant
+        until the motor has moved by `backlash_rad`.
     """
 
     joints_rad: Floats
@@ -188,8 +204,10 @@ class Servo:
         self.driven_rad = self.joints_rad.copy()
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
-        """Advance by `duration_s` in steps of at most a millisecond; `braking` stops along the
-        path."""
+        """Simulate `duration_s` in steps of at most a millisecond.
+
+        wanted_rad: set-point (6,). braking: brake along the path instead of following it.
+        """
         if braking and not self.velocity_rad_per_s.any():
             return
         steps = max(1, int(np.ceil(duration_s / 1e-3)))
@@ -213,14 +231,15 @@ class Servo:
 class Controller:
     """Simulated controller of one arm, which checks command blocks and answers with its status.
 
-    It rejects an invalid new command (magic, version, CRC, mode, sequence) by a Modbus exception.
-    It enters its fault state, where it brakes and stops, for joints out of range or not finite, for
-    a jump of the set-point, and when no command came for `watchdog_s` while moving.  An `idle`
-    command clears a fault and may restart the sequence.
+    It rejects an invalid command (magic number, version, CRC, mode, sequence number) by a Modbus
+    exception. In four cases it enters the fault state, in which it brakes and stops: joints out of
+    range, joints not finite, a jump of the set-point, and no command for `watchdog_s` while moving.
+    An `idle` command clears a fault and may restart the sequence numbers.
 
-    cycle_s: a set-point takes effect at the controller's next cycle; 0: at once.
-    cycle_jitter_s: standard deviation of each cycle's begin.
-    latency_s: time from the arrival of a set-point until the controller considers it.
+    noise_rad: standard deviation of the measured joints.
+    cycle_s: duration of a cycle; a set-point takes effect when the next one begins. 0: at once.
+    cycle_jitter_s: standard deviation of the time at which a cycle begins.
+    latency_s: time from the arrival of a set-point until it waits for the next cycle.
     """
 
     def __init__(
@@ -258,7 +277,7 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Advance by `duration_s`; trips the watchdog."""
+        """Simulate `duration_s` of motion; enter the fault state if commands are missing."""
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()
@@ -274,14 +293,14 @@ class Controller:
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def receive_command(self, registers: list[int]) -> bool:
-        """Check a written command block; False rejects it by a Modbus exception."""
+        """Check and execute a command block; return False if it must be rejected."""
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
             return self._refuse()
         magic, version, sequence, _, mode, _, *joints, crc = _COMMAND.unpack(block)
         if magic != 0x4653 or version != 1 or crc != zlib.crc32(block[:-4]) or mode > _STOP:
             return self._refuse()
-        # Accept a step by less than half the range, so that the 32-bit counter may wrap.
+        # Newer means ahead by less than half the range, so that the 32-bit counter may wrap around.
         newer = 0 < (sequence - self.accepted) % 2**32 < 2**31
         if mode != _IDLE and not newer:
             return self._refuse()
@@ -321,7 +340,7 @@ class Controller:
         due_s = math.ceil(due_s / self._cycle_s) * self._cycle_s
         if not self._cycle_jitter_s:
             return due_s
-        # A set-point never takes effect before the one before it.
+        # Jitter must not change the order in which set-points take effect.
         late_s = self._cycle_jitter_s * float(self._jitter.standard_normal())
         last_s = self._pending[-1][0] if self._pending else self._time_s
         return max(due_s + late_s, last_s)
@@ -336,7 +355,7 @@ class Controller:
         return False
 
     def status_registers(self) -> list[int]:
-        """Return the status block, with the present joints."""
+        """Return the status block of the register map, with the measured joints."""
         measured = self.servo.joints_rad + self._noise_rad * self._random.standard_normal(6)
         block = _STATUS.pack(
             0x4653,
@@ -356,19 +375,19 @@ class Controller:
 
 
 class ArmServer:
-    """Modbus TCP server of a controller."""
+    """Modbus TCP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called ahead of each request, to bring the arm's motion up to date."""
+        """`before` is called before each request; it must call `controller.advance`."""
         self.controller = controller
         self._address = (host, port)
         self._before = before
         self._server: ModbusTcpServer | None = None
 
     async def start(self) -> None:
-        """Listen; raises OSError or RuntimeError when the port is taken."""
+        """Start to listen; raises OSError or RuntimeError if the port is in use."""
         device = SimDevice(
             1,
             simdata=[
@@ -377,16 +396,16 @@ class ArmServer:
             ],
             action=self._act,
         )
-        # A missing device gets no answer at all, which makes this server silent.
+        # With this option, NoSuchIdException in `_act` makes the server silent.
         self._server = ModbusTcpServer(device, address=self._address, ignore_missing_devices=True)
         await self._server.serve_forever(background=True)
 
     @property
     def port(self) -> int:
-        """The port of the server (useful when it was given as 0)."""
+        """Return the port on which the server listens, also if it was given as 0 (any)."""
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
-            raise RuntimeError("the arm's server does not listen")
+            raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(listener.sockets[0].getsockname()[1])
 
     async def stop(self) -> None:
@@ -410,7 +429,7 @@ class ArmServer:
             return ExcCodes.DEVICE_FAILURE
         if fault == "slow" and written:
             await asyncio.sleep(LATE_S)
-        # In a combined read and write, the write comes first and has updated the arm.
+        # A combined read and write request calls this first for the write, which advances the arm.
         if written or function_code != _READ_AND_WRITE:
             self._before()
         if written:

@@ -1,4 +1,8 @@
-"""Simulate two arms on the network, and publish their true poses."""
+"""Simulate two arms that are controlled over the network, and publish their true poses.
+
+The apparatus holds the true parameters of the simulated hardware; the scene holds those that the
+other nodes assume.
+"""
 
 from __future__ import annotations
 
@@ -37,36 +41,48 @@ START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 class TwinArmsParameters(SimulatorParameters):
+    """Parameters of the simulated arms; values that the apparatus states take precedence."""
+
     host: Loopback = "127.0.0.1"
-    left_port: ListenPort = Field(default=5020, description="0: any free one")
+    left_port: ListenPort = Field(
+        default=5020, description="network port of the left arm; 0: any free port"
+    )
     right_port: ListenPort = 5021
     rate_hz: Positive = 140.8
     servo_lag_s: Positive = 0.025
-    noise_rad: NonNegative = Field(default=5e-6, description="of the measured joints")
+    noise_rad: NonNegative = Field(
+        default=5e-6, description="standard deviation of the measured joint angles, rad"
+    )
     backlash_rad: NonNegative = Field(
-        default=3e-5, description="play of each gear: a repeatability of 0.02 mm at the flange"
+        default=3e-5,
+        description="backlash of each gear, rad; the default is 0.02 mm at the flange",
     )
     watchdog_s: Positive = 0.1
     protocol: Literal["modbus", "mxt"] = "modbus"
     cycle_s: NonNegative = Field(
-        default=0.0, description="Modbus set-points act in cycles of so long; 0: at once"
+        default=0.0,
+        description="Modbus: controller cycle at which set-points take effect, s; 0: at once",
     )
     restart_after_s: Positive = Field(
-        default=2.0, description="how long an operator takes to clear an error of mxt"
+        default=2.0,
+        description="MXT: time after which the robot program restarts after an error, s",
     )
     joints_file: str | None = Field(
         default=None,
-        description="file of the joints; a restarted arm stands where it stood, as a real one does",
+        description="file that keeps the joint angles, so that a restart does not move the arms",
     )
-    fault: Fault = Field(default="none", description="what `fault_side` suffers from")
+    fault: Fault = Field(default="none", description="simulated fault of the arm `fault_side`")
     fault_side: Literal["left", "right"] = "left"
-    fault_after_s: NonNegative = Field(default=0.0, description="since the arms were switched on")
+    fault_after_s: NonNegative = Field(
+        default=0.0, description="time from the start of the arms until the fault begins, s"
+    )
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Map the joints of both arms, rad, onto a file that outlasts the process.
+    """Open the file that keeps the joint angles of both arms, rad, when the process ends.
 
-    The joints of a new file, or without a file, are NaN.  Raises OSError.
+    The returned arrays (6,) are mapped onto the file. They are NaN if the file is new or `path` is
+    None. Raises OSError if the file cannot be opened.
     """
     if path is None:
         rows = np.full((2, 6), np.nan)
@@ -79,12 +95,12 @@ def open_joints_file(path: str | None) -> dict[str, Floats]:
 
 
 def is_valid_position(joints_rad: Floats) -> bool:
-    """Return whether the joints are finite and within the arm's range."""
+    """Return whether the joint angles (6,) are finite and within the range of the arm."""
     return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
 
 
 class TwinArmsNode(Node):
-    """Simulate both arms; the first scene switches them on, with the sheet in their grippers."""
+    """Simulate both arms with the sheet between them; they start when the first scene arrives."""
 
     opens_devices: ClassVar[bool] = True
 
@@ -94,7 +110,7 @@ class TwinArmsNode(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it answers the arms' bridges over TCP, and their requests are not recorded"
+        return "it answers requests of the arm bridges over the network, which are not recorded"
 
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}
@@ -134,7 +150,7 @@ class TwinArmsNode(Node):
             self.servers[side] = server
 
     def _server(self, side: str, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
-        """Start an arm at those joints, behind a server of the protocol."""
+        """Make the controller of an arm at the given joint angles, and its network server."""
         given, before = self.parameters, partial(self._advance, side)
         truth = self._truth(side)
         lag_s = given.servo_lag_s if truth.servo_lag_s is None else truth.servo_lag_s
@@ -173,12 +189,18 @@ class TwinArmsNode(Node):
         return ArmTruth() if given is None else getattr(given.arms, side)
 
     def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
-        """Return the true joint angles (6,) behind gears at angles of the encoders (6,)."""
+        """Return the true joint angles (6,), given the angles (6,) after the gears' backlash.
+
+        They differ by the true zero offsets of the encoders.
+        """
         offsets_rad = self._truth(side).joint_offsets_rad
         return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
-        """Return joints that hold the sheet in the screen plane, just stretched."""
+        """Return the joint angles (6,) by the encoders at which an arm starts.
+
+        They hold the sheet in the screen plane (z = 0), with the scene's minimum stretch.
+        """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
         clamp = spec.flange_from_edge
@@ -189,7 +211,7 @@ class TwinArmsNode(Node):
         return np.asarray(joints_rad - np.array(self._truth(side).joint_offsets_rad))
 
     def _advance(self, side: str) -> None:
-        """Advance an arm to the present time."""
+        """Simulate the motion of an arm up to the present time."""
         now_ns = self.clock.now_ns()
         duration_s = (now_ns - self._moved_ns[side]) * 1e-9
         self._moved_ns[side] = now_ns

@@ -1,7 +1,7 @@
-"""Render images of a calibration board for the simulated rig, and choose the board's poses.
+"""Render images of a calibration board for the simulated stereo camera, and choose its poses.
 
-The rays of each pixel are intersected with the board's plane.  An edge of a square is blurred over
-the one ray that it crosses, so that corners are accurate to a few thousandths of a pixel.
+The rays of each pixel are intersected with the plane of the board. Edges of squares are antialiased
+over the width of one ray, so that corners are accurate to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 RAYS = 3
-"""Rays per pixel and direction."""
+"""Number of rays per pixel in each direction."""
 
 PAPER_LEVEL = 175.0
 INK_LEVEL = 22.0
@@ -34,18 +34,18 @@ BORDER_SQUARES = 0.6
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""Fractions of the image's height that the upright board fills: near and far."""
+"""Tilts of successive poses, and fractions of the image height that the untilted board fills."""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
-"""Minimum fraction of a ChArUco board's corners in view; the board may be cut off otherwise."""
+"""Minimum visible fraction of the corners of a ChArUco board; the image may cut off the others."""
 
 CHARUCO_NEARER = 1.2
-"""Factor by which a ChArUco board is shown nearer, since its markers are small."""
+"""Factor by which a ChArUco board appears larger than a chessboard, since its markers are small."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """Raised for a board that cannot be rendered; the message says what to change."""
+    """Raised for a board that cannot be rendered; the text states the cause."""
 
     code = "board"
     remedy = "Choose a board that fits into the images: fewer or smaller squares."
@@ -53,7 +53,11 @@ class BoardError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Uneven light on a board: its gradient across the image, and the room's texture."""
+    """Uneven illumination of an image, and the background behind the board.
+
+    gain: factor at the image centre. slope_x, slope_y: relative change from there to the right and
+    the lower edge. room: background levels (height, width).
+    """
 
     gain: float
     slope_x: float
@@ -62,7 +66,10 @@ class Light:
 
 
 class TwinBoard:
-    """Board in front of a rig with the true lenses; `seed` determines noise and light."""
+    """Simulated stereo camera that views a calibration board.
+
+    camera: true lenses and poses. seed: determines noise, illumination and poses.
+    """
 
     def __init__(
         self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None
@@ -75,10 +82,9 @@ class TwinBoard:
         self._rays = tuple(self._cast(lens) for lens in (camera.left, camera.right))
 
     def _cast(self, lens: Lens) -> Singles:
-        """Return slopes (RAYS*height, RAYS*width, 2) of the rays through the image.
+        """Return x/z and y/z (RAYS * height, RAYS * width, 2) of the rays through the image.
 
-        The distortion varies so little between pixels that the rays of one pixel are equally
-        spaced.
+        The rays within a pixel are equally spaced, because the distortion varies little there.
         """
         height, width = self.camera.height_px, self.camera.width_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -92,8 +98,10 @@ class TwinBoard:
         return rays
 
     def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
-        """Return the true pixels (rows*columns, 2) of the inner corners in both views, columns
-        first."""
+        """Return the true pixels (rows * columns, 2) of the inner corners in both images.
+
+        They are ordered row by row.
+        """
         board = self.board
         grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2) * board.square_m
         points = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
@@ -101,8 +109,10 @@ class TwinBoard:
         return left, right
 
     def _views(self, left_from_board: Floats, points: Floats) -> list[Floats]:
-        """Return pixels (n, 2) of the board's points (n, 3) in each view; all must lie before
-        both."""
+        """Project points (n, 3) of the board to pixels (n, 2) in each image.
+
+        Raises BoardError unless all points lie in front of both cameras.
+        """
         seen = []
         for lens, eye_from_left in (
             (self.camera.left, np.eye(4)),
@@ -110,12 +120,12 @@ class TwinBoard:
         ):
             in_eye = apply(eye_from_left @ left_from_board, points)
             if in_eye[:, 2].min() <= 0:
-                raise BoardError("the board reaches behind the camera; hold it further away")
+                raise BoardError("the board reaches behind a camera; hold it further away")
             seen.append(pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]))
         return seen
 
     def pair(self, left_from_board: Floats) -> tuple[Image, Image]:
-        """Render the left and the right image of the board at a pose (4, 4)."""
+        """Render the left and right image of the board at the pose `left_from_board` (4, 4)."""
         left, right = self.levels(left_from_board)
         return self._exposed(left), self._exposed(right)
 
@@ -124,7 +134,7 @@ class TwinBoard:
         return quantize(levels + self.sensor.noise(levels) * noise)
 
     def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
-        """Render both images before noise and rounding, (height, width)."""
+        """Render both images (height, width) without noise and rounding."""
         self._views(left_from_board, self._outline())
         light = self._light()
         left, right = (
@@ -143,7 +153,7 @@ class TwinBoard:
         return Light(gain, slope_x, slope_y, np.clip(room, 5.0, 90.0).astype(np.float32))
 
     def _outline(self) -> Floats:
-        """Return points (n, 3) along the edge of the board's paper, in the board's frame."""
+        """Return points (n, 3) along the edge of the board with its border, in its frame."""
         board = self.board
         low = -(1.0 + BORDER_SQUARES) * board.square_m
         high = np.array([board.columns, board.rows]) * board.square_m + BORDER_SQUARES * (
@@ -161,7 +171,7 @@ class TwinBoard:
         return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
     def _drawn(self, rays: Singles, eye_from_board: Floats, light: Light) -> Singles:
-        """Render one view with lens blur and vignetting."""
+        """Render the image of one camera with lens blur, vignetting and uneven illumination."""
         height, width = self.camera.height_px, self.camera.width_px
         levels = light.room.copy()
         in_eye = apply(eye_from_board, self._outline())
@@ -183,14 +193,14 @@ class TwinBoard:
         return np.asarray(levels * lit, dtype=np.float32)
 
     def _through_lens(self, fine: Singles) -> Singles:
-        """Average the rays of each pixel, after the lens blur."""
+        """Apply the lens blur to values on rays, then average the rays of each pixel."""
         spread = RAYS * self.sensor.blur_px
         smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
         height, width = fine.shape[0] // RAYS, fine.shape[1] // RAYS
         return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
-        """Return the board's level on each ray, and the fraction of the ray that meets it."""
+        """Return the grey level of the board on each ray, and which fraction of a ray hits it."""
         board = self.board
         plane_from_ray = np.linalg.inv(eye_from_board[:3, [0, 1, 3]]).astype(np.float32)
         on_plane = rays @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
@@ -220,11 +230,11 @@ class TwinBoard:
         return self.board.marker_m / self.board.square_m
 
     def poses(self, count: int) -> list[Floats]:
-        """Return poses `left_from_board` (4, 4) as a careful person would show the board.
+        """Return poses `left_from_board` (4, 4) at which a careful person would hold the board.
 
-        They cover the image's centre, corners and edges, near and far, with tilts in all
-        directions.  Each is as far out as both views still contain the whole board (of a ChArUco
-        board, most of it).
+        They cover the centre, corners and edges of the image, near and far, with tilts in all
+        directions. Each is as far from the image centre as both images still show the whole board
+        (most of a ChArUco board).
         """
         board = self.board
         middle = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -235,7 +245,7 @@ class TwinBoard:
         for number in range(count):
             share = nearer * HEIGHT_FRACTIONS[number % len(HEIGHT_FRACTIONS)]
             tilt_rad = TILTS_RAD[number % len(TILTS_RAD)] + self._random.uniform(0.0, 0.1)
-            # The golden angle: no two tilts have the same direction, for any number of poses.
+            # Multiples of the golden angle: no two poses are tilted in the same direction.
             towards = 2.399963 * number
             turn = rotation_from_vector(
                 tilt_rad * np.array([np.cos(towards), np.sin(towards), 0.0])
@@ -246,7 +256,10 @@ class TwinBoard:
         return poses
 
     def _placed(self, turn: Floats, depth_m: float, way: Floats, middle: Floats) -> Floats:
-        """Place the rotated board as far out as possible, and farther away if necessary."""
+        """Place a rotated board as far from the image centre in direction `way` as it is visible.
+
+        If it is not visible at the centre, move it farther away. Returns left_from_board (4, 4).
+        """
         between_m = -0.5 * float(self.camera.right_from_left[0, 3])
         half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])
         reach = half / np.array([self.camera.left.fx_px, self.camera.left.fy_px])
@@ -265,7 +278,7 @@ class TwinBoard:
         return posed(out)
 
     def _shown(self, left_from_board: Floats) -> bool:
-        """Whether enough of the board is in both images: all of its paper, or enough corners."""
+        """Return whether both images show the whole chessboard, or enough ChArUco corners."""
         whole = self.board.kind == "chessboard"
         try:
             views = self._views(left_from_board, self._outline())
@@ -282,21 +295,25 @@ class TwinBoard:
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:
-    """Return which cells are black: (rows+1, columns+1, n, n), n cells a side with the black
-    border.
+    """Return which cells of the ChArUco markers are black, (rows + 1, columns + 1, n, n).
 
-    Markers are numbered by row over the white squares, with a black first square, as in OpenCV.
-    Raises BoardError for a board without markers or with more than its dictionary holds.
+    A marker has n cells per side, its black border included. Markers are numbered by row over the
+    white squares; the first square of the board is black, as in OpenCV.
+    Raises BoardError if the board has no valid markers, or more than its dictionary holds.
     """
     if board.marker_m is None or board.dictionary is None:
-        raise BoardError("board: a ChArUco board needs marker_m and dictionary")
+        raise BoardError("board: a ChArUco board needs marker_m and dictionary; give both")
     if not 0 < board.marker_m < board.square_m:
         raise BoardError(
-            f"board.marker_m: {board.marker_m:g} m does not fit a square of {board.square_m:g} m"
+            f"board.marker_m: {board.marker_m:g} m does not fit into square_m = "
+            f"{board.square_m:g} m; give a smaller, positive size"
         )
     number = getattr(cv2.aruco, board.dictionary, None)
     if not isinstance(number, int) or not board.dictionary.startswith("DICT_"):
-        raise BoardError(f"board.dictionary: {board.dictionary}: OpenCV has none of that name")
+        raise BoardError(
+            f"board.dictionary: OpenCV has none named {board.dictionary}; give one of cv2.aruco, "
+            "for instance DICT_4X4_50"
+        )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     cells = dictionary.markerSize + 2
     squares = [
@@ -307,8 +324,8 @@ def _markers(board: Board) -> NDArray[np.bool_]:
     ]
     if len(squares) > len(dictionary.bytesList):
         raise BoardError(
-            f"board: {len(squares)} white squares, {board.dictionary} has only "
-            f"{len(dictionary.bytesList)} markers; choose a larger dictionary"
+            f"board: {len(squares)} white squares need a marker each, but {board.dictionary} has "
+            f"only {len(dictionary.bytesList)}; choose a larger dictionary"
         )
     black = np.zeros((board.rows + 1, board.columns + 1, cells, cells), dtype=np.bool_)
     for marker, (row, column) in enumerate(squares):
@@ -317,9 +334,9 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 
 
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
-    """Return the ink (0 or 1) of the markers at positions (..., 2) in squares.
+    """Return where markers are printed black (1) at board positions (..., 2), in squares.
 
-    share: fraction of a square that its marker covers.  Squares without a marker have no ink.
+    share: side length of a marker as a fraction of its square. It is 0 outside markers.
     """
     rows, columns, cells, _ = markers.shape
     column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)

@@ -1,8 +1,9 @@
-"""Describe what a camera sees beside the marked fingertip: the clutter that makes tracking hard.
+"""Describe the clutter: objects in the camera images that make it hard to track the fingertip.
 
-All objects are plain values in world coordinates (m); `pixels.py` renders them.  An object has its
-own path in the world, or is carried: then its path is relative to the fingertip.  Levels are
-digital numbers at the sensor's normal exposure, where the marker has some 215 of 255.
+All objects are plain values in world coordinates (m); `pixels.py` renders them. The path of an
+object is relative to the world, or to the fingertip if the object is `carried`. `views` names the
+cameras that see it. Levels are grey levels (0..255) at normal exposure, where the marker on the
+fingertip has about 215.
 """
 
 from __future__ import annotations
@@ -21,19 +22,21 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""World direction from the tip to the knuckle: up from below, out of the marker's view."""
+"""World direction from the fingertip to the knuckle; the finger must not hide the marker."""
 
 
 class Trajectory(Protocol):
-    """Interface of a position over simulation time."""
+    """Interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,), world; of a carried object relative to the fingertip."""
+        """Return the position (3,) in the world frame, or from the fingertip if carried."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
+    """Trajectory of an object that does not move."""
+
     point: Point
 
     def at(self, time_s: float) -> Floats:
@@ -42,7 +45,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Motion at constant velocity through `start` at time 0."""
+    """Trajectory with constant velocity, at `start` at time 0."""
 
     start: Point
     velocity_m_per_s: Point
@@ -53,7 +56,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """Oscillate through `middle` by +-`reach`."""
+    """Trajectory that oscillates sinusoidally about the centre `middle` by +-`reach`."""
 
     middle: Point
     reach: Point
@@ -67,7 +70,7 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """Skin: a tapered capsule between two points, behind the finger and its marker."""
+    """Part of the hand: a tapered capsule between two points, drawn behind the finger."""
 
     start: Trajectory
     end: Trajectory
@@ -79,7 +82,7 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class SecondMarker:
-    """Bead that resembles the marker."""
+    """Bead that looks like the marker on the fingertip."""
 
     path: Trajectory
     radius_m: float = MARKER_RADIUS_M
@@ -90,9 +93,9 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """Reflection of a lamp: a small spot whose light adds to the background.
+    """Reflection of a lamp: a small spot whose light is added to the background.
 
-    It saturates above some 255.  A curved mirror often shows it in one view only.
+    It saturates above 255. On a curved surface it often appears in only one of the two images.
     """
 
     path: Trajectory
@@ -104,7 +107,7 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Dark or skin-coloured capsule of constant level in front of everything else."""
+    """Capsule of constant level that hides everything behind it, such as a cable."""
 
     start: Trajectory
     end: Trajectory
@@ -116,9 +119,9 @@ class Occluder:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Lit rubber sheet behind the finger, at rest in the plane z = 0, with its grain.
+    """Illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
-    contrast: standard deviation of the grain's levels.
+    contrast: standard deviation of the texture's levels. grain_m: size of its features.
     """
 
     half_width_m: float = 0.12
@@ -130,7 +133,10 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """All clutter; rendered in this order, with the finger and its marker before `markers`."""
+    """Set of cluttering objects, in the order in which they are drawn.
+
+    The finger with its marker is drawn after `limbs`.
+    """
 
     sheet: Sheet | None = None
     limbs: tuple[Capsule, ...] = ()
@@ -140,7 +146,7 @@ class Clutter:
 
 
 def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both") -> Clutter:
-    """Make a second marker at a fixed offset from the first."""
+    """Make a second marker at a fixed offset from the fingertip."""
     return Clutter(
         markers=(SecondMarker(FixedPoint(offset_m), level=level, carried=True, views=views),)
     )
@@ -149,22 +155,23 @@ def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both
 def touching_highlight(
     overlap: float, *, radius_m: float = 0.0015, level: float = 300.0, views: Views = "both"
 ) -> Clutter:
-    """Make a highlight beside the marker along x that covers `overlap` (0..1) of its diameter."""
+    """Make a highlight at +x of the marker that covers the fraction `overlap` of its diameter."""
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
     spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, level, carried=True, views=views)
     return Clutter(highlights=(spot,))
 
 
 def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clutter:
-    """Make a straight-edged occluder that hides this fraction (0..1) of the marker's area from +x.
+    """Make an occluder whose straight edge hides the fraction `share` of the marker's area.
 
-    At 1 it hides the marker with its blur.  With `views`, only one camera misses the marker.
+    It comes from +x. At `share` = 1 it hides the marker with its blur. With `views`, it hides the
+    marker from one camera only.
     """
     radius_m = 0.05
     if share >= 1.0:
         edge = -3.0
     else:
-        # The segment of a unit disc beyond x = edge.
+        # Find the x = edge beyond which a segment of the unit disc has this area.
         edge = brentq(
             lambda x: (np.arccos(x) - x * np.sqrt(1.0 - x * x)) / np.pi - share, -1.0, 1.0
         )
@@ -176,10 +183,10 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
 
 
 def together(*parts: Clutter) -> Clutter:
-    """Combine clutter; at most one part may contain a sheet."""
+    """Combine sets of clutter; raises ValueError if several contain a sheet."""
     sheets = [part.sheet for part in parts if part.sheet is not None]
     if len(sheets) > 1:
-        raise ValueError(f"{len(sheets)} sheets: there is one plane z = 0 to lay them in")
+        raise ValueError(f"{len(sheets)} sheets found; give one, since it fills the plane z = 0")
     return Clutter(
         sheet=sheets[0] if sheets else None,
         limbs=tuple(limb for part in parts for limb in part.limbs),
@@ -190,7 +197,7 @@ def together(*parts: Clutter) -> Clutter:
 
 
 def _from_knuckle(x: float, y: float, z: float) -> FixedPoint:
-    """Return a point of the hand, relative to the pointing finger's knuckle."""
+    """Return a point given relative to the knuckle of the pointing finger, from the fingertip."""
     knuckle = [FINGER_LENGTH_M * part for part in FINGER_DIRECTION]
     return FixedPoint((knuckle[0] + x, knuckle[1] + y, knuckle[2] + z))
 
@@ -211,12 +218,12 @@ HAND = Clutter(
         ),
     )
 )  # fmt: skip
-"""The rest of a pointing right hand: palm, folded fingers, thumb."""
+"""Palm, folded fingers and thumb of a right hand whose index finger points."""
 
 NAIL = Clutter(
     highlights=(Highlight(FixedPoint((0.001, -0.006, 0.014)), 0.0006, 120.0, carried=True),)
 )
-"""A reflection on the nail: dimmer and smaller than the marker."""
+"""Reflection on the fingernail, dimmer and smaller than the marker."""
 
 CLAMPS = Clutter(
     highlights=(
@@ -246,11 +253,11 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""A bead as bright as the marker, moving reflections, and cables that swing before everything."""
+"""Moving bead as bright as the marker, moving reflections, and cables that swing in front."""
 
 CLUTTER = {
     "none": Clutter(),
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""Clutter by its name in launch files; moving objects oscillate, so that every time is valid."""
+"""Sets of clutter by their names in launch files."""

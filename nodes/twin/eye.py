@@ -1,11 +1,13 @@
-"""Render what an eye sees on the true sheet by ray tracing, as the reference of the display.
+"""Render by ray tracing what the user's eye sees on the simulated sheet, to verify the display.
 
-A measuring camera stands at the eye.  Its image plane is the screen plane (z = 0), a square window
-about the origin.  Each ray is traced to the sheet's triangles and from there to the projector, and
-takes the colour that the projector sends there.  The object itself is traced in the same way, as
-the expected image.  Sizes are then measured in the images, as in the paper.
+A virtual measuring camera is placed at the eye. Its image plane is the screen plane (z = 0), a
+square window about the origin. Each ray is traced to the triangles of the sheet, and takes the
+colour that the projector casts on that point. The expected image, which shows the virtual object
+itself, is traced in the same way. Sizes are then measured in both images as in Furukawa et al. 2007
+("the paper" below).
 
-It shares no code with the renderer: own rays, own projector, own object.
+"True" names the simulator's own devices, which may differ from those that the nodes assume. The
+module shares no code with the renderer, so that an error of the renderer becomes visible here.
 """
 
 from __future__ import annotations
@@ -35,36 +37,38 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 METRES_PER_PX = 0.00035
-"""Half of the paper's 0.7 mm."""
+"""Default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
 
 HALF_WINDOW_M = 0.12
 MARGIN_PX = 3
 SEEN_SAMPLES = 2
 FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
-"""Samples per pixel and direction: a silhouette is measured and needs finer sampling than
-shading."""
+"""Samples per pixel and direction for flat and soft shading of the expected image. Sizes are
+measured in flat-shaded images, whose outline needs finer sampling."""
 
 SHADOW_TOLERANCE = 0.002
-"""Relative depth behind the lit surface beyond which a point is in shadow."""
+"""Relative distance behind the first surface on a projector ray beyond which a point is in shadow.
+"""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
 GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
-"""Appearance of a soft object in this light; see docs/renderer.md."""
+"""Parameters of the shading of a soft object; see docs/renderer.md."""
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised when an image does not show what is to be measured; the message states what is
-    missing."""
+    """Raised if an image does not show the object to be measured; the text states the cause."""
 
     code = "not-measurable"
-    remedy = "Render a nearer pose: the quantity to measure must be in view."
+    remedy = "Choose a pose in which the whole object is visible within the image."
 
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Fan of rays: from `origin` (3,) along first + column * right + row * down, each
-    (3,)."""
+    """Regular fan of rays from `origin`, one per pixel of an image.
+
+    The direction of a ray is first + column * right + row * down; all vectors are (3,).
+    """
 
     origin: Floats
     first: Floats
@@ -74,18 +78,19 @@ class Rays:
     height: int
 
     def directions(self) -> Floats:
-        """(height, width, 3)."""
+        """Return the directions (height, width, 3) of all rays; they are not unit vectors."""
         columns, rows = np.arange(self.width), np.arange(self.height)
         return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
 
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """First hits of a fan of rays.
+    """First intersection of each ray of a fan with a mesh.
 
-    triangle: (height, width), -1 where nothing is hit.
-    inverse_range: (height, width), one over the ray parameter of the hit, 0 without a hit.
-    weights: (triangles, 3, 3), which map (1, column, row) to unscaled barycentric weights.
+    triangle: (height, width) index of the triangle that is hit; -1 where nothing is hit.
+    inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 without a hit.
+    weights: (triangles, 3, 3) matrices that map (1, column, row) to barycentric weights, which are
+        not normalised.
     """
 
     triangle: NDArray[np.int32]
@@ -94,17 +99,20 @@ class Hits:
 
 
 def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
-    """Intersect a fan of rays with triangles (triangles, 3) of vertices (vertices, 3).
+    """Find the nearest triangle that each ray of a fan hits.
 
-    A direction d = sum of w_i (vertex_i - origin) meets the triangle where all w_i >= 0, at the
-    parameter 1 / sum(w).  The weights are linear in column and row.  Triangles that extend behind
-    the origin, or are seen edge-on, are not hit.
+    triangles: (triangles, 3) indices of vertices (vertices, 3).
+
+    A direction is written as d = sum of w_i (vertex_i - origin) over the corners of a triangle. The
+    ray hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are
+    linear in column and row. Triangles that extend behind the origin, or are seen edge-on, are
+    ignored.
     """
     corners = (vertices - rays.origin)[triangles]
     basis = np.column_stack([rays.first, rays.right, rays.down])
     volume = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     size = np.linalg.norm(corners, axis=2).prod(axis=1)
-    # Vertices as the fan's own pixels: their (1, column, row) up to the depth.
+    # Corners in the fan's coordinates: (1, column, row) times a depth.
     pixels = corners @ np.linalg.inv(basis).T
     ahead = (pixels[..., 0] > 1e-9).all(axis=1) & (np.abs(volume) > 1e-12 * size)
     weights = np.zeros((len(triangles), 3, 3))
@@ -134,16 +142,19 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """Projector that maps between its pixels and points of the true sheet."""
+    """Simulated projector, which maps between its pixels and the points of the sheet they light."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
-        """vertices: (vertices, 3) of the sheet, world.  triangles: (triangles, 3)."""
+        """Prepare the rays of a projector that lights a mesh.
+
+        vertices: (vertices, 3) of the sheet in the world frame. triangles: (triangles, 3) indices.
+        """
         pose, lens = projector.world_from_projector, projector.lens
         self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._lens = lens
         self._size = np.array([projector.width_px, projector.height_px])
-        # The rays are those of an image without distortion, with a margin for pixels that the lens
-        # bends in.
+        # The rays are those of a lens without distortion. A margin contains the pixels that
+        # distortion moves out of the undistorted image.
         edge = np.array([(x, y) for x in np.linspace(0, 1, 9) for y in np.linspace(0, 1, 9)])
         border = edge * (self._size - 1)
         self._margin = 0
@@ -167,7 +178,7 @@ class TrueProjector:
         return first_hits(self._rays, self._vertices, self._triangles)
 
     def _straight(self, pixels: Floats) -> Floats:
-        """Return the positions that pixels (..., 2) would have without the lens's distortion."""
+        """Return the positions (..., 2) that pixels (..., 2) have without lens distortion."""
         lens = self._lens
         if not any(lens.distortion):
             return pixels
@@ -175,9 +186,10 @@ class TrueProjector:
         return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
-        """Return projector pixels (..., 2) that light points (..., 3), and which points are lit.
+        """Return the projector pixels (..., 2) that light points (..., 3), and which are lit.
 
-        A point is not lit outside the image, or behind another part of the sheet.
+        A point is not lit if it lies outside the projected image or if another part of the sheet
+        casts a shadow on it.
         """
         local = apply(inverse(self._world_from_projector), points)
         depth = local[..., 2]
@@ -195,7 +207,10 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return the sheet's points (n, 3) that pixels (n, 2) light, and which exist."""
+        """Return the points (n, 3) of the sheet that pixels (n, 2) light, and which are valid.
+
+        A point is not valid if the pixel is outside the image or its ray misses the sheet.
+        """
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
         limit = np.array([self._rays.width - 1, self._rays.height - 1])
@@ -211,13 +226,14 @@ class TrueProjector:
 
 
 Box = tuple[int, int, int, int]
-"""Part of an image: left, top, and the column and row behind its last."""
+"""Part of an image: first column, first row, last column + 1, last row + 1."""
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
-    """Make the measuring camera's rays through part of its image of `size` x `size` pixels.
+    """Make the rays from the eye through part of the measuring camera's square image.
 
-    Each pixel has `samples` x `samples` rays, top left first.
+    The whole image has `size` x `size` pixels. Each pixel of `box` has `samples` x `samples` rays;
+    the first is at the top left.
     """
     left, top, right, bottom = box
     pitch = metres_per_px / samples
@@ -242,11 +258,11 @@ def seen(
     metres_per_px: float = METRES_PER_PX,
     half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
-    """Render the image (rows, columns, 3) that the measuring camera takes of the sheet.
+    """Render the image (rows, columns, 3) that the measuring camera at the eye takes of the sheet.
 
-    projected: the projector's image (height, width, 3), top row first.
+    projected: the projected image (height, width, 3), top row first.
 
-    The image is black where there is no sheet, and where a fold blocks the light.
+    The result is black where there is no sheet or where a fold of the sheet blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
@@ -274,7 +290,10 @@ def seen(
 
 
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
-    """Return the part of the image that shows points (n, 3), with a margin; None if it is empty."""
+    """Return the part of the measuring camera's image that shows world points (n, 3).
+
+    It has a margin of MARGIN_PX. Return None if the image shows none of the points.
+    """
     if len(points) == 0:
         return None
     on_screen = eye[:2] + (points[:, :2] - eye[:2]) * (eye[2] / (eye[2] - points[:, 2:]))
@@ -287,7 +306,7 @@ def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | 
 
 
 def _put(whole: Image, box: Box, samples_of: NDArray[np.float32], samples: int) -> None:
-    """Average samples x samples into a pixel and store them in their part of the image."""
+    """Average the samples of each pixel and store the pixels in part `box` of image `whole`."""
     left, top, right, bottom = box
     blocks = samples_of.reshape(bottom - top, samples, right - left, samples, -1)
     whole[top:bottom, left:right] = np.rint(blocks.mean(axis=(1, 3)))
@@ -301,12 +320,12 @@ def render_expected(
     metres_per_px: float = METRES_PER_PX,
     half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
-    """Render the expected image (rows, columns, 3): the object itself, on black.
+    """Render the expected image (rows, columns, 3): the virtual object itself, on black.
 
-    Raises ValueError unless the object lies before the eye.
+    Raises ValueError unless the whole object lies in front of the eye.
     """
     if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
-        raise ValueError("the object reaches up to the eye")
+        raise ValueError("the virtual object reaches the eye or beyond; move the object or the eye")
     vertices, triangles = true_object.vertices, true_object.triangles
     size = round(2.0 * half_window_m / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
@@ -342,7 +361,11 @@ def render_expected(
 
 
 def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
-    """Return colours (n, 3) of a soft object without a texture at normals (n, 3)."""
+    """Return the colours (n, 3), 0 to 1, of points on a soft object without a texture.
+
+    colour: (3,) of the object. normals, to_eye: (n, 3) normals, and vectors from the points to the
+    eye. sunk_m: (n,) depths by which the points are pushed in.
+    """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -354,34 +377,38 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """Largest bright blob of an image, and the ends of lines through it."""
+    """Outline of the largest bright region of an image, measured along rows and columns."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
         bright = gray[gray > 25.0]
         if len(bright) < 400:
-            raise NotMeasurableError(f"only {len(bright)} pixels of the picture are lit")
+            raise NotMeasurableError(
+                f"only {len(bright)} pixels of the image are lit; at least 400 are required"
+            )
         self.white = float(np.quantile(bright, 0.9))
         mask = (gray > 0.5 * self.white).astype(np.uint8)
         _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
         largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
         left, top, width, height, area = statistics[largest]
         if area < 400:
-            raise NotMeasurableError(f"the largest bright blob has only {area} pixels")
+            raise NotMeasurableError(
+                f"the largest bright region has only {area} pixels; at least 400 are required"
+            )
         if left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
-            raise NotMeasurableError("the object reaches the picture's border")
-        # Other blobs are removed; a margin keeps the edge's own soft pixels.
+            raise NotMeasurableError("the object reaches the border of the image")
+        # Remove other regions. The margin keeps the partly bright pixels at the edge.
         keep = cv2.dilate((labels == largest).astype(np.uint8), np.ones((9, 9), np.uint8))
         self._gray = np.where(keep > 0, gray, 0.0) / self.white
         self.middle_column = left + 0.5 * (width - 1)
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the object's first and last row on a column, interpolated over columns."""
+        """Return the rows at which the object begins and ends on a (fractional) column."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return where the object begins and ends (columns) on a row."""
+        """Return the columns at which the object begins and ends on a (fractional) row."""
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
@@ -395,14 +422,14 @@ class _Silhouette:
 
 
 def _ends(profile: Floats) -> tuple[float, float]:
-    """Return the subpixel first and last edge of a bright run.
+    """Return the subpixel positions at which a bright run of a grey-level profile begins and ends.
 
-    The edge is where a sharp edge would give the same light.  This is exact for any symmetric blur,
-    unlike the crossing of half the brightness.
+    An edge is placed where a sharp step would give the same total light. Unlike the position of
+    half brightness, this is exact for any symmetric blur.
     """
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
-        raise NotMeasurableError("the object is too narrow, or missing, where it is measured")
+        raise NotMeasurableError("the object is too narrow, or missing, on a measured line")
     return _edge(profile, bright[0]), len(profile) - 1 - _edge(
         profile[::-1], len(profile) - 1 - bright[-1]
     )
@@ -416,11 +443,11 @@ def _edge(profile: Floats, first: int) -> float:
 
 
 INSET = 0.05
-"""Widths of the tilted cylinder are measured this fraction of its height inside the upper and lower
-edge, away from its rounded corners."""
+"""Fraction of the height of the tilted cylinder. Its widths are measured this far inside the upper
+and lower edge, away from the rounded corners."""
 
 MIDDLE_COLUMNS = 17
-"""Heights are means over this many columns about the middle."""
+"""Number of columns about the centre over which a measured height is averaged."""
 
 
 def _height(shape: _Silhouette) -> tuple[float, float]:
@@ -431,10 +458,10 @@ def _height(shape: _Silhouette) -> tuple[float, float]:
 
 
 def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, float]:
-    """Measure height, upside width and downside width (m) of the cylinder in a flat-shaded image.
+    """Measure height, upper width and lower width (m) of a cylinder in a flat-shaded image.
 
-    The method is that of section VI-B.  Raises NotMeasurableError when it is cut off, broken or
-    missing.
+    The method is that of section VI-B of the paper. Raises NotMeasurableError if the cylinder is
+    cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -449,10 +476,10 @@ def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, floa
 
 
 def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
-    """Measure height and width (m) through the middle of the cylinder in a flat-shaded image.
+    """Measure height and width (m) of a cylinder at its centre in a flat-shaded image.
 
-    The method is that of section VI-C.  Raises NotMeasurableError when it is cut off, broken or
-    missing.
+    The method is that of section VI-C of the paper. Raises NotMeasurableError if the cylinder is
+    cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -462,12 +489,14 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
-    """True state at which a frame was shown.
+    """True state of the simulated hardware and of the object while a frame is shown.
 
-    world_from_flange_left, world_from_flange_right: (4, 4).
-    finger_tip: (3,) or None.
-    skin_vertices, displacement: (skin vertices, 3), and skin_triangles: (skin triangles, 3), or all
-        None for the object at rest.
+    world_from_flange_left, world_from_flange_right: (4, 4) poses of the arms' last links.
+    finger_tip: (3,) in the world frame, or None without a finger.
+    skin_vertices, skin_triangles: surface mesh of the soft body at rest, (skin vertices, 3) and
+        (skin triangles, 3).
+    displacement: (skin vertices, 3). All three are None if the object is not deformed.
+    flat: whether the object is shown in one colour, without shading.
     """
 
     scene: Scene
@@ -495,9 +524,10 @@ class EyeSituation:
         metres_per_px: float,
         apparatus: Apparatus | None = None,
     ) -> Self:
-        """Combine the latest messages; a skin and an answer of different meshes are not used.
+        """Combine the latest messages.
 
-        scene: the true one.
+        scene: the scene with the true devices. The deformation is ignored unless `body` and `skin`
+        belong to the same mesh.
         """
         moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
         shown = skin if moved is not None else None
@@ -525,10 +555,12 @@ def true_sheet(
     rubber: TrueRubber,
     friction_coefficient: float | None = None,
 ) -> DeformedSheet:
-    """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or
-    None.
+    """Compute the shape of the sheet between the true flange poses (4, 4).
 
-    scene: the true one.
+    scene: the scene with the true devices.
+    finger_tip: true position (3,) of the fingertip that pushes the sheet, or None.
+
+    Raises NotConvergedError if the membrane has no solution.
     """
     arms = scene.arms
     edges = [
@@ -550,7 +582,7 @@ def true_sheet(
 
 
 class EyeCamera:
-    """Render images of the measuring camera, and cache what does not change between them."""
+    """Measuring camera at the user's eye, which caches results that later images can use."""
 
     def __init__(self) -> None:
         self._scene: Scene | None = None
@@ -560,10 +592,10 @@ class EyeCamera:
     def take(
         self, projected: Image, situation: EyeSituation, *, eye: Floats
     ) -> tuple[Image, Image]:
-        """Render what the eye sees of a projected image, and the expected image: both (rows,
-        columns, 3).
+        """Render what the eye sees of a projected image, and what it should see.
 
-        Raises NotConvergedError or ValueError when the state has no image.
+        Both images are (rows, columns, 3). Raises NotConvergedError if the sheet's shape is not
+        found, and ValueError if the object reaches the eye or its deformation is invalid.
         """
         sheet = true_sheet(
             situation.scene,

@@ -1,4 +1,8 @@
-"""Simulate the user's eye: render the projected frames on the true sheet, for the experiments."""
+"""Simulate the user's eye: render what it sees of projected frames, to evaluate experiments.
+
+Experiments label the frames that they evaluate. The apparatus holds the true parameters of the
+simulated hardware; the scene holds those that the other nodes assume.
+"""
 
 from __future__ import annotations
 
@@ -34,38 +38,42 @@ Job = tuple[EyeSituation, Floats, Frame, Header]
 
 
 class TwinEyeParameters(SimulatorParameters):
+    """Parameters of the simulated eye."""
+
     metres_per_px: Positive = Field(
-        default=METRES_PER_PX, description="size of a pixel on the screen plane"
+        default=METRES_PER_PX, description="size of a pixel on the screen plane, m"
     )
     max_queue: int = Field(
-        default=32, ge=1, description="number of labels that may wait to be rendered"
+        default=32, ge=1, description="maximum number of frames that wait to be rendered"
     )
     projector: Projector | None = Field(
         default=None,
-        description="true projector, in the scene's format; null takes the scene's",
+        description="true projector, in the format of the scene; null: that of the scene",
     )
     eye_stale_s: Positive = Field(
-        default=0.1, description="maximum age of `eye`; afterwards the scene's eyes count"
+        default=0.1,
+        description="age of the tracked `eye`, s, above which the eyes of the scene are used",
     )
     min_interval_s: Positive = Field(
-        default=5.0, description="minimum time before the same label is rendered again"
+        default=5.0, description="minimum time before the same label is rendered again, s"
     )
     viewpoint: Viewpoint = Field(
         default="centre",
-        description="where the measuring camera stands for mono frames: an eye, or midway",
+        description="position of the measuring camera for mono frames: one eye or between both",
     )
-    seed: int = Field(default=2026, description="of the head's motion")
+    seed: int = Field(default=2026, description="random seed of the simulated head motion")
 
 
 class TwinEyeNode(Node):
-    """Render each labelled frame of one view that carries pixels, once per label and correction.
+    """Render what the eye sees of labelled frames, once per label, correction and eye.
 
-    A mono frame is seen from the viewpoint of the parameters, a frame of one eye from that eye.
+    Only frames with pixels and of a single view are rendered. A mono frame is seen from the
+    viewpoint of the parameters, a frame for one eye from that eye.
 
-    An image takes about a second.  Further frames of a label that waits, or was just rendered, are
-    therefore skipped; they do not count as lost.  The sheet is the true one at the time that the
-    frame was drawn for, a few milliseconds after it arrives.  The finger is that of the newest
-    exposure before, the body the solver's newest.
+    An image takes about a second. Further frames of a label that is waiting or was just rendered
+    are therefore skipped; they do not count as lost. The sheet has its true shape at the time at
+    which the projector shows the frame, a few milliseconds after the frame arrives. The finger
+    position is that of the latest exposure, the deformation is the solver's latest.
     """
 
     on_demand: ClassVar[bool] = True
@@ -113,10 +121,13 @@ class TwinEyeNode(Node):
         if self.scene.message is None or self.twin__arms.message is None:
             self.note = "waits for the scene and the simulated arms"
         elif frame.stereo != "mono" and frame.eye == "both":
-            self.note = f'renders frames of one view only; "{frame.label}" is {frame.stereo}'
+            self.note = f'cannot render frame "{frame.label}" with two views ({frame.stereo})'
         elif self._queue.is_full:
             if self._queue.reject(key):
-                self.report_error("on_frame", OverflowError(f'no room for "{frame.label}"'))
+                self.report_error(
+                    "on_frame",
+                    OverflowError(f'frame "{frame.label}" not rendered: increase max_queue'),
+                )
         elif self._before_light is None:
             self._before_light = (frame, header)
 
@@ -139,12 +150,12 @@ class TwinEyeNode(Node):
 
     @property
     def _late_light_ns(self) -> int:
-        """Return the delay of the light after the time that the renderer assumes, ns."""
+        """Return how much later the projector shows an image than the renderer assumes, ns."""
         truth = self.parameters.apparatus
         return 0 if truth is None else round(1e9 * truth.projector.latency_offset_s)
 
     def _true_scene(self, scene: Scene) -> Scene:
-        """Return the scene with the true devices; the same object for the same scene."""
+        """Return the scene with the true devices; cached, so that it is one object per scene."""
         if self._scenes is None or self._scenes[0] is not scene:
             true = apply_apparatus(scene, self.parameters.apparatus)
             if self.parameters.projector is not None:
@@ -170,7 +181,8 @@ class TwinEyeNode(Node):
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
         """Return the true position (3,) of the measuring camera.
 
-        The apparatus's offset counts from the tracked eyes, or else from the scene's.
+        The offset of the apparatus is added to the tracked eyes, or to the eyes of the scene if
+        none are tracked.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

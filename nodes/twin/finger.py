@@ -1,8 +1,9 @@
-"""Simulate a person's fingertip as a pure function of time.
+"""Simulate the motion of a person's fingertip as a function of time.
 
-One path message and one seed determine a motion.  It can be computed again from both at any time,
-so that the truth behind an image is exact.  Positions are in the world frame, m; times are in
-seconds since the path was given.
+A path message and a random seed determine the motion. The finger follows the path with two kinds of
+unsteadiness: wander (slow) and tremor (fast). As the position can be computed for any time, the
+ground truth of each image is exact. Positions are in the world frame, m. Times are in seconds since
+the path was given, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ Floats = NDArray[np.float64]
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04
-"""Half the time over which corners of lines are rounded, since a hand does not jerk."""
+"""Half the duration over which corners of a polyline are rounded; a hand does not turn abruptly."""
 
 EASE_SPEED_M_PER_S = 0.4
-"""Peak speed of the reach from the present position to a path's first point."""
+"""Peak speed of the reach from the present position to the first point of a path."""
 
 MIN_EASE_S = 0.3
 WANDER_BAND_HZ = (0.15, 1.2)
@@ -32,22 +33,25 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the finger cannot follow; the message contains the remedy."""
+    """Raised for a path that the simulated finger cannot follow; the text gives the remedy."""
 
     code = "finger-path"
-    remedy = "Slow the path down, or correct the row that the text names."
+    remedy = "Slow the path down, or correct the point or line that the text names."
 
 
 @dataclass(frozen=True, slots=True)
 class SineSum:
-    """Band-limited noise: a sum of sines per axis with standard deviation 1, for all times."""
+    """Band-limited noise: a sum of sines per axis with standard deviation 1, defined for any time.
+
+    frequencies_hz, phases_rad: (3 axes, sines).
+    """
 
     frequencies_hz: Floats
     phases_rad: Floats
 
     @staticmethod
     def drawn(band_hz: tuple[float, float], generator: np.random.Generator) -> SineSum:
-        """Draw seven sines per axis, one in each seventh of the band, at random within it."""
+        """Choose seven sines per axis at random, one from each seventh of the frequency band."""
         edges = np.linspace(*band_hz, 8)
         return SineSum(
             frequencies_hz=generator.uniform(edges[:-1], edges[1:], (3, 7)),
@@ -55,7 +59,7 @@ class SineSum:
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return value and rate of change (1/s), each (3,)."""
+        """Return the value and its rate of change (1/s), each (3,)."""
         pace = 2.0 * np.pi * self.frequencies_hz
         angle = pace * time_s + self.phases_rad
         scale = np.sqrt(2.0 / self.frequencies_hz.shape[1])
@@ -63,7 +67,10 @@ class SineSum:
 
 
 class Path(Protocol):
-    """Interface of the steady part of a finger's motion, at rest before and after the path."""
+    """Interface of the steady motion along a path, without wander and tremor.
+
+    Here times are in seconds from the first point. The finger rests before and after the path.
+    """
 
     @property
     def points(self) -> Floats: ...
@@ -73,12 +80,14 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Time, zero or less, when the finger leaves the first point; before, it must have come to
-        rest."""
+        """Time, zero or less, at which the finger leaves the first point.
+
+        The reach to the path must have ended by then.
+        """
         ...
 
     def speeds(self) -> Floats:
-        """Return a bound on the speed (n-1,) m/s between each point and the next."""
+        """Return upper bounds (n - 1,) on the speed between successive points, m/s."""
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
@@ -88,11 +97,14 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """Polyline in time, its corners rounded by a moving mean of +-ROUNDING_S.
+    """Motion along straight lines, whose corners are rounded by a moving average of +-ROUNDING_S.
 
-    The mean of a polyline is exact through its integral.  It never leaves the polyline's hull,
-    never exceeds its speed, and has a continuous velocity.  It is meant for paths of a few points:
-    the mean removes ROUNDING_S^2 / 6 times the acceleration from a motion that bends between them.
+    The average is computed exactly from the integral of the position. It never leaves the convex
+    hull of the points, never exceeds the speed on the lines, and has a continuous velocity.
+    It suits paths of a few points. A smooth motion that is sampled densely would be displaced by
+    ROUNDING_S^2 / 6 times its acceleration.
+
+    integral: (n, 3) integral of the position from time 0 to each point, m s.
     """
 
     times_s: Floats
@@ -116,12 +128,12 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """See `Path`; these are the lines' own."""
+        """Return the speeds (n - 1,) on the straight lines, m/s, which rounding does not exceed."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the polyline's position, and its integral since time 0."""
+        """Return the position on the polyline without rounding, and its integral since time 0."""
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -136,7 +148,7 @@ class RoundedLines:
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """See `Path`."""
+        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
         before, area_before = self._corner(time_s - ROUNDING_S)
         after, area_after = self._corner(time_s + ROUNDING_S)
         span = 2.0 * ROUNDING_S
@@ -147,8 +159,8 @@ class RoundedLines:
 class SmoothPath:
     """Cubic spline through samples of a motion, at rest at both ends.
 
-    Between samples `h` apart its error is some h^4 / 100 times the motion's fourth derivative.
-    This is below a micrometre for a reach of 10 mm in 50 ms that is sampled every 4 ms.
+    Between samples at intervals h the error is about h^4 / 100 times the fourth derivative of the
+    motion. For a reach of 10 mm in 50 ms, sampled every 4 ms, it is below a micrometre.
     """
 
     times_s: Floats
@@ -172,10 +184,10 @@ class SmoothPath:
         return 0.0
 
     def speeds(self) -> Floats:
-        """See `Path`.
+        """Return upper bounds (n - 1,) on the speed between successive samples, m/s.
 
-        Velocity is quadratic between samples, so that it stays within the triangle of its three
-        Bezier points: both ends' velocities, and three times the mean velocity less both.
+        Between two samples the velocity is a quadratic Bezier curve. It stays within the triangle
+        of its control points: both end velocities, and 3 times the mean velocity minus these two.
         """
         ends = self.rate(self.times_s)
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -184,12 +196,12 @@ class SmoothPath:
         return np.asarray(corners.max(axis=0))
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """See `Path`."""
+        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
         if time_s <= 0.0:
             return self.points[0], np.zeros(3)
         if time_s >= self.times_s[-1]:
             return self.points[-1], np.zeros(3)
-        # For one time, the library's evaluation takes six times as long.
+        # The library's function would take six times as long for a single time.
         i = int(np.searchsorted(self.times_s, time_s, side="right")) - 1
         since = time_s - self.times_s[i]
         cubic, square, linear, constant = self.spline.c[:, i]
@@ -200,23 +212,23 @@ class SmoothPath:
 
 
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
-    """Make the path through points (n, 3) at times (n,).
+    """Check points (n, 3) and times (n,), and make the path through them.
 
     Raises FingerPathError for a path without points or with times that do not increase.
     """
     if len(times_s) != len(points) or len(times_s) == 0:
         raise FingerPathError(
-            f"path of {len(times_s)} times and {len(points)} points: one time per point, and at "
-            "least one"
+            f"path has {len(times_s)} times and {len(points)} points; give one time per point, and "
+            "at least one point"
         )
     steps_s = np.diff(times_s)
     if (steps_s <= 0).any():
         at = int(np.argmax(steps_s <= 0))
         raise FingerPathError(
-            f"times_s[{at + 1}] = {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
-            f"{times_s[at]:.6g}"
+            f"path: times_s[{at + 1}] = {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
+            f"{times_s[at]:.6g}; give increasing times"
         )
-    # A single point is a point of rest, which needs no curve.
+    # At a single point the finger rests, which needs no spline.
     if joined_by == "spline" and len(points) > 1:
         return SmoothPath.through(times_s, points)
     return RoundedLines.through(times_s, points)
@@ -224,7 +236,12 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FingerState:
-    """Fingertip at one time; `path_time_s` is negative during the reach to the path."""
+    """True state of the fingertip at one time.
+
+    position, velocity: (3,) in m and m/s.
+    path_time_s: time since the first point of the path; negative during the reach to it.
+    path_done: whether the end of the path is reached.
+    """
 
     position: Floats
     velocity: Floats
@@ -234,11 +251,14 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """Combine a path, the reach to its start, and a person's unsteadiness.
+    """Motion of the fingertip: a reach to the first point of a path, the path, and unsteadiness.
 
-    start, start_velocity: the steady part (without wander and tremor) when the path was given.
-    amplitudes: (wander, tremor) at the start and on the path; they blend during the reach.
-    age_s: time of the unsteadiness when the path was given; it continues from motion to motion.
+    start, start_velocity: position and velocity when the path was given, without unsteadiness.
+    ease_s: duration of the reach to the first point.
+    amplitudes_before_m, amplitudes_m: (wander, tremor) before the reach and on the path; they are
+        blended during the reach.
+    age_s: time argument of the unsteadiness when the path was given. It increases from one motion
+        to the next, so that the unsteadiness has no jumps.
     """
 
     path: Path
@@ -259,7 +279,7 @@ class FingerMotion:
         wander_band_hz: tuple[float, float] = WANDER_BAND_HZ,
         tremor_band_hz: tuple[float, float] = TREMOR_BAND_HZ,
     ) -> FingerMotion:
-        """Make a finger that rests at `position`, with the bands of its unsteadiness."""
+        """Make a finger that rests at `position`; `seed` determines its later unsteadiness."""
         generator = np.random.default_rng(seed)
         return FingerMotion(
             path=RoundedLines.through(np.zeros(1), position[None]),
@@ -284,21 +304,21 @@ class FingerMotion:
         max_speed_m_per_s: float,
         joined_by: PathJoin = "rounded_lines",
     ) -> FingerMotion:
-        """Return the motion after a path is given `at_s` into this one.
+        """Return the motion that follows if a new path is given at time `at_s` of this motion.
 
-        wander_m: standard deviation per axis.
-        tremor_m: amplitude, so that its standard deviation is tremor_m / sqrt(2).
+        wander_m: standard deviation of the wander per axis.
+        tremor_m: amplitude of the tremor, that is sqrt(2) times its standard deviation per axis.
 
-        Raises FingerPathError for a path without points, with times that do not increase, or faster
-        than a finger.
+        Raises FingerPathError if the path has no points, times that do not increase, or a speed
+        above `max_speed_m_per_s`.
         """
         path = validate_path(times_s, points, joined_by)
         speeds = path.speeds()
         if (speeds > max_speed_m_per_s).any():
             at = int(np.argmax(speeds))
             raise FingerPathError(
-                f"speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g}: a finger "
-                f"does {max_speed_m_per_s:.3g} m/s (finger.max_speed_m_per_s), give it more time"
+                f"path: speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g} exceeds "
+                f"finger.max_speed_m_per_s = {max_speed_m_per_s:.3g} m/s; increase the times"
             )
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))
@@ -318,7 +338,7 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return the steady position and velocity, and the wander and tremor amplitudes."""
+        """Return position and velocity without unsteadiness, and the amplitudes of both parts."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -333,7 +353,7 @@ class FingerMotion:
         return position, velocity, amplitudes
 
     def at(self, time_s: float) -> FingerState:
-        """Return the true fingertip `time_s` after the path was given."""
+        """Return the true state of the fingertip `time_s` after the path was given."""
         position, velocity, amplitudes = self._steady(time_s)
         _, share_rate = minimum_jerk_profile(min(max(time_s / self.ease_s, 0.0), 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
@@ -354,18 +374,22 @@ class FingerMotion:
 
 
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
-    """Return the minimum-jerk rise from 0 to 1 and its slope (Flash and Hogan 1985)."""
+    """Return the minimum-jerk profile and its derivative at s (Flash and Hogan 1985).
+
+    The profile rises from 0 to 1 while s, the fraction of the duration, rises from 0 to 1.
+    """
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 
 
 def _reach(
     s: float, duration_s: float, start: Floats, start_velocity: Floats, path: Path
 ) -> tuple[Floats, Floats]:
-    """Return a minimum-jerk reach at the fraction `s` of its time, from `start` to the path's first
-    point.
+    """Return position (m) and velocity (m/s) during a minimum-jerk reach to a path.
 
-    The result is position (m) and velocity (m/s).  The start's velocity decays by the quintic
-    Hermite function s (1-s)^3 (1+3s), so that both are continuous.
+    s: fraction of the duration, 0 at `start` and 1 at the first point of the path.
+
+    The effect of the initial velocity decays by the quintic Hermite function s (1-s)^3 (1+3s), so
+    that position and velocity are continuous.
     """
     share, slope = minimum_jerk_profile(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)

@@ -1,4 +1,8 @@
-"""Simulate the finger and the stereo camera that observes it."""
+"""Simulate the user's finger and the stereo camera that observes it.
+
+The apparatus holds the true parameters of the simulated hardware; the scene holds those that the
+other nodes assume.
+"""
 
 from __future__ import annotations
 
@@ -23,25 +27,34 @@ from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 JITTER_STREAM = 1
-"""Number of the random stream of exposure times; the noise of images has the seed itself."""
+"""Second element of the random seed for the jitter of exposure times, which makes it independent of
+the image noise."""
 
 
 class TwinFingerParameters(SimulatorParameters):
-    """Parameters; `seed` determines the finger's unsteadiness and the camera's noise."""
+    """Parameters of the simulated finger and stereo camera."""
 
-    seed: int = Field(default=2006, description="not that of any chart")
-    rest_world_m: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.08), description="where the finger is before the first path"
+    seed: int = Field(
+        default=2006,
+        description="random seed of the finger's unsteadiness and the image noise; no chart of the "
+        "documentation uses the default",
     )
-    transfer_s: NonNegative = Field(default=0.004, description="read-out, from end of exposure")
+    rest_world_m: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.08),
+        description="position of the finger before the first path, world frame, m",
+    )
+    transfer_s: NonNegative = Field(
+        default=0.004, description="duration of the image read-out after the exposure, s"
+    )
     clutter: Literal["none", "lab", "crowded"] = Field(
         default="lab",
-        description="lab: sheet, hand, glints; crowded: also a second mark, highlights, cables",
+        description="other objects in the images. lab: sheet, hand, reflections; crowded: also a "
+        "second marker, moving reflections, cables",
     )
 
 
 class TwinFingerNode(Node):
-    """Move a true finger along its path, and render its images at the camera's rate."""
+    """Move a simulated finger along its path, and render stereo images at the camera's rate."""
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     parameters: TwinFingerParameters
@@ -60,12 +73,12 @@ class TwinFingerNode(Node):
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
-        """Event that the first scene sets."""
+        """Event that is set when the first scene has arrived."""
         return asyncio.Event()
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it takes images by its own clock; its motion is in the bag as twin/finger"
+        return "it takes images by its own clock; the bag has the finger's motion as twin/finger"
 
     async def setup(self) -> None:
         self._jitter = np.random.default_rng((self.parameters.seed, JITTER_STREAM))
@@ -100,7 +113,7 @@ class TwinFingerNode(Node):
             self._follow(self.twin__finger_path.message)
 
     def _make_resting(self, rest: Floats) -> FingerMotion:
-        """Make the finger at rest, with the unsteadiness of the apparatus."""
+        """Make a finger that rests at `rest`, with the unsteadiness that the apparatus states."""
         given = self.parameters
         if given.apparatus is None:
             return FingerMotion.resting(rest, seed=given.seed)
@@ -118,7 +131,10 @@ class TwinFingerNode(Node):
             self._follow(path)
 
     def _follow(self, path: FingerPath) -> None:
-        """Switch to a path now; an infeasible path raises an error and changes nothing."""
+        """Start to follow a path now.
+
+        A path that the finger cannot follow raises FingerPathError and changes nothing.
+        """
         now_ns = self.clock.now_ns()
         self.motion = self.motion.followed_by(
             (now_ns - self.motion_from_ns) * 1e-9,
@@ -133,20 +149,21 @@ class TwinFingerNode(Node):
         self.path_stroke_s = path.stroke_s
 
     def _tremor_m(self, path: FingerPath) -> float:
-        """Return the tremor's amplitude on a path; one without tremor stays without."""
+        """Return the tremor amplitude on a path: that of the apparatus if both state a tremor."""
         given = self.parameters.apparatus
         if given is None or given.finger.tremor_rms_m is None or not path.tremor_m:
             return path.tremor_m
         return math.sqrt(2.0) * given.finger.tremor_rms_m
 
     def truth(self, at_ns: int) -> FingerState:
-        """Return the fingertip at a time of this node's clock."""
+        """Return the true state of the fingertip at a time of this node's clock."""
         return self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
 
     def expose(self, middle_ns: int) -> StereoPair:
-        """Render the image pair with the stamp `middle_ns`, and publish the truth at that time.
+        """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
 
-        The true exposure differs from the stamp as the apparatus states. Requires a scene.
+        The images are exposed at a slightly different time, as the apparatus states. A scene must
+        have arrived.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()
@@ -176,7 +193,7 @@ class TwinFingerNode(Node):
         )
 
     def _stamp_error_ns(self) -> int:
-        """Draw the true time of an exposure minus its stamp."""
+        """Return a random sample of the true time of an exposure minus its timestamp."""
         if self.parameters.apparatus is None:
             return 0
         camera = self.parameters.apparatus.camera
@@ -193,12 +210,15 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return how late a frame may be begun; its exposure may overlap the last read-out."""
+        """Return by how much the start of an exposure may be late without missing the frame.
+
+        An exposure may overlap the read-out of the previous frame.
+        """
         overlap_ns = self.exposure_ns + round(1e9 * self._read_out_s) - self.period_ns
         return self.exposure_ns + max(0, overlap_ns)
 
     async def _film(self) -> None:
-        """Simulate the exposures on a fixed time grid.
+        """Take images at fixed intervals until the node closes.
 
         A frame whose exposure time has already passed counts as missed.
         """
@@ -215,7 +235,7 @@ class TwinFingerNode(Node):
             await self.call("frame", self._take_frame, start_ns)
 
     async def _take_frame(self, start_ns: int) -> None:
-        """Process one frame from the start of its exposure until it is read out."""
+        """Simulate one frame from the start of its exposure to the end of its read-out."""
         middle_ns = start_ns + self.exposure_ns // 2
         pair = self.expose(middle_ns)
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)

@@ -1,13 +1,14 @@
-"""Apply the rubber's hysteresis and creep to the force of the elastic membrane.
+"""Apply the hysteresis and creep of rubber to the force of the simulated elastic sheet.
 
-Creep is quasi-linear viscoelasticity (Fung, Biomechanics, 1981): the force is the sum of all past
-changes of the elastic force, each times a relaxation function of its age. The function is a sum of
-exponentials with one time constant per decade, so that the force falls by a constant share per
-decade. It is one at the age `REFERENCE_S`, at which the modulus is measured.
+Creep follows quasi-linear viscoelasticity (Fung, Biomechanics, 1981). The force is the sum of all
+past changes of the elastic force, each multiplied by a relaxation function of its age. The function
+is a sum of exponentials with one time constant per decade of time. The force therefore falls by a
+constant fraction per decade. The function is one at the age `REFERENCE_S`, at which the modulus is
+measured.
 
-Hysteresis that does not depend on the rate multiplies the force by 1 + h while the elastic force
-rises and by 1 - h while it falls. After a reversal the factor changes over a relative change of the
-force by `REVERSAL_RATIO`.
+Hysteresis does not depend on the rate. It multiplies the force by 1 + h while the elastic force
+rises, and by 1 - h while it falls. After a reversal the factor changes gradually, over a relative
+change of the force by `REVERSAL_RATIO`.
 """
 
 from __future__ import annotations
@@ -26,24 +27,25 @@ REFERENCE_S = 1.0
 """Age of a force at which the relaxation function is one."""
 
 TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
-"""Time constants of the relaxation: forces relax from about 50 ms to some hours."""
+"""Time constants of the relaxation function; forces relax from about 50 ms to some hours."""
 
 REVERSAL_RATIO = 0.1
-"""Relative change of the elastic force over which the hysteresis reverses, to 1/e."""
+"""Relative change of the elastic force within which the factor of the hysteresis approaches its new
+value to 1/e."""
 
 MIN_FORCE_N = 1e-3
-"""Elastic force below which the direction of a change is not counted."""
+"""Elastic force below which a change does not reverse the hysteresis."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
-"""Share of the energy that a cycle loses by relaxation, over the relaxation per decade."""
+"""Fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
 
 
 class ForceHistory:
-    """History of one force of the sheet.
+    """State of the hysteresis and creep of one force of the sheet.
 
-    hysteresis_ratio: share of the loading's energy that a cycle from zero force loses, the part
-        lost by creep included.
-    creep_ratio_per_decade: relative loss of force per decade of time.
+    hysteresis_ratio: fraction of the loading energy that a cycle from zero force loses, including
+        the loss by creep.
+    creep_ratio_per_decade: relative decrease of the force per decade of time.
     """
 
     def __init__(self, hysteresis_ratio: float, creep_ratio_per_decade: float) -> None:
@@ -57,7 +59,10 @@ class ForceHistory:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self | None:
-        """Return the history of an apparatus's sheet; None for elastic rubber."""
+        """Make the history for the sheet of an apparatus (true hardware parameters).
+
+        Return None if the sheet has neither hysteresis nor creep.
+        """
         if apparatus is None:
             return None
         sheet = apparatus.sheet
@@ -66,20 +71,23 @@ class ForceHistory:
         return cls(sheet.hysteresis_ratio, sheet.creep_ratio_per_decade)
 
     def update(self, time_s: float, elastic_n: float) -> float:
-        """Add an elastic force (N) at a time and return the force (N) of the rubber.
+        """Add the elastic force at a time, and return the force with hysteresis and creep, N.
 
-        The force changes linearly between two calls. The first one has the age `REFERENCE_S`.
-        Raises ValueError if the time decreases.
+        The elastic force is assumed to change linearly between calls; the first value has the age
+        `REFERENCE_S`. Raises ValueError if the time decreases.
         """
         if self._elastic_n is None:
             self._relaxing = elastic_n * np.exp(-REFERENCE_S / TIME_CONSTANTS_S)
         else:
             elapsed_s = time_s - self._time_s
             if elapsed_s < 0.0:
-                raise ValueError(f"time {time_s} s is before {self._time_s} s")
+                raise ValueError(
+                    f"force history: time {time_s} s is before {self._time_s} s, the time of the "
+                    "previous call; give times in ascending order"
+                )
             change_n = elastic_n - self._elastic_n
             ratios = elapsed_s / TIME_CONSTANTS_S
-            # Mean of the exponential over the interval, in which the force changes linearly.
+            # Mean of the exponential over the interval, since the force changes linearly in it.
             kept = -np.expm1(-ratios) / ratios if elapsed_s else np.ones(len(ratios))
             self._relaxing = self._relaxing * np.exp(-ratios) + change_n * kept
             self._turn(self._elastic_n, elastic_n)
@@ -98,7 +106,7 @@ class ForceHistory:
 
 
 def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
-    """Return the force (n,), N, of rubber at times (n,) by its elastic force (n,)."""
+    """Return forces (n,) with hysteresis and creep for elastic forces (n,) at times (n,), N."""
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )

@@ -1,28 +1,31 @@
-"""Generate gestures of a finger on an object, each a function of the scene and a seed.
+"""Generate typical finger gestures on an object; each is a function of the scene and a random seed.
 
-What is known of such motions, and where it is from:
+The gestures follow published measurements of human motion:
 
-- A reach has a bell-shaped speed that is the same for all distances and durations (Atkeson and
-  Hollerbach 1985, J. Neurosci. 5:2318), the one of least jerk (Flash and Hogan 1985, J. Neurosci.
-  5:1688): its peak is 1.875 of its mean, its greatest acceleration 5.77 distance / duration^2.
-- Unhurried reaches peak at 0.2-0.35 m/s (REACH+, which plans for them); hurried elbow flexions of
-  27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341), so the braking
-  half takes 50-80 ms.
-- A surface is explored at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
+- A reach has a bell-shaped speed profile, of the same shape for all distances and durations
+  (Atkeson and Hollerbach 1985, J. Neurosci. 5:2318). It is the profile of minimum jerk (Flash and
+  Hogan 1985, J. Neurosci. 5:1688). Its peak speed is 1.875 times the mean, its maximum acceleration
+  5.77 distance / duration^2.
+- Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+, which plans for them). Hurried elbow
+  flexions of 27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341), so
+  that the braking half takes 50-80 ms.
+- People explore a surface at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
   147:209).
-- Taps follow one another in 150-500 ms in typing (Angelaki and Soechting 1993, Exp. Brain Res.
-  95:319), in 170-200 ms, 50-60 in ten seconds, when hurried (finger tapping test of the Halstead
-  Reitan battery).  That contact takes 100-200 ms of an unhurried tap and about half of a hurried
-  one is taken here, without a source for soft objects.
-- A reach that is told to stop is called off after 206 ms on average (Mirabella, Pani, Pare and
-  Ferraina 2006, Exp. Brain Res. 174:240): a stop is sudden for who watches, not for who stops.
-- Ellipses and the like are drawn slower where they are more curved, as harmonic motions are
-  (Richardson and Flash 2002, J. Neurosci. 22:8201).
-- Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411).  Its amplitude is
-  0.03 mm with the hand at rest, twice that with the hand held out, 4 to 5 times with the arm held
-  out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).  Most of what a still finger
-  does is slower, 1-3.5 Hz and below (Carignan, Daneault and Duval 2009, Exp. Brain Res. 201:299):
-  the wander.
+- In typing, the interval between taps is 150-500 ms (Angelaki and Soechting 1993, Exp. Brain Res.
+  95:319). Hurried taps follow in 170-200 ms, 50-60 in ten seconds (finger tapping test of the
+  Halstead Reitan battery). Contact is assumed to last 100-200 ms of an unhurried tap and about half
+  of a hurried one; there is no source for soft objects.
+- People who are told to stop a reach need 206 ms on average to react (Mirabella, Pani, Pare and
+  Ferraina 2006, Exp. Brain Res. 174:240). A stop is therefore sudden for an observer only.
+- Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
+  motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
+- Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
+  0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
+  held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
+- Most of the motion of a finger that is held still is slower, 1-3.5 Hz and below (Carignan,
+  Daneault and Duval 2009, Exp. Brain Res. 201:299). It is called wander here.
+
+Surface positions (along, arc, height) are defined in `paths.py`.
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]
-"""Times (n,) s from zero, and surface positions (n, 3) m or distances (n,) m at them."""
+"""Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
+"""
 
 SAMPLE_S = 0.004
 WANDER_M = 0.0005
@@ -51,10 +55,10 @@ HOVER_M = 0.04
 APPROACH_S = 0.8
 REST_S = 0.3
 TOUCH_M = 0.001
-"""Depth of a light touch."""
+"""Depth below the surface of a light touch."""
 
 PRESS_M = 0.002
-"""Depth of a tap."""
+"""Depth below the surface of a tap."""
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35
@@ -68,9 +72,11 @@ class Gesture(Protocol):
 
 
 def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
-    """Return reaches of minimum jerk from `start` through positions (3,), each with a duration (s).
+    """Sample a sequence of minimum-jerk reaches.
 
-    A move to the present position is a rest.
+    start: first position (3,).
+    moves: pairs of a duration (s) and the next position (3,). A move to the present position is a
+    rest.
     """
     corners = np.array([start, *(place for _, place in moves)])
     ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
@@ -82,10 +88,10 @@ def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> 
 
 
 def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
-    """Return the distance (n,) m of a finger whose speed changes in phases (duration s, final speed
-    m/s).
+    """Sample the distance (n,), m, that a finger covers if its speed changes in phases.
 
-    The speed changes by the minimum-jerk profile, so that the acceleration is continuous.
+    phases: pairs of a duration (s) and the speed at its end (m/s); the finger starts at rest. The
+    speed changes by the minimum-jerk profile, so that the acceleration is continuous.
     """
     durations = np.array([duration for duration, _ in phases])
     speeds = np.array([0.0, *(speed for _, speed in phases)])
@@ -94,7 +100,7 @@ def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
     times = _sampled_times(float(ends[-1]))
     phase = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(phases) - 1)
     s = (times - ends[phase]) / durations[phase]
-    gained = s**4 * (2.5 - 3.0 * s + s * s)  # the integral of the smooth step
+    gained = s**4 * (2.5 - 3.0 * s + s * s)  # integral of the minimum-jerk profile
     change = speeds[phase + 1] - speeds[phase]
     return times, ways[phase] + durations[phase] * (speeds[phase] * s + change * gained)
 
@@ -104,7 +110,7 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """Add an approach from above, a short rest and a lift to a motion on the surface."""
+    """Extend a motion on the surface by an approach from above, short rests and a lift."""
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -119,19 +125,19 @@ def touched(motion: Sampled) -> Sampled:
 
 
 def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
-    """Return the path of a motion in contact, with the tremor of a hand that is held out."""
+    """Make the path of a gesture in contact, with the tremor of a hand that is held out."""
     times, places = touched(motion)
     return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Touch lightly and hold still for 5 s; nothing is random."""
+    """Touch the object lightly and hold still for 5 s; `seed` has no effect."""
     touch = (0.0, 0.0, -TOUCH_M)
     return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
 
 
 def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Hold still in the air for 5 s with the arm held out, where tremor is greatest."""
+    """Hold the finger still in the air for 5 s, with the large tremor of an arm held out."""
     place = (0.0, 0.0, 0.5 * HOVER_M)
     times, places = minimum_jerk(place, [(5.0, place)])
     return place_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
@@ -158,12 +164,12 @@ def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed:
 
 
 def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Reach to and from the object without hurry, with rests."""
+    """Reach to and from the object at normal speed, with rests of 0.4 s."""
     return _reaches(scene, "reach", REACH_PEAK_M_PER_S, 0.4, seed)
 
 
 def reach_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Reach to and from the object in a hurry, with hardly a rest."""
+    """Reach to and from the object in a hurry, with rests of 0.1 s."""
     return _reaches(scene, "reach-fast", 3.0 * REACH_PEAK_M_PER_S, 0.1, seed)
 
 
@@ -177,10 +183,11 @@ def _taps(
     lift_m: float,
     seed: int,
 ) -> FingerPath:
-    """Tap at about the same position; intervals vary by 5 %, positions by 2 mm.
+    """Tap `count` times at about the same position; intervals vary by 5 %, positions by 2 mm.
 
     A tap is a reach from `lift_m` above the surface to PRESS_M below it, a rest there, and a reach
-    back. The finger does not brake before contact: it is below the surface for `contact_s`.
+    back. The finger does not brake before contact. It is below the surface for `contact_s` of each
+    interval `every_s`.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
@@ -211,13 +218,16 @@ def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return the half length (m) of a stroke around the surface, and its speed (m/s)."""
+    """Return half the arc length (m) of a stroke around the surface, and its speed (m/s)."""
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
 
 def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke around the surface; stop suddenly, half way and at the end, three times each way."""
+    """Stroke around the surface and stop suddenly, at half length and at the end of each stroke.
+
+    There are three strokes in each direction.
+    """
     half, speed = _arc_run(scene)
     start_s, lag_s = 0.2, np.random.default_rng(seed).uniform(0.3, 0.6, 12)
     even_s = half / speed - 0.5 * (start_s + BRAKE_S)
@@ -248,9 +258,9 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke around the surface while the depth oscillates 0.7 times a second.
+    """Stroke around the surface while the depth oscillates at 0.7 Hz.
 
-    The maximum depth is a tenth of the working range's.
+    The maximum depth is a tenth of `push_depth_m` of the scene's working range.
     """
     half, speed = _arc_run(scene)
     stroke_s = PEAK_OF_MEAN * 2.0 * half / speed
@@ -264,19 +274,19 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """Return the angle (n,) rad of some rounds, which start and end at rest."""
+    """Sample the angle (n,), rad, of `turns` turns on a closed figure, with rest at both ends."""
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
     return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
 
 
 def _drawing_m(scene: Scene) -> float:
-    """Return the radius (m) of a figure that is drawn on the surface."""
+    """Return the radius (m) of a figure that fits the part of the surface that can be stroked."""
     return min(0.02, *(0.5 * size for size in touchable(scene)))
 
 
 def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Draw four circles on the surface, at the speed at which people explore one."""
+    """Draw four circles on the surface, at the speed at which people explore a surface."""
     radius = _drawing_m(scene)
     times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
     places = np.stack(
@@ -286,9 +296,9 @@ def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Draw three figures of eight on the surface, slower in their bends."""
+    """Draw three figures of eight on the surface, more slowly where they are curved."""
     radius = _drawing_m(scene)
-    # Its length is 6.1 radii, by the integral of its speed below.
+    # The length of the figure, integrated numerically, is 6.1 radii.
     times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)
     places = np.stack(
         [radius * np.sin(angle), 0.5 * radius * np.sin(2.0 * angle), np.full(len(angle), -TOUCH_M)],
@@ -298,7 +308,7 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _pressing(arcs: Floats, depth_m: float) -> Floats:
-    """Return positions (n, 3) on arcs (n,) around the surface's middle, `depth_m` below it."""
+    """Return surface positions (n, 3) at arc lengths (n,) from the front, `depth_m` deep."""
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
 
 
@@ -315,4 +325,4 @@ GESTURES: dict[str, Gesture] = {
     "circle": circle,
     "eight": eight,
 }
-"""Gestures by the name of their path."""
+"""All gestures; the key is the label of the path."""

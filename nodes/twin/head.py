@@ -14,24 +14,27 @@ from flexsheet.nodes.twin.finger import SineSum
 Floats = NDArray[np.float64]
 
 MIN_SWAY_FREQUENCY_RATIO = 0.1
-"""Minimum frequency of the sway, relative to the highest."""
+"""Lowest frequency of the head's sway, relative to the highest."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadSway:
-    """Motion of standard deviation `sway_m` per axis, a function of time."""
+    """Random motion of the head, as a function of time.
+
+    sway_m: standard deviation per axis.
+    """
 
     sway_m: float
     noise: SineSum
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Draw the motion; None for a head at rest."""
+        """Generate the random motion for true eye parameters; None for a head at rest."""
         if not eyes.sway_m:
             return None
         band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
         return cls(eyes.sway_m, SineSum.drawn(band_hz, np.random.default_rng(seed)))
 
     def at(self, time_s: float) -> Floats:
-        """Return the displacement (3,) m of the eyes."""
+        """Return the displacement (3,) of the eyes at a time, m."""
         return np.asarray(self.sway_m * self.noise.at(time_s)[0])

@@ -1,16 +1,18 @@
-"""Solve the true sheet: a finite-element membrane, clamped at two edges and pushed by a finger.
+"""Solve the simulated sheet: a finite-element membrane between two clamps, pushed by a finger.
 
-The material is incompressible neo-Hookean rubber in plane stress, W = mu/2 (I1 - 3) with mu = E/3.
-A membrane has no bending stiffness and would buckle into ever finer wrinkles. Where the taut law
-would give compression, the energy is therefore that of a tension field (Pipkin, IMA J. Appl. Math.
-36, 1986): uniaxial along the wrinkles, free across them, and zero where the sheet is slack. The
+The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is
+W = mu/2 (I1 - 3), where I1 is the first strain invariant and mu = E/3 the shear modulus.
+A membrane has no bending stiffness and would buckle into ever finer wrinkles. Where W would give
+compression, the energy of a tension field replaces it (Pipkin, IMA J. Appl. Math. 36, 1986): the
+stress is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This
 relaxed energy is convex in the strain, so that Newton's method with a line search finds its
 minimum.
 
-The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points), another kind than the
-renderer's; the mesh is finer around the finger. The sheet has a weight. The fingertip is a rigid
-sphere that is pushed in along the sheet's normal, in steps. Stiff penalties keep the sheet out of
-it. Nodes that it has touched stick to it, unless Coulomb's limit of friction is exceeded.
+The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). They differ from the
+elements of the renderer, which this module serves to test. The mesh is finer around the finger.
+Gravity acts on the sheet. The fingertip is a rigid sphere that is pushed in along the sheet's
+normal, in steps. A stiff penalty force keeps the sheet outside it. Touched nodes stick to it unless
+the limit of Coulomb friction is exceeded.
 """
 
 from __future__ import annotations
@@ -29,40 +31,41 @@ Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 CELLS = 32
-"""Intervals between nodes along either side; an element spans two of them."""
+"""Number of intervals between nodes along each side; an element spans two of them."""
 MIN_CELL_FRACTION = 0.008
-"""Distance of nodes under the finger over the sheet's side: 1.9 mm of 240."""
+"""Distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
 
 SLACK_TENSION = 2e-4
-"""Isotropic tension, in shear moduli, that makes slack and wrinkled regions determinate."""
+"""Isotropic tension added everywhere, in units of the shear modulus. Without it the equilibrium of
+slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""Pressure of the finger per depth of penetration: 0.01 mm under 10 N on 1 cm2."""
+"""Contact pressure per penetration depth; 10 N on 1 cm2 penetrate 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
-"""Maximum advance of the finger per step, in its radii; a longer one could pass the sheet."""
+"""Maximum advance of the finger per step, in radii; in a longer step it could cross the sheet."""
 
 MAX_ITERATIONS = 80
 MAX_FRICTION_ROUNDS = 12
-"""Maximum number of equilibria per step of the finger while nodes begin to slip."""
+"""Maximum number of equilibria that are solved per step of the finger while nodes slip."""
 FRICTION_TOLERANCE = 0.01
-"""Accepted change of the friction of slipping nodes between two equilibria, as a fraction."""
+"""Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
-"""Acceleration in the world frame, whose y axis points up."""
+"""Gravitational acceleration in the world frame, whose y axis points up."""
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised when the membrane's equilibrium is not found; the message gives the residual."""
+    """Raised when the membrane's equilibrium is not found; the text gives the residual force."""
 
     code = "membrane"
-    remedy = "Reduce the push: it is beyond the simulated membrane's range."
+    remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
 
 
 @dataclass(frozen=True, slots=True)
 class TrueRubber:
-    """Dimensions and material of the true sheet at rest.
+    """Dimensions and material of the simulated sheet at rest.
 
-    width_m: between the clamps when slack; height_m: along them.
+    width_m: free length between the clamps of the unstretched sheet; height_m: length along them.
     density_kg_per_m3: 0 for a sheet without weight.
     thickness_gradient: relative change of the thickness from the left to the right clamp, and from
         the lower to the upper end of the clamps.
@@ -80,10 +83,10 @@ class TrueRubber:
 class DeformedSheet:
     """Equilibrium of the sheet.
 
-    rest_m: (rows, columns, 2) from the left bottom corner.
-    positions: (rows, columns, 3) world.
-    finger_force_n: (3,) of the sheet on the finger.
-    left_force_n, right_force_n: (3,) of the sheet on the clamps.
+    rest_m: (rows, columns, 2) node positions at rest, measured from the bottom left corner.
+    positions: (rows, columns, 3) node positions in the world frame.
+    finger_force_n: (3,) force that the sheet exerts on the finger.
+    left_force_n, right_force_n: (3,) forces that the sheet exerts on the clamps.
     iterations: total number of Newton steps.
     """
 
@@ -95,7 +98,7 @@ class DeformedSheet:
     iterations: int
 
     def triangles(self) -> Indices:
-        """Return (triangles, 3) indices of the flattened positions, facing the user."""
+        """Return triangles (triangles, 3), as indices of the flattened nodes, facing the user."""
         rows, columns = self.positions.shape[:2]
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         right, above = corner + 1, corner + columns
@@ -108,7 +111,10 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """Return (cells + 1,) coordinates up to `length_m`, finest at `focus_m`; None: uniform."""
+    """Return coordinates (cells + 1,) from 0 to `length_m`, which are densest at `focus_m`.
+
+    Without a focus they are uniform.
+    """
     if focus_m is None:
         return np.linspace(0.0, length_m, cells + 1)
     samples = np.linspace(0.0, length_m, 4001)
@@ -128,17 +134,20 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
 
 
 def _quadratic(t: Floats) -> tuple[Floats, Floats]:
-    """Return the shape functions (points, 3) of nodes at 0, 1/2 and 1, and their derivatives."""
+    """Return the values and derivatives (points, 3) of the quadratic shape functions on [0, 1].
+
+    Their nodes are at 0, 1/2 and 1.
+    """
     values = [(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)]
     slopes = [4 * t - 3, 4 - 8 * t, 4 * t - 1]
     return np.stack(values, axis=-1), np.stack(slopes, axis=-1)
 
 
 class _Mesh:
-    """Assemble forces and stiffness of a rectangular mesh.
+    """Rectangular finite-element mesh, which assembles the elastic forces and stiffness.
 
-    x, y: coordinates of the nodes; element boundaries are at the even ones, and the odd ones are
-    midway between their neighbours.
+    x, y: coordinates of the nodes. Element boundaries have even indices; nodes with odd indices
+    are midway between their neighbours.
     """
 
     def __init__(self, rubber: TrueRubber, x: Floats, y: Floats, slack_tension: float) -> None:
@@ -154,7 +163,7 @@ class _Mesh:
         points = 0.5 + 0.5 * np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.6)
         weights = np.array([5.0, 8.0, 5.0]) / 18.0
         value, slope = _quadratic(points)
-        # Points and nodes are ordered along y first: (3 x 3 points, 3 x 3 nodes).
+        # Gauss points and nodes are ordered by y, then x: (3 x 3 points, 3 x 3 nodes).
         shape_function = np.einsum("ab,cd->acbd", value, value).reshape(9, 9)
         along_x = np.einsum("ab,cd->acbd", value, slope).reshape(9, 9)
         along_y = np.einsum("ab,cd->acbd", slope, value).reshape(9, 9)
@@ -183,7 +192,8 @@ class _Mesh:
         row = indices[np.repeat(self.dofs, 27, axis=1)].ravel()
         column = indices[np.tile(self.dofs, (1, 27))].ravel()
         self._is_free = (row >= 0) & (column >= 0)
-        # Entries are summed into a fixed sparsity pattern: found once, used in every iteration.
+        # The sparsity pattern of the stiffness matrix is the same in all iterations, so that it is
+        # computed once. Element entries are summed into it.
         size = len(self.free)
         keys = column[self._is_free].astype(np.int64) * size + row[self._is_free]
         unique, self._slot = np.unique(keys, return_inverse=True)
@@ -193,7 +203,11 @@ class _Mesh:
         self._unique, self._size = unique, size
 
     def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return F (elements, points, 3, 2) and C (..., [C11, C22, C12]) at the Gauss points."""
+        """Return the deformation at the Gauss points.
+
+        It consists of the gradient F (elements, points, 3, 2) and [C11, C22, C12] (elements,
+        points, 3) of the right Cauchy-Green tensor C = F^T F.
+        """
         at_nodes = positions[self.elements].transpose(0, 2, 1)[:, None]
         f = at_nodes @ self.gradient
         a, b = f[..., 0], f[..., 1]
@@ -201,13 +215,13 @@ class _Mesh:
         return f, c
 
     def energy(self, positions: Floats) -> float:
-        """Return the elastic energy less the work of the weight, J."""
+        """Return the elastic energy minus the work of gravity, J."""
         _, c = self.deformation(positions)
         elastic = np.sum(self.weight * relaxed_energy(c, self.shear_modulus, self.slack_tension))
         return float(elastic - np.sum(self.load_n * positions))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the energy's gradient (nodes * 3,) and element stiffness (elements, 27, 27)."""
+        """Return the gradient of `energy` (nodes * 3,) and the stiffness (elements, 27, 27)."""
         f, c = self.deformation(positions)
         stress, tangent = relaxed_stress(c, self.shear_modulus, self.slack_tension)
         g, weight = self.gradient, self.weight
@@ -234,7 +248,10 @@ class _Mesh:
         return total - self.load_n.ravel(), blocks.reshape(elements, 27, 27)
 
     def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
-        """Return the sparse free stiffness; contact: (nodes, 3, 3) diagonal blocks."""
+        """Return the sparse stiffness matrix of the nodes that are not clamped.
+
+        contact: (nodes, 3, 3) contact stiffness, added to the diagonal blocks.
+        """
         free = stiffness.ravel()[self._is_free]
         values = np.bincount(self._slot, free, minlength=len(self._unique))
         for node in np.nonzero(contact.any(axis=(1, 2)))[0]:
@@ -246,7 +263,10 @@ class _Mesh:
 
 
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return eigenvalues (...,) of C, larger first, and the first's unit vector (..., 2)."""
+    """Return the larger and smaller eigenvalue (...,) of C, and the larger one's unit eigenvector.
+
+    c: (..., 3) = [C11, C22, C12]. The eigenvector is (..., 2).
+    """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
     angle = 0.5 * np.arctan2(c[..., 2], half)
@@ -254,7 +274,10 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
-    """Return the energy per rest volume (...,) of C (..., 3) = [C11, C22, C12]."""
+    """Return the energy per volume at rest (...,), relaxed for wrinkles, J/m3.
+
+    c: (..., 3) components [C11, C22, C12] of the right Cauchy-Green tensor.
+    """
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
     taut = small > stretched**-0.5
@@ -268,10 +291,10 @@ def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK
 def relaxed_stress(
     c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION
 ) -> tuple[Floats, Floats]:
-    """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent (..., 3,
-    3).
+    """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent.
 
-    Both are derivatives of `relaxed_energy`; the tangent is over the strain [E11, E22, 2 E12].
+    The stress is the derivative of `relaxed_energy` with respect to the Green strain
+    [E11, E22, 2 E12]; the tangent (..., 3, 3) is the derivative of the stress.
     """
     large, small, along = _eigen(c)
     taut = small > np.maximum(large, 1.0) ** -0.5
@@ -308,10 +331,10 @@ def relaxed_stress(
 
 
 class _Finger:
-    """Rigid sphere that nodes cannot enter (penalty); touched nodes stick to it.
+    """Fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
 
-    stuck: (nodes,) nodes that stick, each at its position in `anchor` (nodes, 3).
-    friction_coefficient: Coulomb's, or None for nodes that never slip.
+    stuck: (nodes,) whether a node sticks to the finger at its position in `anchor` (nodes, 3).
+    friction_coefficient: Coulomb coefficient; None if touched nodes never slip.
     """
 
     def __init__(
@@ -337,18 +360,21 @@ class _Finger:
         return np.where(self._stuck, 0.0, np.maximum(self._radius - distance, 0.0)), outward
 
     def touching(self, positions: Floats) -> Bools:
-        """Return which nodes (nodes,) stick or are pressed."""
+        """Return which nodes (nodes,) stick to the finger or penetrate it."""
         return self._stuck | (self._depth(positions)[0] > 0.0)
 
     def energy(self, positions: Floats) -> float:
-        """Return the energy of the penalties less the work of the friction, J."""
+        """Return the energy of the penalty forces minus the work of the friction forces, J."""
         depth, _ = self._depth(positions)
         away = np.sum((positions - self._anchor) ** 2, axis=1)
         penalty = 0.5 * np.sum(self._stiffness * np.where(self._stuck, away, depth**2))
         return float(penalty - np.sum(self._friction_n * (positions - self._anchor)))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (nodes, 3), and the definite part of its derivative (nodes, 3, 3)."""
+        """Return the gradient (nodes, 3) of `energy`, and a stiffness (nodes, 3, 3).
+
+        The stiffness omits the effect of the sphere's curvature, so that it is never negative.
+        """
         depth, outward = self._depth(positions)
         pressed = np.where(depth > 0.0, self._stiffness, 0.0)
         fixed = np.where(self._stuck, self._stiffness, 0.0)
@@ -358,9 +384,10 @@ class _Finger:
         return gradient, derivative + fixed[:, None, None] * np.eye(3)
 
     def release(self, positions: Floats) -> bool:
-        """Let nodes slip whose friction exceeds Coulomb's limit; return whether forces changed.
+        """Release the nodes whose friction exceeds the Coulomb limit, so that they slip.
 
-        A slipping node keeps the direction of its friction; the size follows its normal force.
+        Return whether forces changed, so that a new equilibrium must be solved. The friction force
+        of a slipping node keeps its direction; its size is the coefficient times the normal force.
         """
         if self._coefficient is None:
             return False
@@ -394,22 +421,24 @@ def solve(
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
-    world_from_..._edge: (4, 4), origin in the middle of the clamped edge, y along it.
-    finger_tip: the point (3,) of the sphere that is farthest from the user; its centre is
-    `finger_radius_m` towards the user. With None, or a tip before or beside the sheet, there is no
-    contact.
-    friction_coefficient: between finger and sheet; None if touched nodes stick whatever the force.
-    cells: even number of intervals between nodes along either side.
-    slack_tension: in shear moduli. A smaller one is more accurate for small pushes of a sheet that
-    is barely taut, but the equilibrium of a slack sheet is then not found.
+    world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
+    the centre of the edge, y points along it.
+    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
+    or if it lies in front of or beside the sheet, there is no contact.
+    friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
+    cells: number of intervals between nodes along each side; even.
+    slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
+    taut sheet. With it, the equilibrium of a slack sheet is not found.
 
-    Raises NotConvergedError if no equilibrium is found.
+    Raises NotConvergedError if no equilibrium is found, and ValueError if the edges coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
     distance = float(np.linalg.norm(x_axis))
     if distance < 1e-3:
-        raise ValueError(f"the sheet's edges are {distance * 1e3:.2f} mm apart")
+        raise ValueError(
+            f"the sheet's edges are {distance * 1e3:.2f} mm apart; at least 1 mm is required"
+        )
     x_axis = x_axis / distance
     normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
     normal /= np.linalg.norm(normal)
@@ -465,8 +494,8 @@ def solve(
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
-                        f"membrane: the friction changes after {rounds} equilibria; "
-                        f"friction coefficient {friction_coefficient}"
+                        f"membrane: the friction forces still change after {rounds} equilibria "
+                        f"(friction coefficient {friction_coefficient})"
                     )
                 positions, count = _relax(mesh, positions, finger)
                 iterations += count
@@ -486,7 +515,7 @@ def solve(
 
 
 def _insert_midpoints(boundaries: Floats) -> Floats:
-    """Return node coordinates (2 n - 1,): element boundaries (n,) and the points midway."""
+    """Return the node coordinates (2 n - 1,): element boundaries (n,) and the points between."""
     nodes = np.empty(2 * len(boundaries) - 1)
     nodes[::2] = boundaries
     nodes[1::2] = 0.5 * (boundaries[1:] + boundaries[:-1])
@@ -494,7 +523,10 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
 
 
 def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
-    """Return (nodes,) 1 at the focus, decreasing to 0 at the distance of the clamps."""
+    """Return a cone (nodes,), 1 at the focus and 0 from about the distance of the clamps on.
+
+    It distributes a step of the finger over the sheet, as the start of the next equilibrium.
+    """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus
     assert focus_x is not None
@@ -506,7 +538,10 @@ def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRub
 
 
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
-    """Solve by Newton's method with a line search on the energy; return positions and steps."""
+    """Minimise the energy by Newton's method with a line search; return positions and step count.
+
+    Raises NotConvergedError if the residual does not vanish.
+    """
     positions = start.copy()
     scale = mesh.shear_modulus * float(mesh.weight.sum()) / float(np.ptp(mesh.rest[..., 0]))
 
@@ -548,5 +583,6 @@ def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, 
     if residual < 1e-5 * scale:
         return positions, iteration
     raise NotConvergedError(
-        f"membrane: residual {residual:.2e} N after {iteration} steps, tolerance {1e-7 * scale:.2e}"
+        f"membrane: residual force {residual:.2e} N after {iteration} Newton steps exceeds the "
+        f"tolerance {1e-7 * scale:.2e} N"
     )

@@ -1,8 +1,9 @@
-"""Simulate arms behind the Mitsubishi real-time external control (MXT) over UDP.
+"""Simulate arm controllers with Mitsubishi's real-time external control (MXT) over UDP.
 
-This module was written from `docs/mxt.md` only, and shares nothing with the bridge that it tests.
-The robot program `Mxt 1,1,<filter>` is assumed to run.  It is known only in part what a real
-controller refuses.  This one refuses more, and does not answer after its program has ended.
+This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
+sends commands to an arm), because it serves to test the bridge. The robot program
+`Mxt 1,1,<filter>` is assumed to run. Only part of what a real controller refuses is known; this one
+refuses more, and does not answer after its program has ended.
 """
 
 from __future__ import annotations
@@ -40,17 +41,17 @@ _MORE_AT = (64, 108, 152)
 _RIGHT, _ABOVE, _NONFLIP = 4, 2, 1
 
 FILTER_S = 0.01
-"""Time constant of the low-pass that the maker recommends for `Mxt`."""
+"""Time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
 
 FIRST_STEP_RAD = 0.01
-"""Maximum distance of the first set-point from the arm's joints."""
+"""Maximum difference of each joint between the first set-point and the arm."""
 
 STEP_CYCLES = 2.0
-"""Maximum step between set-points, in cycles at full speed."""
+"""Maximum step between set-points, as the number of cycles that it would take at full speed."""
 
 
 class MxtError(FlexsheetError):
-    """Raised when the robot program ends; the text gives the reason."""
+    """Raised when an invalid command ends the robot program; the text gives the reason."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
@@ -59,12 +60,16 @@ class MxtError(FlexsheetError):
 class MxtController:
     """Simulated controller of one arm, which receives and answers one packet per cycle.
 
-    An error ends its program: the arm brakes, and no packet is answered until `restart`.  Errors
-    are: a move without a first packet that only asks; an unsupported data type; numbers that are
-    not a pose in range; a first set-point away from the arm; a jump; `timeout_s` without a packet.
-    filter_s: time constant of the low-pass on set-points.
-    cycle_s, cycle_jitter_s: mean and standard deviation of a cycle.  latency_s: time from a
-    set-point to its effect.
+    An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
+    Errors are: a move before a packet that only requests the state; an unknown command or data
+    type; values that are not a reachable pose; a first set-point away from the arm; a jump; and no
+    packet for `timeout_s`.
+
+    servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
+    filter_s: time constant of the low-pass filter on set-points.
+    restart_after_s: time after which the program restarts by itself.
+    cycle_s, cycle_jitter_s: mean and standard deviation of the cycle's duration.
+    latency_s: time from the arrival of a set-point until it takes effect.
     """
 
     def __init__(
@@ -94,7 +99,7 @@ class MxtController:
         self._next_cycle_s = cycle_s
         self._jitter = np.random.default_rng((seed, JITTER_STREAM))
         self._filter_share = 1.0 - math.exp(-cycle_s / filter_s) if filter_s else 1.0
-        # Clients send at the protocol's period even where the controller's cycle is shorter.
+        # Clients send at the period of the protocol, even if the controller's cycle is shorter.
         self._max_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * max(cycle_s, CONTROLLER_CYCLE_S)
         self._timeout_cycles = round(timeout_s / cycle_s)
         self._restart_cycles = restart_after_s / cycle_s
@@ -114,9 +119,9 @@ class MxtController:
         self._count = self._timeouts = self._missing = 0
 
     def receive_command(self, packet: bytes, sender: Address) -> None:
-        """Store a packet; the next cycle takes the newest.
+        """Store a packet; the next cycle processes the latest one.
 
-        A packet of another length, or of another sender while external control is on, is ignored.
+        A packet of wrong length is ignored, and so is another sender while one has control.
         """
         if len(packet) != _BYTES or (self._master not in (None, sender)):
             self.refused += 1
@@ -125,15 +130,15 @@ class MxtController:
 
     @property
     def waits(self) -> bool:
-        """Return whether a packet waits for the next cycle."""
+        """Return whether a packet is waiting to be processed in the next cycle."""
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:
-        """Return the time until the next cycle."""
+        """Return the time until the next cycle begins."""
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
-        """Advance by `duration_s`, cycle by cycle; append their answers to `answers`."""
+        """Simulate `duration_s`; append the answers of the cycles to `answers`."""
         while duration_s >= self.until_cycle_s():
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
@@ -167,7 +172,7 @@ class MxtController:
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """Return the set-point in effect: the newest, or an older one if the arm is late."""
+        """Return the set-point that takes effect now: the latest, or an older one with latency."""
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -200,14 +205,17 @@ class MxtController:
             self.answers.append((self._answer(command, receive_type, packet), sender))
 
     def _stay(self, sender: Address) -> None:
-        """Take a packet that only asks: the arm stops; the next set-point is a first one."""
+        """Process a packet that only requests the state.
+
+        The arm stops, and the next set-point counts as the first one.
+        """
         self._master = sender
         if self._moved:
             self.wanted_rad = self._filtered_rad = self.servo.joints_rad.copy()
             self._moved = False
 
     def _move(self, send_type: int, data: Floats, flags: int) -> None:
-        """Accept a set-point; raise MxtError for one that ends the program."""
+        """Check and store a set-point; raise MxtError if it is invalid, which ends the program."""
         if self._master is None:
             raise MxtError("a move ahead of the first packet")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
@@ -234,7 +242,10 @@ class MxtController:
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
-        """Return type, eight numbers and two flags; type 0 for what is not measured."""
+        """Return the requested state as data type, eight numbers and two flags.
+
+        The type is 0 if the requested quantity is not available.
+        """
         if wanted_type in _JOINTS:
             joints = self._seen(_JOINTS.index(wanted_type))
             return (wanted_type, *joints, 0.0, 0.0, 0, 0)
@@ -244,13 +255,16 @@ class MxtController:
         return (0, *([0.0] * 8), 0, 0)
 
     def _seen(self, what: int) -> Floats:
-        """Return the set-point, the filtered set-point, or the joints by the encoders."""
+        """Return joints (6,): 0: the set-point; 1: the filtered set-point; 2: the measurement."""
         noise = self._noise_rad * self._random.standard_normal(6)
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
 
 
 def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> Floats:
-    """Return the joints (6,) of a packet, near those before; raise MxtError if there are none."""
+    """Decode the joints (6,) of a packet; `before_rad` are the previous ones.
+
+    Raises MxtError if the packet contains no reachable set-point.
+    """
     if send_type not in (_POSES[0], _JOINTS[0]):
         raise MxtError(f"a set-point of type {send_type}")
     if not np.isfinite(data).all():
@@ -269,12 +283,12 @@ def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> 
 
 
 def pose_from(numbers: Floats) -> Floats:
-    """Return base_from_flange of x, y, z (mm) and angles about the fixed x, y, z axes (rad)."""
+    """Return base_from_flange (4, 4) for x, y, z (mm) and angles about fixed x, y, z axes (rad)."""
     return transform_from_rpy(numbers[:3] * 1e-3, numbers[3:6])
 
 
 def numbers_of(pose: Floats) -> tuple[float, ...]:
-    """Return the six numbers of a pose: inverse of `pose_from`."""
+    """Convert a pose (4, 4) to the six numbers of the protocol; the inverse of `pose_from`."""
     turn = pose[:3, :3]
     b = math.atan2(-turn[2, 0], math.hypot(turn[0, 0], turn[1, 0]))
     a, c = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
@@ -282,19 +296,22 @@ def numbers_of(pose: Floats) -> tuple[float, ...]:
 
 
 def structure_flags(joints_rad: Floats) -> int:
-    """Return the sum of 4 (wrist ahead of the shoulder), 2 (elbow up), 1 (J5 not negative)."""
+    """Return the protocol's flags of the branch of the inverse kinematics to which joints belong.
+
+    It is the sum of 4 (wrist in front of the shoulder), 2 (elbow up) and 1 (J5 not negative).
+    """
     q2, q3 = float(joints_rad[1]), float(joints_rad[2])
     ahead = 0.25 * math.sin(q2) - 0.09 * math.cos(q2 + q3) + 0.16 * math.sin(q2 + q3)
     return (_RIGHT if ahead >= 0 else 0) | _ABOVE | (_NONFLIP if joints_rad[4] >= 0 else 0)
 
 
 class MxtServer:
-    """UDP server of a controller."""
+    """UDP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called before each packet and cycle, to advance the arm's motion."""
+        """`before` is called before each packet and cycle; it must call `controller.advance`."""
         self.controller = controller
         self._address = (host, port)
         self._before = before
@@ -302,7 +319,7 @@ class MxtServer:
         self._due: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
-        """Listen; raises OSError if the port is taken."""
+        """Start to listen; raises OSError if the port is in use."""
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(
             lambda: _Packets(self._received), local_addr=self._address
@@ -310,9 +327,9 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the port (useful when it was given as 0)."""
+        """Return the port on which the server listens, also if it was given as 0 (any)."""
         if self._transport is None:
-            raise RuntimeError("the arm's server does not listen")
+            raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])
 
     async def stop(self) -> None:
@@ -328,7 +345,7 @@ class MxtServer:
         self._wait_for_cycle()
 
     def _wait_for_cycle(self) -> None:
-        """Answer at the end of the present cycle."""
+        """Schedule the answer for the end of the present cycle."""
         if self._due is None:
             loop = asyncio.get_running_loop()
             self._due = loop.call_later(self.controller.until_cycle_s(), self._flush)

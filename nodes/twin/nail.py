@@ -1,4 +1,4 @@
-"""Place the marker on the nail of a finger that is held at an angle."""
+"""Compute where the marker is on the nail of a finger, which may be held at an angle."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Nail:
-    """Marker and the direction of the finger, all in the world's directions.
+    """Placement of the marker, and direction of the finger, as vectors in the world frame.
 
-    marker_offset_m: (3,) from the fingertip (the pad's contact point) to the marker's centre.
-    marker_normal: (3,) of a flat marker; None: a ball.
-    direction: (3,) from the tip to the knuckle.
+    marker_offset_m: (3,) from the fingertip (contact point of the finger pad) to the centre of the
+        marker.
+    marker_normal: (3,) normal of a flat marker; None if the marker is a ball.
+    direction: (3,) from the fingertip to the knuckle.
     """
 
     marker_offset_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -30,10 +31,10 @@ class Nail:
 
     @classmethod
     def of(cls, finger: FingerTruth) -> Self:
-        """Return the nail of a finger.
+        """Compute the placement from the true finger parameters.
 
-        The finger's frame has x from the tip to the knuckle, y to the right for a finger that is
-        not tilted, z out of the nail.
+        In the finger's frame, x points from the tip to the knuckle and z out of the nail. For a
+        finger that is not tilted, y points to the right.
         """
         tilt = rotation_from_vector((*finger.finger_tilt_rad, 0.0))
         x = tilt @ np.array(FINGER_DIRECTION)
@@ -52,5 +53,5 @@ class Nail:
 
     @property
     def knuckle_shift_m(self) -> Floats:
-        """Return by how much the tilt moves the knuckle, and the hand with it (3,)."""
+        """Return the vector (3,) by which the finger's tilt displaces the knuckle and the hand."""
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))

@@ -1,8 +1,10 @@
 """Map finger paths onto the scene's object, within the range of the arms; read recorded paths.
 
-A surface position is (along, arc, height) in metres: along the object's x axis over its surface,
-around it from there, and along the normal. (0, 0, 0) is the object's front, which faces the user.
-Motions are defined in surface positions, so that they apply to the object of any scene.
+A surface position is (along, arc, height) in metres. `along` is the distance over the surface in
+the direction of the object's x axis. `arc` is the distance over the surface from there, at right
+angles. `height` is the distance from the surface, negative inside the object. (0, 0, 0) is the
+front of the object, the point that faces the user. Motions are defined in surface positions, so
+that they apply to the object of any scene.
 """
 
 from __future__ import annotations
@@ -26,49 +28,50 @@ FAR_M = 2.0
 MAX_DISTANCE_M = 0.5
 STRIDE_M = 0.001
 GRID_M = 0.003
-"""Maximum length of geodesics, their step, and the spacing of the grid."""
+"""Distance of an imaginary viewer, maximum length of geodesics (straightest lines on the surface),
+their step, and the spacing of the interpolation grid."""
 
 WITHIN_ENDS = 0.8
 OF_WIDTH = 0.7
 OF_HEIGHT = 0.9
-"""Fractions that are stroked: of an object that ends, of the sheet's width and of its usable
-half-height."""
+"""Fractions that the finger can stroke: of the length of an object with ends, of the width of the
+sheet, and of its usable half-height."""
 
 MAX_CACHED_GROUNDS = 4
 _GROUNDS: dict[bytes, Ground] = {}
 
 SPEED_FRACTION = 0.8
-"""Maximum speed of a path over the finger's; wander and tremor are added to it."""
+"""Maximum speed of a path, as a fraction of the scene's finger speed. The rest is a reserve, since
+wander and tremor are added to the path."""
 
 PRESS_FRACTION = 1.0 / 6.0
-"""Maximum depth of a recorded hand, over the scene's push depth."""
+"""Maximum depth to which a recorded path pushes, as a fraction of the scene's push depth."""
 
 
 def map_to_surface(scene: Scene, places: Floats) -> Floats:
-    """Return world points (n, 3) of surface positions (n, 3) on the scene's object."""
+    """Convert surface positions (n, 3) on the scene's object to world points (n, 3)."""
     return _ground_of(scene).points(places)
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
-    """Return the lengths (m), along and around the surface, that a finger can stroke.
+    """Return the lengths (m), along and around the object, over which a finger can stroke.
 
-    They are limited by the object (0.8 of its length), by the working range's tilt, and by the
-    usable sheet, to the same distance on both sides of the front. Around the object the sheet is
-    met at its centre line.
+    They extend equally to both sides of the front. They are limited by 0.8 of the length of an
+    object with ends, the maximum tilt of the working range, and the usable part of the sheet.
     """
     return _ground_of(scene).touchable_m
 
 
 class Ground:
-    """Map from surface positions of a scene's object to points, from its front.
+    """Map from surface positions on a scene's object to world points.
 
-    Positions are measured along geodesics: first along the object's x axis, then at right angles to
-    that. They are computed on a grid, interpolated by bicubic splines and projected onto the
-    surface. A path over them is therefore as smooth as the surface.
+    The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
+    between are interpolated by bicubic splines and projected onto the surface, so that a mapped
+    path is as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Raise FingerPathError for an object that turns no side to the user."""
+        """Compute the grid; raises FingerPathError if no side of the object faces the user."""
         pose = scene.object.world_from_object
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._shape = make_shape(dict(scene.object.geometry))
@@ -77,12 +80,12 @@ class Ground:
         most = np.cos(min(scene.working_range.tilt_rad, 0.5 * np.pi))
         if front.normal @ towards_user < most:
             raise FingerPathError(
-                f'scene "{scene.name}": the object turns no side to the user that may be touched; '
-                "turn it by object.world_from_object"
+                f'scene "{scene.name}": no side of the object faces the user within '
+                "working_range.tilt_rad; turn the object by object.world_from_object"
             )
         along = np.array([1.0, 0.0, 0.0])
         across = np.cross(front.normal, along)
-        if np.linalg.norm(across) < 0.1:  # its x axis points to the user
+        if np.linalg.norm(across) < 0.1:  # the object's x axis points to the user
             across = np.array([0.0, 1.0, 0.0])
         ways = []
         for heading in (np.cross(across, front.normal), across):
@@ -99,7 +102,10 @@ class Ground:
         self._lay_out(front, np.cross(across, front.normal))
 
     def points(self, places: Floats) -> Floats:
-        """Return world points (n, 3) of positions (n, 3), limited to the touchable range."""
+        """Convert surface positions (n, 3) to world points (n, 3).
+
+        `along` and `arc` are limited to the range of the grid.
+        """
         along, arc = places[:, 0], places[:, 1]
         rough = np.column_stack([spline(along, arc, grid=False) for spline in self._splines])
         found = self._shape.closest(rough)
@@ -108,7 +114,11 @@ class Ground:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the distance to the limit of tilt or to the end; True: to the end."""
+        """Return how far a finger can stroke in one direction, and whether an end limits it.
+
+        The other limit is the tilt of the normal from the user, whose cosine is `most`. Lengths
+        are measured from the front along the geodesic that begins in direction `heading`, m.
+        """
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
             heading = heading - here.normal * (heading @ here.normal)
@@ -125,7 +135,7 @@ class Ground:
         return way_m, False
 
     def _lay_out(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines of the surface over (along, arc), to a quarter beyond the touchable range."""
+        """Fit splines of the surface over (along, arc), to 1.25 times the range to be stroked."""
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -142,8 +152,8 @@ class Ground:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point that faces the user.
 
-    That is the point nearest to a distant user. If it is an end of the object, it is the point that
-    the user sees through the origin.
+    That is the point nearest to a distant user. If that point lies on an end of the object, the
+    point that the user sees in the direction of the object's origin is taken instead.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -162,9 +172,10 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 
 
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
-    """Return points and normals (k, n, 3) on geodesics from points (n, 3), at distances (k,) m.
+    """Return points and normals (k, n, 3) on geodesics from points (n, 3).
 
-    ticks: ascending, as many before 0 as after it; 0 is in the middle.
+    ticks: ascending distances (k,) in m at which points are computed. 0 is in the centre, with
+    equally many distances on both sides.
     """
     middle = len(ticks) // 2
     begun = shape.closest(starts)
@@ -180,7 +191,8 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
             for _ in range(parts):
                 heading = heading - normal * (heading * normal).sum(1, keepdims=True)
                 heading = heading / np.maximum(np.linalg.norm(heading, axis=1), 1e-12)[:, None]
-                # Seen from the tangent plane a way s on a bend k is tan(k s) / k long.
+                # An arc of length s and curvature k has the length tan(k s) / k when projected
+                # from its centre of curvature onto the tangent (here to third order).
                 bend = np.einsum("ni,nij,nj->n", heading, found.shape_operator, heading)
                 length = way_m / parts * (1.0 + (bend * way_m / parts) ** 2 / 3.0)
                 found = shape.closest(here + length[:, None] * heading, previous=here)
@@ -190,7 +202,7 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _ground_of(scene: Scene) -> Ground:
-    """Return the scene's ground; the latest few are cached, since a path needs it many times."""
+    """Return the surface map of a scene; the latest few are cached, as they are costly."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _GROUNDS:
         while len(_GROUNDS) >= MAX_CACHED_GROUNDS:
@@ -200,14 +212,14 @@ def _ground_of(scene: Scene) -> Ground:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Return whether world points (n, 3) keep that far inside the scene's finger volume."""
+    """Return whether world points (n, 3) are at least `margin_m` inside the finger volume."""
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return times (n,), scaled if the path is too fast for the scene's finger."""
+    """Return the times (n,), stretched by one factor if the path exceeds the finger's speed."""
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
     slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
     return np.asarray((times_s - times_s[0]) * slower)
@@ -222,13 +234,14 @@ def place_path(
     wander_m: float,
     tremor_m: float,
 ) -> FingerPath:
-    """Return the path of a motion through positions (n, 3) at times (n,), samples of a smooth
-    motion.
+    """Make a path in the scene from a smooth motion in surface positions.
 
-    The motion is scaled down by one factor if it leaves the scene's finger volume, wander included,
-    and slowed by one factor if it exceeds the finger's speed.
+    times_s, places: sample times (n,) and surface positions (n, 3).
 
-    Raises FingerPathError where the volume does not contain the object's front.
+    The motion is scaled down by one factor if it, with wander and tremor, leaves the scene's finger
+    volume. It is slowed down by one factor if it exceeds the scene's finger speed.
+
+    Raises FingerPathError if the volume does not contain the front of the object.
     """
     margin_m = 4.0 * wander_m + 3.0 * tremor_m
     shrunk = next(
@@ -257,22 +270,22 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Map a recorded fingertip's path into the scene; it has the name of its file.
+    """Load a recorded fingertip path and map it into the scene. The path is named after its file.
 
-    The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as from hand trackers. The mapping
-    preserves the motion and changes its location:
+    The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as hand trackers write it. The
+    mapping preserves the motion and changes its location:
 
-    1. Rotate: the recording's x, y, z become the world's x, y, z (right, up, towards the user).
-    2. Scale, if necessary, by one factor, so that the middle 90 % fits the touchable range and 50
-      mm of depth.
-    3. Translate: the median x, y is put before the object's middle.
-    4. Project: the depth becomes the height over the object's surface. The deepest 30 % press into
-    it, limited smoothly to a sixth of `push_depth_m`; the rest hovers or reaches. Height y becomes
-    arc length over the surface, so that moving up and down strokes it.
+    1. Rotate: the recorded x, y, z become the world's x, y, z (right, up, towards the user).
+    2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fits the range
+       that can be stroked (`touchable`) and 50 mm of depth.
+    3. Translate: the median x, y is placed in front of the centre of the object.
+    4. Project: z becomes the height above the surface. The deepest 30 % of the samples push into
+       it, limited smoothly to a sixth of `push_depth_m`; the others are in the air. y becomes arc
+       length on the surface, so that moving up and down strokes it.
     5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
-    The samples are limited to the scene's finger volume and joined smoothly, so that the motion
-    between them, tremor included, is preserved.
+    The samples are limited to the scene's finger volume and joined by a spline, which preserves the
+    recorded motion with its tremor.
 
     Raises FingerPathError for an invalid file.
     """
@@ -290,7 +303,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
         [
             _soft_clip(points[:, 0], half[0]),
             _soft_clip(points[:, 1], half[1]),
-            # A skin gives way, it does not stop a hand.
+            # The limit is gradual, since soft skin yields instead of stopping the hand abruptly.
             _soft_max(points[:, 2] - touch, -press_m, 0.5 * press_m),
         ],
         axis=1,
@@ -309,38 +322,49 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
 
 
 def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
-    """Limit values (n,) from below by a hyperbola, so that the transition has the width `bend`."""
+    """Limit values (n,) smoothly to at least `floor`; the transition has the width `bend`."""
     above = values - floor
     return np.asarray(floor + 0.5 * (above + np.hypot(above, bend)))
 
 
 def _soft_clip(values: Floats, half: float) -> Floats:
-    """Limit values (n,) to +-half, with a transition over a fifth of it."""
+    """Limit values (n,) smoothly to +-half; the transition has the width 0.2 half."""
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 
 def _read_recording(csv_path: Path) -> Floats:
-    """Read columns t_s, x_mm, y_mm, z_mm (n, 4); raise FingerPathError with line and remedy."""
+    """Read the columns t_s, x_mm, y_mm, z_mm of a CSV file as an array (n, 4).
+
+    Raises FingerPathError, which names the file, the line and the error.
+    """
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:
         lines: Sequence[str] = csv_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise FingerPathError(f"{csv_path}: cannot be read: {error}") from error
+        raise FingerPathError(
+            f"{csv_path}: cannot be read: {error}; give a CSV file in UTF-8"
+        ) from error
     columns = [name.strip() for name in lines[0].split(",")] if lines else []
     if missing := [name for name in wanted if name not in columns]:
-        raise FingerPathError(f"{csv_path}: no column {missing[0]}; needed are {', '.join(wanted)}")
+        raise FingerPathError(
+            f"{csv_path}: no column {missing[0]} in the first line; required: {', '.join(wanted)}"
+        )
     rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], start=2):
         cells = line.split(",")
         try:
             row = [float(cells[columns.index(name)]) for name in wanted]
         except (ValueError, IndexError) as error:
-            raise FingerPathError(f"{csv_path}: line {number}: {error}") from error
+            raise FingerPathError(f"{csv_path}: line {number}: invalid row: {error}") from error
         if not np.isfinite(row).all():
-            raise FingerPathError(f"{csv_path}: line {number}: not a finite number")
+            raise FingerPathError(
+                f"{csv_path}: line {number}: not a finite number; correct or delete the line"
+            )
         if rows and row[0] <= rows[-1][0]:
-            raise FingerPathError(f"{csv_path}: line {number}: t_s does not increase")
+            raise FingerPathError(
+                f"{csv_path}: line {number}: t_s does not increase; sort or delete the line"
+            )
         rows.append(row)
     if len(rows) < 2:
-        raise FingerPathError(f"{csv_path}: {len(rows)} samples, a path needs two")
+        raise FingerPathError(f"{csv_path}: {len(rows)} samples found; a path needs at least two")
     return np.array(rows)

@@ -1,10 +1,11 @@
-"""Simulate the stereo camera: images of a fingertip with a bright marker, as of a real rig.
+"""Simulate the stereo camera: render images of a finger with a bright marker at its tip.
 
-The optics are the simulator's own, a pinhole with Brown's distortion (`rig.py`), because they are
-the reference of the camera model that the nodes use. The fingertip is a tapered finger that ends in
-a small luminous bead, the marker, whose centre is the fingertip's point; `clutter.py` describes its
-surroundings. All is drawn ray by ray, blurred by the lens, by defocus, by the pixel's area and by
-the motion during the exposure. Photon and read noise, saturation and rounding follow.
+The camera model, a pinhole with Brown's distortion (`rig.py`), is separate from the one that the
+nodes use, since the images serve to test theirs. The finger is a tapered capsule. By default the
+marker is a small luminous bead, whose centre is the fingertip position; `nail.py` defines others.
+`clutter.py` describes the surroundings. All objects are drawn ray by ray and blurred by the lens,
+defocus, pixel area and motion during the exposure. Then photon and read noise are added, and the
+result is clipped and rounded to grey levels.
 """
 
 from __future__ import annotations
@@ -40,32 +41,32 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
-"""Rows and columns of a part of an image."""
+"""Rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
-"""Fingertip (3,) at a time in seconds from the middle of the exposure."""
+"""Function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
 
 MOTION_STEP_PX = 0.7
-"""Maximum step by which motion within the exposure is summed; the blur closes the gaps. The motion
-within a step would widen the blur by 4 % at most."""
+"""Maximum distance between the positions at which a moving object is drawn during one exposure. The
+lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4 %."""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
-"""World direction towards the lamp, of about unit length: from the upper left."""
+"""World direction towards the lamp at the upper left, of about unit length."""
 
 SHADE = 0.35
-"""Darkening of skin at a limb's flank relative to its ridge."""
+"""Fraction by which skin is darker at the outline of a limb than along its centre line."""
 
 SIDE_LIGHT = 0.2
-"""Brightening of the flank towards the lamp relative to the ridge, and darkening of the other."""
+"""Fraction by which the side of a limb that faces the lamp is brighter, and the other darker."""
 
 MIN_DEPTH_M = 0.02
 """Objects closer to a camera than this are not drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""Positions along a limb that are projected to find the window that contains it."""
+"""Positions along a limb (0: start, 1: end) that are projected to find the window with the limb."""
 
 EMPTY_FRACTION = 1.2
-"""Maximum area of joined windows over the sum of theirs."""
+"""Two overlapping windows are joined if the joined area is at most this multiple of their sum."""
 
 SPOTS = 61
 """Number of Gaussian spots that make up a flat marker."""
@@ -73,18 +74,21 @@ SPOTS = 61
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 GRAIN = 1 << 21
-"""Number of normal deviates from which images take their noise, at random offsets."""
+"""Length of the stored sequence of normal deviates; images take their noise from random parts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Image sensor; levels are digital numbers (0..255), linear.
+    """Properties of the image sensor and lens; grey levels (0..255) are proportional to the light.
 
-    photons_per_level: full-well photons over 255; the variance of a level L is L over it.
-    blur_px: standard deviation of the lens's point spread in focus.
-    aperture_m, focus_m: out of focus, a point spreads to a disc of f * aperture * |1/z - 1/focus|
-    px in diameter. It is drawn as a Gaussian of the same standard deviation, a quarter of that.
-    exposure: factor on all light; above 1 the marker saturates.
+    photons_per_level: full-well capacity in photons, divided by 255. The variance of the photon
+    noise at level L is L / photons_per_level.
+    blur_px: standard deviation of the lens's point spread function in focus.
+    aperture_m, focus_m: aperture diameter and focused distance. A point at depth z spreads to a
+    disc of diameter focal_px * aperture_m * |1/z - 1/focus_m|. It is drawn as a Gaussian with the
+    same standard deviation, a quarter of the diameter.
+    exposure: factor on all light; well above 1 the marker saturates.
+    noisy_backgrounds: number of precomputed noisy background images per camera.
     """
 
     marker_level: float = 215.0
@@ -100,35 +104,41 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Return the standard deviation of each level."""
+        """Return the standard deviation of the photon and read noise at each grey level."""
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     def spread_px(self, depth_m: float, focal_px: float) -> float:
-        """Return the standard deviation of a point at a depth: lens, focus, pixel area."""
+        """Return the blur (standard deviation) of a point due to lens, defocus and pixel area."""
         defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """Return the sensor with a point at a depth out of focus by `defocus_px`."""
+        """Return this sensor refocused farther away, so that a point at `depth_m` is blurred.
+
+        The defocus alone has the standard deviation `defocus_px`. Raises ValueError if even focus
+        at infinity gives less.
+        """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
         if focus <= 0:
             raise ValueError(
-                f"defocus of {defocus_px:g} px at {depth_m:g} m lies beyond infinity: needs an "
-                f"aperture_m above {4.0 * defocus_px * depth_m / focal_px:.3g}"
+                f"a defocus of {defocus_px:g} px at {depth_m:g} m is impossible even with focus at "
+                f"infinity: set aperture_m above {4.0 * defocus_px * depth_m / focal_px:.3g} m"
             )
         return replace(self, focus_m=1.0 / focus)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """One camera of the rig with the rays through its pixels and its noisy backgrounds.
+    """One camera of the stereo rig with the rays through its pixels and its background images.
 
-    slopes_x, slopes_y: x/z and y/z of each pixel's ray, in the camera.
-    canvas: where images are drawn; between images it equals the background.
+    slopes_x, slopes_y: x/z and y/z of the ray through each pixel, in the camera frame.
+    background: noise-free image of all static objects.
+    canvas: buffer in which images are drawn; between images it equals the background.
+    noisy: copies of the background with noise added.
     """
 
     side: Side
@@ -141,7 +151,7 @@ class CameraView:
     noisy: list[Image]
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
-        """Return pixel (2,) and depth (m) of a world point; depths <= 0 are invalid."""
+        """Return the pixel (2,) and depth (m) of a world point; for depths <= 0 the pixel is 0."""
         x, y, z = (
             self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
         ).tolist()
@@ -150,7 +160,7 @@ class CameraView:
         return np.array(pixel_of(self.lens, x / z, y / z)), z
 
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
-        """Return the part of the image within a distance of some pixels; None if there is none."""
+        """Return the bounding box of pixels, enlarged by `reach_px`; None if outside the image."""
         height, width = self.canvas.shape
         rows = slice(
             max(math.floor(min(y for _, y in pixels) - reach_px), 0),
@@ -164,7 +174,7 @@ class CameraView:
 
 
 class TwinCamera:
-    """Stereo camera that renders pairs with a true rig; `seed` determines the noise."""
+    """Simulated stereo camera, which renders image pairs; `seed` determines the noise."""
 
     def __init__(
         self,
@@ -177,9 +187,11 @@ class TwinCamera:
         nail: Nail | None = None,
         skew_s: float = 0.0,
     ) -> None:
-        """nail: where the marker is, and how the finger is held; None: a ball at the fingertip.
+        """Render the static background of both cameras.
 
-        skew_s: exposure of the right image minus that of the left one.
+        camera: true lenses and poses of the stereo rig.
+        nail: marker position and finger direction; None: a bead at the fingertip.
+        skew_s: exposure time of the right image minus that of the left image.
         """
         self.camera = camera
         self.skew_s = skew_s
@@ -208,9 +220,9 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return the same camera and background with another marker or sensor.
+        """Return a copy of this camera, with the same background, but another marker or sensor.
 
-        marker_offset_m: of the marker from the fingertip, in the world's directions.
+        marker_offset_m: vector from the fingertip to the marker, in the world frame.
         """
         other = copy.copy(self)
         other.sensor = self.sensor if sensor is None else sensor
@@ -221,10 +233,10 @@ class TwinCamera:
     def picture(
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Image, Image]:
-        """Return the left and right image of a fingertip at `position(seconds from mid-exposure)`.
+        """Render the left and right image of a finger whose tip moves along `position`.
 
         marker: whether the finger wears a marker.
-        time_s: time at mid-exposure of the clutter that moves.
+        time_s: simulation time at mid-exposure, which determines where moving clutter is.
         """
         left, right = (
             self._exposed(eye, self._draw(eye, tips, time_s + instants_s, marker=marker))
@@ -235,7 +247,7 @@ class TwinCamera:
     def levels(
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
-        """Return both images (height, width) as light: before noise, saturation and rounding."""
+        """Render both images (height, width) without noise, saturation and rounding."""
         pictures = []
         for eye, instants_s, tips in self._views(position, exposure_s):
             windows = self._draw(eye, tips, time_s + instants_s, marker=marker)
@@ -246,7 +258,7 @@ class TwinCamera:
     def _views(
         self, position: Position, exposure_s: float
     ) -> Iterator[tuple[CameraView, Floats, Floats]]:
-        """Return each camera with its instants (n,) and the fingertips (n, 3) at them."""
+        """Yield each camera with times (n,) from mid-exposure and the fingertip (n, 3) at them."""
         instants_s, tips = self._instants(position, exposure_s)
         left, right = self.eyes
         yield left, instants_s, tips
@@ -256,7 +268,10 @@ class TwinCamera:
         yield right, instants_s, tips
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
-        """Return times (n,) from mid-exposure and fingertips (n, 3), dense enough to sum motion."""
+        """Return times (n,) from mid-exposure and fingertip positions (n, 3), for motion blur.
+
+        They are so dense that the fingertip moves at most MOTION_STEP_PX between two of them.
+        """
         ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
         travel_px = 0.0
         for eye in self.eyes:
@@ -268,7 +283,10 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return the image: a noisy background with the touched windows drawn on it."""
+        """Return a noisy background into which the drawn windows of the canvas are copied.
+
+        Then restore the canvas to the background.
+        """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
             image[window] = self._read_out(eye.canvas[window])
@@ -283,9 +301,9 @@ class TwinCamera:
     def _draw(
         self, eye: CameraView, tips: Floats, times_s: Floats, *, marker: bool
     ) -> list[Window]:
-        """Draw all that is not background on the eye's canvas; gives the windows it touches.
+        """Draw the finger and all moving objects on the camera's canvas; return drawn windows.
 
-        tips: (n, 3) over the exposure, times_s: (n,).
+        tips: fingertip positions (n, 3) during the exposure. times_s: their times (n,).
         """
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
@@ -337,12 +355,15 @@ class TwinCamera:
         *,
         lit: bool,
     ) -> Window | None:
-        """Draw a tapered capsule between two world points (2, 3); None if it is not visible.
+        """Draw a tapered capsule between two world points (2, 3); return its window.
 
-        lit: by the lamp from its side; otherwise evenly.
+        Return None if the capsule is not visible.
 
-        The motion over the exposure (m) widens its edges; their profile is a cubic, within 2 % of
-        the normal distribution. It is not valid for limbs thinner than their edges.
+        lit: whether the lamp shades it from the side; otherwise its level is constant.
+        way: motion (3,) in m during the exposure, which widens the blurred edges.
+
+        The profile of the edges is a cubic, within 2 % of the normal distribution function. It is
+        not valid for a limb that is thinner than its blurred edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
         if min(z0, z1) <= MIN_DEPTH_M:
@@ -352,7 +373,7 @@ class TwinCamera:
         scale = pixels_per_slope(eye.lens, u0, v0)
         travel_px = scale / z0 * math.hypot(*way.tolist())
         spread_px = math.hypot(self.sensor.spread_px(z0, eye.lens.fx_px), travel_px / math.sqrt(12))
-        # A lens bends straight things: their middle may bulge out of the box of their ends.
+        # Lens distortion bends straight lines, so the bounding box of the ends does not suffice.
         pixels = [
             pixel_of(eye.lens, u0 + share * (u1 - u0), v0 + share * (v1 - v0)) for share in ALONG
         ]
@@ -368,7 +389,7 @@ class TwinCamera:
         within = np.minimum(np.maximum(along, single(0.0)), single(length))
         off = cv2.magnitude(across, along - within)
         width = within * single((width1 - width0) / length) + single(width0)
-        # A cubic from 0 to 1 over +-2.2 standard deviations.
+        # The edge rises from 0 to 1 by a cubic over +-2.2 standard deviations.
         edge = (width - off) * single(scale / (4.4 * spread_px)) + single(0.5)
         edge = np.minimum(np.maximum(edge, single(0.0)), single(1.0))
         cover = edge * edge * (single(3.0) - single(2.0) * edge)
@@ -385,9 +406,11 @@ class TwinCamera:
     def _disc(
         self, eye: CameraView, places: Floats, radius_m: float, level: float, *, adds: bool = False
     ) -> Window | None:
-        """Draw a luminous ball at world points (n, 3) over the exposure; None if not visible.
+        """Draw a luminous ball that passes world points (n, 3) during the exposure.
 
-        adds: its light adds to the background instead of hiding it.
+        Return its window, or None if it is not visible.
+
+        adds: whether its light is added to the background instead of hiding it.
         """
         in_camera = apply(eye.camera_from_world, places)
         if in_camera[:, 2].min() <= MIN_DEPTH_M:
@@ -406,11 +429,12 @@ class TwinCamera:
         return window
 
     def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
-        """Draw the marker as a flat disc at world points (n, 3), seen as an ellipse; None if it is
-        not visible, or seen from behind.
+        """Draw the marker as a flat disc that passes world points (n, 3) during the exposure.
 
-        The disc is a sum of Gaussian spots, which is exact up to their overlap: within 1 % of the
-        light of a disc that is larger than the blur.
+        Return its window, or None if it is not visible or seen from behind.
+
+        The disc is a sum of Gaussian spots. If it is larger than the blur, its light is within 1 %
+        of that of a uniform disc.
         """
         in_camera = apply(eye.camera_from_world, places)
         middle = in_camera.mean(axis=0)
@@ -442,7 +466,7 @@ class TwinCamera:
     def _eye(
         self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None
     ) -> CameraView:
-        """Return one camera with all static objects drawn into its background."""
+        """Make the view of one camera, with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
         canvas = self._room(height, width)
@@ -468,7 +492,7 @@ class TwinCamera:
         return eye
 
     def _room(self, height: int, width: int) -> Singles:
-        """Return a dim background: two octaves of smooth noise, much darker than the marker."""
+        """Return the image of a dim room: smooth noise of two scales, darker than the marker."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
@@ -477,7 +501,10 @@ class TwinCamera:
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
-        """Return the sheet's levels, one per half grain: noise of two sizes, one side brighter."""
+        """Return the grey levels of the sheet's surface, with two samples per grain.
+
+        The texture is noise of two scales; the left side is brighter.
+        """
         size = [
             2 + int(np.ceil(4.0 * half_m / sheet.grain_m))
             for half_m in (sheet.half_height_m, sheet.half_width_m)
@@ -492,7 +519,11 @@ class TwinCamera:
     def _lay(
         self, sheet: Sheet, grain: Singles, canvas: Singles, slopes: Floats, pose: Floats
     ) -> None:
-        """Draw the sheet, in the plane z = 0, where the rays of slopes (h, w, 2) meet it."""
+        """Draw the sheet, which lies in the world plane z = 0, on the canvas.
+
+        slopes: x/z and y/z (height, width, 2) of the pixels' rays.
+        pose: camera_from_world (4, 4).
+        """
         plane_from_ray = np.linalg.inv(pose[:3, [0, 1, 3]])
         on_plane = slopes @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
         before = on_plane[..., 2] > 0
@@ -509,7 +540,7 @@ class TwinCamera:
 
 
 def _disc_points(normal: Floats) -> Floats:
-    """Return SPOTS points (n, 3) spread evenly over the unit disc with that normal."""
+    """Return points (SPOTS, 3), spread evenly over the unit disc perpendicular to `normal`."""
     number = np.arange(SPOTS) + 0.5
     radius, angle = np.sqrt(number / SPOTS), GOLDEN_ANGLE_RAD * number
     aside = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
@@ -522,7 +553,7 @@ def _disc_points(normal: Floats) -> Floats:
 
 @lru_cache(maxsize=4)
 def _slopes(lens: Lens, width: int, height: int) -> Floats:
-    """Return slopes (height, width, 2) of the rays through all pixels; cached."""
+    """Return x/z and y/z (height, width, 2) of the rays through all pixels; cached."""
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     slopes = slopes_of(lens, pixels.astype(np.float64))
     slopes.setflags(write=False)
@@ -532,12 +563,12 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
 def rasterize_ball(
     eye: CameraView, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
-    """Return the fraction of each pixel's light that comes from a ball, the mean over centres (n,
-    3).
+    """Return the fraction of each pixel's light that comes from a ball.
 
-    Centres are in the camera's frame. A ray passes one at distance |ray x centre| / |ray|. A disc
-    of radius r blurred by a Gaussian s gives, at distance d, the non-central chi-square
-    distribution of (d/s)^2 at (r/s)^2 with two degrees of freedom.
+    The fraction is the mean over the ball's centres (n, 3) during the exposure, in the camera
+    frame. A ray passes a centre at the distance d = |ray x centre| / |ray|. For a disc of radius r
+    that is blurred by a Gaussian of standard deviation s, the fraction is a non-central chi-square
+    distribution function. It has two degrees of freedom and non-centrality (d/s)^2, at (r/s)^2.
     """
     single = np.float32
     u, v = eye.slopes_x[window], eye.slopes_y[window]
@@ -545,7 +576,7 @@ def rasterize_ball(
     cover = np.zeros_like(u)
     for a, b, c in centres.tolist():
         x, y = a / c, b / c
-        # Pixels per metre across the ray, alike for the spread and the distance.
+        # Pixels per metre perpendicular to the ray; it converts the blur from pixels to metres.
         scale = pixels_per_slope(eye.lens, x, y) * (1.0 + x * x + y * y) ** 0.25 / c
         spread_sq = (spread_px / scale) ** 2
         du, dv = u - single(x), v - single(y)
@@ -556,12 +587,12 @@ def rasterize_ball(
 
 
 def quantize(levels: Singles) -> Image:
-    """Return digital numbers as the converter does: rounded, clipped at 0 and 255."""
+    """Convert grey levels to integers as the sensor's converter does: round, clip to 0..255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
 def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
-    """Return the markers and highlights that one camera sees."""
+    """Return the additional markers and the highlights that one camera sees."""
     spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 
@@ -578,7 +609,8 @@ def _wipe(eye: CameraView, windows: list[Window]) -> None:
 def disjoint(windows: list[Window]) -> list[Window]:
     """Return windows that cover the same pixels and do not overlap.
 
-    Two that overlap are joined; if the result would be mostly empty, one is cut along the other.
+    Two overlapping windows are joined. If the joined window would be too large (EMPTY_FRACTION),
+    the overlap is cut off one of them.
     """
     apart: list[Window] = []
     pending = list(windows)
@@ -613,7 +645,7 @@ def _overlap(a: Window, b: Window) -> bool:
 
 
 def _beyond(one: Window, other: Window) -> list[Window]:
-    """Return the parts of a window outside another: above, below, left and right of it."""
+    """Return the up to four parts of window `one` that lie outside window `other`."""
     (rows, columns), (cut_rows, cut_columns) = one, other
     between = slice(max(rows.start, cut_rows.start), min(rows.stop, cut_rows.stop))
     parts = [

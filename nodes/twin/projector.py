@@ -1,7 +1,7 @@
-"""Simulate the true projector and its light on a flat sheet; compute errors of its calibration.
+"""Simulate a projector that lights a flat sheet; compute the errors of its calibration.
 
-Its projection is the simulator's own. An unpushed sheet between two parallel edges is flat, so that
-a plane represents it.
+The projector model is separate from the one that the nodes use, because it serves to test theirs.
+A sheet that is not pushed lies flat between two parallel edges, so that a plane represents it.
 """
 
 from __future__ import annotations
@@ -28,21 +28,28 @@ Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 RAYS = 2
-"""Rays per camera pixel and direction."""
+"""Number of rays per camera pixel in each direction."""
 
 ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
-"""Levels of the room behind, of the sheet at full light, and of the sheet in projected black."""
+"""Grey levels of the room behind the sheet, and of the sheet: the level that full light adds, and
+the level where black is projected."""
 
 SPREAD_PX = 0.5
-"""Standard deviation of a projector pixel's image on the sheet: lens and rubber."""
+"""Blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
+"""Standard deviations of the true projector from the scene's: focal length (relative), principal
+point, position, rotation and distortion."""
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
-    """Return a true projector near the pose that a tape measure gives, with true optics."""
+    """Return a projector that differs at random from the scene's, as a real one from a data sheet.
+
+    Its pose deviates as after measuring with a tape. Deviations are normal, limited to two standard
+    deviations.
+    """
     random = np.random.default_rng(seed)
 
     def deviation(*shape: int) -> Floats:
@@ -74,7 +81,10 @@ def make_true_projector(projector: Projector, *, seed: int) -> Projector:
 
 
 def _rpy(rotation: Floats) -> Floats:
-    """Return roll, pitch, yaw about fixed x, y, z (rad); undefined at a pitch of 90 degrees."""
+    """Convert a rotation matrix to roll, pitch, yaw about fixed x, y, z axes (rad).
+
+    They are not unique at a pitch of +-90 degrees.
+    """
     return np.array(
         [
             np.arctan2(rotation[2, 1], rotation[2, 2]),
@@ -85,11 +95,14 @@ def _rpy(rotation: Floats) -> Floats:
 
 
 def sheet_poses(count: int) -> list[Floats]:
-    """Return poses `world_from_sheet` (4, 4) that arms can hold: near and far, tilted."""
+    """Return various poses `world_from_sheet` (4, 4) at which the arms can hold the sheet.
+
+    They differ in distance and tilt, as the calibration of a projector requires.
+    """
     poses = []
     for number in range(count):
         share = number / max(count - 1, 1)
-        towards = 2.399963 * number  # the golden angle: no two lean alike
+        towards = 2.399963 * number  # golden angle: all tilt directions differ
         tilt = 0.0 if number == 0 else 0.15 + 0.25 * share
         turn = rotation_from_vector(tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
         depth_m = 0.05 * np.cos(np.pi * number * 0.618)
@@ -98,10 +111,10 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """Stereo rig in front of a flat sheet that the projector lights from behind."""
+    """Stereo camera in front of a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
-        """camera, projector: the true ones."""
+        """camera, projector: the simulated devices, with their true parameters."""
         self._scene, self._camera, self._projector = scene, camera, projector
         self._random = np.random.default_rng(seed)
         self._sensor = Sensor()
@@ -114,7 +127,7 @@ class LitSheet:
     def pair(
         self, patterns: Sequence[Image], world_from_sheet: Floats
     ) -> tuple[list[Image], list[Image]]:
-        """Return the left and right image of each pattern on the sheet at a pose."""
+        """Render the left and right images of patterns projected on the sheet at a pose (4, 4)."""
         pose = self._camera.world_from_left
         world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
         views = (world_from_left, world_from_left @ inverse(self._camera.right_from_left))
@@ -143,7 +156,11 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """Return the projector's column and row that light what rays see; also which hit it."""
+        """Return the projector columns and rows that light the points of the sheet that rays hit.
+
+        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result is whether a ray
+        hits the sheet.
+        """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         points, ahead = on_plane(
             world_from_eye[:3, 3], directions @ world_from_eye[:3, :3].T, world_from_sheet
@@ -158,7 +175,7 @@ class LitSheet:
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
 
-    Returns the points, and whether the plane is before the origin of the ray.
+    Return the points (..., 3), and whether they lie in front of the origin of the rays.
     """
     normal = plane[:3, 2]
     slant = directions @ normal
@@ -168,7 +185,7 @@ def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats,
 
 
 def pixels_lighting(projector: Projector, points: Floats) -> Floats:
-    """Return the projector's pixels (..., 2) that light world points (..., 3) before it."""
+    """Return the projector pixels (..., 2) that light world points (..., 3) in front of it."""
     pose = projector.world_from_projector
     from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
     local = points @ from_world[:3, :3].T + from_world[:3, 3]
@@ -178,10 +195,11 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the errors (n,), m on the imaginary screen, of the positions at which points appear.
+    """Return how far from their intended positions projected points appear to the eye, (n,).
 
-    Points on a grid of +-half_m on planes (4, 4) are lit by the pixels that `believed` computes;
-    the true projector puts that light elsewhere on the plane.
+    The distances are in m on the imaginary screen, the world plane z = 0. Points on a grid of
+    +-half_m on planes (4, 4) are lit by the pixels that the calibrated projector `believed`
+    computes. The true projector casts their light elsewhere on the plane.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

@@ -1,20 +1,20 @@
-"""Queue the frames that the simulated eye renders: one per label and correction."""
+"""Queue the frames that the simulated eye renders: one per label, correction and viewpoint."""
 
 from __future__ import annotations
 
 from typing import Generic, TypeVar
 
 Key = tuple[str, ...]
-"""Label, correction and viewpoint of a frame."""
+"""Label, correction and viewpoint of a frame, which identify a job."""
 
 J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """Queue of jobs, which selects the frames that are rendered.
+    """Queue of rendering jobs in order of arrival, which also decides what is rendered again.
 
-    max_length: number of jobs that may wait.
-    min_interval_s: time before the same key is rendered again.
+    max_length: maximum number of waiting jobs.
+    min_interval_s: minimum time before a job with the same key is rendered again.
     """
 
     def __init__(self, max_length: int, min_interval_s: float) -> None:
@@ -28,11 +28,11 @@ class RenderQueue(Generic[J]):
 
     @property
     def is_full(self) -> bool:
-        """Return whether no further job may wait."""
+        """Return whether the queue has no room for a further job."""
         return len(self._jobs) >= self._max_length
 
     def is_known(self, key: Key, now_ns: int) -> bool:
-        """Return whether a job of the key waits, or was rendered a short time ago."""
+        """Return whether a job with this key is waiting, or was rendered in `min_interval_s`."""
         if key in self._jobs:
             return True
         return key in self._recent_ns and self._is_recent(self._recent_ns[key], now_ns)
@@ -41,21 +41,24 @@ class RenderQueue(Generic[J]):
         return now_ns - at_ns < self._min_interval_s * 1e9
 
     def reject(self, key: Key) -> bool:
-        """Reject a key while the queue is full; True the first time, which is to be reported."""
+        """Record that a job was rejected because the queue is full.
+
+        Return True the first time for this key, so that the caller reports it only once.
+        """
         is_new = key not in self._rejected
         self._rejected.add(key)
         return is_new
 
     def add(self, key: Key, job: J) -> None:
-        """Append a job, or replace the one of the same key."""
+        """Append a job, or replace the waiting job with the same key."""
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return the oldest job, which stays in the queue until `finish`."""
+        """Return key and content of the oldest job, which stays in the queue until `finish`."""
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:
-        """Remove a rendered job."""
+        """Remove a rendered job, and remember when it was rendered."""
         self._jobs.pop(key, None)
         self._rejected.discard(key)
         self._recent_ns[key] = now_ns
@@ -64,5 +67,5 @@ class RenderQueue(Generic[J]):
         }
 
     def clear(self) -> None:
-        """Drop all jobs that wait."""
+        """Remove all waiting jobs."""
         self._jobs.clear()

@@ -1,8 +1,8 @@
-"""Simulate the true stereo rig and its lenses.
+"""Simulate the stereo camera's true geometry and lenses.
 
-A scene's camera block is a data sheet. The device differs from it by deviations that only a
-calibration determines. The projection is the simulator's own, because it is the reference of the
-camera model that the nodes use.
+The section `camera` of a scene corresponds to a data sheet. The simulated device deviates from it,
+and only a calibration determines the deviations. The camera model here is separate from the one
+that the nodes use, because it serves to test theirs.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ Floats = NDArray[np.float64]
 T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005
-"""Relative standard deviation of a focal length between devices of one make."""
+"""Relative standard deviation of the focal length between devices of one model."""
 
 ASPECT_DEVIATION = 0.0005
-"""Relative standard deviation of fy from fx: pixels are nearly square."""
+"""Relative standard deviation of fy from fx, which is small since pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""Standard deviation of a principal point per 640 px of width, from mounting the sensor."""
+"""Standard deviation of the principal point, due to the mounting of the sensor, for an image 640 px
+wide."""
 
 RADIAL = (-0.30, 0.11)
 RADIAL_DEVIATION = (0.015, 0.01)
-"""k1 and k2 of the lenses of such rigs (66 degrees across), which no data sheet gives."""
+"""Mean and standard deviation of k1 and k2 for typical lenses with 66 degrees of horizontal field
+of view; data sheets do not state them."""
 
 TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
@@ -44,10 +46,10 @@ NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """Return the true rig of a data sheet, determined by the device name.
+    """Return the true parameters of a camera, whose deviations the device name determines.
 
-    Deviations are normal, limited to two standard deviations. The left camera's pose, the size,
-    rate and exposure are those of the scene.
+    The deviations from the scene's parameters are normal, limited to two standard deviations. The
+    pose of the left camera, image size, rate and exposure remain those of the scene.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
@@ -104,7 +106,10 @@ def _seen(lens: Lens, u: T, v: T) -> tuple[T, T]:
 
 
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
-    """Return d(x, y)/d(u, v) of Brown's distortion, which is symmetric: xx, xy, yy."""
+    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
+
+    u, v: x/z and y/z of the ray; x, y: the same after distortion.
+    """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -115,15 +120,18 @@ def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
 
 
 def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
-    """Return pixels per unit of slope about a ray, the geometric mean over all directions."""
+    """Return the local image scale: pixels per unit of the slopes x/z and y/z near a ray.
+
+    It is the square root of the determinant of the projection's derivative.
+    """
     xx, xy, yy = _slopes_of_distortion(lens, slope_x, slope_y)
     return math.sqrt(lens.fx_px * lens.fy_px * abs(xx * yy - xy * xy))
 
 
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
-    """Return rays (x/z, y/z) (..., 2) of pixels (..., 2): inverts `pixels_of` by Newton's method.
+    """Return the rays (x/z, y/z) (..., 2) of pixels (..., 2): the inverse of `pixels_of`.
 
-    It is valid wherever the distortion is injective.
+    It uses Newton's method, and is valid wherever the distortion is injective.
     """
     focal = np.array([lens.fx_px, lens.fy_px])
     slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)

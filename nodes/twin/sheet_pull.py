@@ -1,4 +1,7 @@
-"""Displace the flanges by the sheet's pull on them."""
+"""Displace the flanges (last links of the arms) by the tension and weight of the sheet.
+
+The apparatus holds the true parameters of the simulated hardware.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,14 @@ from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
 Floats = NDArray[np.float64]
 
 CELLS = 8
-"""Elements per side: the force of an unpushed sheet then differs by 1 % from that of 32."""
+"""Number of node intervals per side of the sheet's mesh. Without a finger, the force differs by 1 %
+from that with 32."""
 
 STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
 
 
 def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
-    """Return the simulator's sheet; sheet: the true one."""
+    """Make the simulated sheet; `sheet` has the true dimensions and material."""
     gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
     return TrueRubber(
         sheet.width_m,
@@ -36,17 +40,19 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
 
 
 def true_friction(apparatus: Apparatus | None) -> float | None:
-    """Return the friction coefficient between finger and sheet; None if touched rubber sticks."""
+    """Return the friction coefficient between finger and sheet; None: touched rubber sticks."""
     return None if apparatus is None else apparatus.sheet.friction_coefficient
 
 
 @dataclass(slots=True)
 class SheetPull:
-    """Pull of the sheet over the distance of its edges, and both arms' compliances, m/N.
+    """Force with which the sheet pulls on both arms, and the compliance of the arms.
 
-    A finger's push on the sheet is not part of the pull: it is small beside the tension.
-    weight_n: (3,) of the sheet, of which each flange carries half.
-    history: of the pull; None for elastic rubber.
+    The force of a finger on the sheet is neglected, since it is small compared with the tension.
+    distances_m, forces_n: (n,) tension as a function of the distance between the clamped edges.
+    compliances_m_per_n: displacement of the left and right flange per force.
+    weight_n: (3,) weight of the sheet; each flange carries half of it.
+    history: hysteresis and creep of the tension; None for elastic rubber.
     """
 
     distances_m: Floats
@@ -58,7 +64,10 @@ class SheetPull:
 
     @classmethod
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
-        """Compute the pull of the true sheet by the membrane; None if both arms are rigid."""
+        """Compute the tension of the true sheet with the membrane model.
+
+        Return None if both arms are rigid, so that nothing is displaced.
+        """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
         if not any(compliances):
@@ -79,16 +88,16 @@ class SheetPull:
         )
 
     def force_n(self, distance_m: float) -> float:
-        """Return the pull between the arms at a distance of the rigid arms' edges.
+        """Return the tension if the edges would be at `distance_m` with rigid arms.
 
-        The flanges give way until compliance and sheet are in equilibrium.
+        The flanges yield until the tension and the stiffness of the arms are in equilibrium.
         """
         forces_n = self._rubber_ratio * self.forces_n
         rigid_m = self.distances_m + sum(self.compliances_m_per_n) * forces_n
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Add the pull at a distance to its history; elastic rubber has none."""
+        """Update hysteresis and creep with the tension at a distance; does nothing without them."""
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio
@@ -104,9 +113,9 @@ class SheetPull:
         *,
         time_s: float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Return both flange poses (4, 4) under pull and weight; they move, but do not turn.
+        """Return both flange poses (4, 4), displaced by the sheet's tension and weight.
 
-        time_s: of the poses; it must not decrease.
+        The flanges are not rotated. time_s: time of the poses, which must not decrease.
         """
         left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
         right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]

@@ -1,9 +1,11 @@
-"""List the tolerances of an apparatus, and draw apparatuses from them.
+"""List the tolerances of real hardware, and generate random apparatuses from them.
 
-This is the one table from which `--apparatus seed:N` draws. Each row has its own stream of random
-numbers, named after the row, so that a new row changes no other value. Seeds 0 to 99 are for
-development; no method may be tuned on any other seed. A calibrated draw describes a laboratory
-that has calibrated its devices: only the calibration's residual separates scene and truth.
+An apparatus holds the true parameters of the simulated hardware, as deviations from the scene,
+which holds those that the nodes assume. The option `--apparatus seed:N` generates a random one from
+this table. Each row has its own stream of random numbers, so that a new row changes no other value.
+Seeds 0 to 99 are for development; no method may be tuned on any other seed. A calibrated apparatus
+describes a laboratory that has calibrated its devices. Its deviations are the residual errors of
+the calibrations.
 """
 
 from __future__ import annotations
@@ -21,15 +23,15 @@ from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
 MAX_DEVIATION_SIGMAS = 3.0
-"""Normal draws are limited to this: beyond it a laboratory notices the fault."""
+"""Limit of normal random samples; a laboratory would notice and correct a larger deviation."""
 
 
 class Profile(StrEnum):
-    """Equipment of a laboratory.
+    """Generation of the laboratory's equipment.
 
-    modern: a 60 Hz camera with a short read-out, a controller with a short period.
-    paper: a camera of 15 to 48 Hz that reads out for most of a frame, a controller period of
-        7.1 ms.
+    modern: a 60 Hz camera with a short read-out, and robot controllers with a short period.
+    paper: equipment as in Furukawa et al. 2007. The camera has 15 to 48 Hz and reads out for most
+        of a frame; the controller period is 7.1 ms.
     """
 
     MODERN = "modern"
@@ -37,22 +39,24 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """Interface of a distribution that draws values."""
+    """Interface of a probability distribution of one quantity."""
 
-    def draw(self, random: np.random.Generator) -> Any: ...
+    def draw(self, random: np.random.Generator) -> Any:
+        """Return a random sample."""
+        ...
 
     def at(self, sigmas: float) -> Any:
-        """Return the quantile that a normal deviate of `sigmas` has."""
+        """Return the value whose cumulative probability is that of a normal deviate of `sigmas`."""
         ...
 
     def text(self, scale: float) -> str:
-        """Format the distribution, its numbers multiplied by `scale`."""
+        """Format the distribution for a table, with its numbers multiplied by `scale`."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """Normal distribution, limited to MAX_DEVIATION_SIGMAS and to `low` to `high`."""
+    """Normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
 
     mean: float
     sigma: float
@@ -90,7 +94,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """Absolute value of a normal deviate."""
+    """Distribution of the absolute value of a normal deviate, limited to MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -106,6 +110,8 @@ class HalfNormal:
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
+    """Uniform distribution from `low` to `high`."""
+
     low: float
     high: float
 
@@ -122,6 +128,8 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class LogUniform:
+    """Distribution from `low` to `high` whose logarithm is uniform."""
+
     low: float
     high: float
 
@@ -138,7 +146,7 @@ class LogUniform:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """One of a few values, all equally likely; in order, so that more sigmas mean a later one."""
+    """Choice of one of a few values in ascending order, all equally likely."""
 
     values: tuple[float, ...]
 
@@ -155,7 +163,7 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class Always:
-    """A value without tolerance."""
+    """Constant value, without tolerance."""
 
     value: float | str
 
@@ -171,15 +179,16 @@ class Always:
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """One row of the table.
+    """Row of the table: the distribution of one parameter of the apparatus.
 
-    key: path in the apparatus; "*" stands for both arms or both lenses.
-    modern: distribution of each component, or one per component.
-    paper: the same where the profile differs.
-    calibrated: what remains after calibration; None where no calibration changes the quantity.
-    pair: difference between the arms, if both share one draw.
-    frame_periods: the drawn number counts periods of the camera's true rate.
-    unit, scale: how tables state it.
+    key: dotted path in the apparatus; "*" stands for both arms or both lenses.
+    unit, scale: unit in tables, and the factor from SI units to it.
+    modern: distribution of every component, or a tuple with one for each component.
+    source, calibrated_source: source of the numbers.
+    paper: distribution for the profile `paper`; None: as `modern`.
+    calibrated: distribution after calibration; None if no calibration affects the parameter.
+    pair: if given, both arms share a random sample, to which each adds a sample of `pair`.
+    frame_periods: profiles in which the sample is in periods of the true camera rate, not seconds.
     """
 
     key: str
@@ -194,7 +203,7 @@ class Tolerance:
     frame_periods: tuple[Profile, ...] = ()
 
     def of(self, profile: Profile, *, calibrated: bool) -> Distribution | tuple[Distribution, ...]:
-        """Return the distribution, or one per component."""
+        """Return the distribution for a profile, or a tuple with one for each component."""
         if calibrated and self.calibrated is not None:
             return self.calibrated
         return self.paper if profile is Profile.PAPER and self.paper is not None else self.modern
@@ -340,25 +349,25 @@ _ROWS = (
 TOLERANCES: dict[str, Tolerance] = {row.key: row for row in _ROWS}
 
 NOT_SIMULATED: dict[str, str] = {
-    "finger.hand_mass_kg": "the finger follows its path whatever it feels",
-    "finger.hand_damping_ns_per_m": "the finger follows its path whatever it feels",
-    "finger.hand_stiffness_n_per_m": "the finger follows its path whatever it feels",
+    "finger.hand_mass_kg": "the finger follows its path regardless of the contact force",
+    "finger.hand_damping_ns_per_m": "the finger follows its path regardless of the contact force",
+    "finger.hand_stiffness_n_per_m": "the finger follows its path regardless of the contact force",
 }
-"""Keys that an apparatus can state and that no simulator node uses yet, with the reason."""
+"""Keys that an apparatus can contain but that no simulator node uses yet, with the reason."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
-    """Return the paths that a row's key stands for."""
+    """Return the paths for which the key of a row stands: left and right if it contains "*"."""
     return tuple(key.replace("*", side) for side in ("left", "right")) if "*" in key else (key,)
 
 
 def sample_apparatus(
     scene: Scene, seed: int, *, profile: Profile = Profile.MODERN, calibrated: bool = False
 ) -> Apparatus:
-    """Draw an apparatus of a scene; the same arguments always give the same apparatus.
+    """Generate a random apparatus for a scene; equal arguments give equal results.
 
-    Nominal, calibrated and other draws of one seed use the same random numbers, so that they can
-    be compared in pairs.
+    All profiles, calibrated or not, use the same random numbers for the same seed, so that they
+    can be compared in pairs.
     """
     values = nominal_apparatus(scene).model_dump(mode="json")
     for row in TOLERANCES.values():
@@ -376,10 +385,10 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Return an apparatus that is nominal except for one row of the table, at `sigmas`.
+    """Make an apparatus in which only the parameter of one row deviates, to test its effect.
 
-    All components of a vector, and both arms or lenses, are at the same quantile.  Raises KeyError
-    for a key that is not in the table.
+    The deviation is that of a normal deviate of `sigmas`. All components of a vector, and both arms
+    or lenses, deviate equally. Raises KeyError for a key that is not in the table.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)
@@ -420,7 +429,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random numbers of one parameter: other parameters have no influence on them."""
+    """Return the random generator of one parameter, which is independent of other parameters."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 
@@ -428,7 +437,7 @@ def _stream(seed: int, name: str) -> np.random.Generator:
 def _draw(
     given: Distribution | tuple[Distribution, ...], like: Any, random: np.random.Generator
 ) -> Any:
-    """Draw a value of the shape of `like`: a number, or a list with one draw per component."""
+    """Return a random value in the form of `like`: a number, or a list of independent samples."""
     if not isinstance(like, list):
         assert not isinstance(given, tuple)
         return given.draw(random)
@@ -437,14 +446,14 @@ def _draw(
 
 
 def value_at(values: dict[str, Any], path: str) -> Any:
-    """Return the value at a dotted path."""
+    """Return the value at a dotted path of nested dictionaries."""
     for part in path.split("."):
         values = values[part]
     return values
 
 
 def set_value(values: dict[str, Any], path: str, value: Any) -> None:
-    """Set the value at a dotted path."""
+    """Set the value at a dotted path of nested dictionaries."""
     *outer, last = path.split(".")
     for part in outer:
         values = values[part]
@@ -452,7 +461,7 @@ def set_value(values: dict[str, Any], path: str, value: Any) -> None:
 
 
 def iterate_paths(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """Return the dotted paths of all values."""
+    """Yield the dotted paths of all values in nested dictionaries."""
     for name, value in values.items():
         if isinstance(value, dict):
             yield from iterate_paths(value, f"{prefix}{name}.")
@@ -464,9 +473,9 @@ TRUTH_SECTIONS = ("camera", "arms", "sheet", "finger", "eyes", "projector")
 
 
 def list_differences(apparatus: Apparatus) -> list[tuple[str, Any, Any, str]]:
-    """Return (path, value, nominal value, unit) of all that differs from a nominal apparatus.
+    """List the parameters in which an apparatus differs from a nominal one.
 
-    Values are in the table's unit.
+    An entry is (path, value, nominal value, unit), with values in the unit of the table.
     """
     mine = apparatus.model_dump(mode="json")
     nominal = Apparatus(scene=apparatus.scene).model_dump(mode="json")

@@ -1,4 +1,8 @@
-"""Compute the true object, at rest or deformed as its skin, on a mesh of the simulator's own."""
+"""Compute the surface of the virtual object, at rest or deformed, to verify the displayed images.
+
+The skin is the surface mesh of the soft-body solver. The object has a separate, finer mesh here,
+which follows the displacement of the skin.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +22,21 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
-"""Vertices around the x axis, and rows of them along it."""
+"""Number of vertices around the x axis, and of rows along it (twice for rounded shapes)."""
 PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
-"""Maximum edge of a mesh object's triangles after subdivision."""
+"""Maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""Number of nearest skin vertices whose triangles are searched for the nearest point."""
+"""Number of skin vertices near a point whose triangles are searched for its nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
-    """True object: vertices (vertices, 3) world, outward triangles, unit normals.
+    """Mesh of the virtual object's surface at one time.
 
-    Along a sharp edge vertices are doubled.
-
+    vertices: (vertices, 3) in the world frame; they are doubled along sharp edges.
+    triangles: (triangles, 3) indices of vertices, facing outward.
+    normals: (vertices, 3) unit normals.
     sunk_m: (vertices,) depth by which each vertex is pushed in.
     colour: (3,) red, green, blue in full light, 0 to 1.
     """
@@ -44,7 +49,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """True object of a scene, of any shape; of a plane, the touchable rectangle."""
+    """Virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -75,16 +80,18 @@ class TrueBody:
     def displaced(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer], displacement: Floats
     ) -> TrueObject:
-        """Return the object with each point displaced as the nearest point of a skin at rest.
+        """Return the deformed object: each point moves with the nearest point of the skin at rest.
 
-        skin_vertices: (skin vertices, 3).
-        displacement: (skin vertices, 3), linear within skin_triangles (triangles, 3).
+        skin_vertices: (skin vertices, 3) at rest.
+        displacement: (skin vertices, 3), interpolated linearly in skin_triangles (triangles, 3).
 
-        Raises ValueError if it is of another skin, or the skin has no triangles.
+        Raises ValueError if the displacement belongs to another skin, or if no triangle of the skin
+        has an area.
         """
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
-                f"displacement: expected {len(skin_vertices)} vertices, found {len(displacement)}"
+                f"displacement has {len(displacement)} vertices, but the skin has "
+                f"{len(skin_vertices)}; give both from the same mesh"
             )
         corners, weights = self._on_skin(skin_vertices, skin_triangles)
         return self._object(self._rest + np.einsum("vc,vcx->vx", weights, displacement[corners]))
@@ -92,9 +99,9 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return three skin vertices (vertices, 3) for each own vertex, and their weights.
+        """Return, for each vertex of the object, three skin vertices and their weights.
 
-        The result is cached until the skin changes.
+        Both arrays are (vertices, 3). They are cached until the skin changes.
         """
         key = skin_vertices.tobytes() + skin_triangles.tobytes()
         if self._skin is None or self._skin[0] != key:
@@ -115,14 +122,15 @@ class TrueBody:
 
 
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Return corners (points, 3) of the triangles nearest to points, and barycentric weights.
+    """Find the nearest point of a mesh to each of some points (points, 3).
 
-    Raises ValueError where no triangle has an area.
+    Return the corners (points, 3) of its triangle and its barycentric weights (points, 3). Raises
+    ValueError if no triangle has an area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
-        raise ValueError("the skin has no triangles with an area")
-    # Triangles by corner: those of one vertex stand together.
+        raise ValueError("no triangle of the skin has an area; give the skin of a valid mesh")
+    # Sort the triangles' corners by vertex, so that the triangles of one vertex are adjacent.
     order = np.argsort(triangles.ravel(), kind="stable")
     corner = triangles.ravel()[order]
     begin = np.searchsorted(corner, np.arange(len(vertices) + 1))
@@ -145,9 +153,9 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
 
 
 def _strip(rows: int, around: int) -> Indices:
-    """Return triangles between closed rows of vertices.
+    """Return the triangles between successive closed rows of `around` vertices each.
 
-    They face outward where the rows run about +x with the sine along y and the cosine along z.
+    They face outward if the rows are ordered along +x, and their vertices as in `_turned`.
     """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij"))
     here, beside = i * around + j, i * around + (j + 1) % around
@@ -160,18 +168,18 @@ def _strip(rows: int, around: int) -> Indices:
 
 
 def _fan(rim: Indices, centre: int) -> Indices:
-    """Return triangles from a centre to a closed rim."""
+    """Return triangles from a centre vertex to all edges of a closed rim."""
     return np.column_stack([np.full(len(rim), centre), rim, np.roll(rim, -1)])
 
 
 def _turned() -> Floats:
-    """Return unit vectors (AROUND, 3) about the x axis."""
+    """Return unit vectors (AROUND, 3) perpendicular to the x axis, from +z towards +y."""
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     return np.column_stack([np.zeros(AROUND), np.sin(angle), np.cos(angle)])
 
 
 def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
-    """Return side and end caps of a cylinder along x; the caps have rims of their own."""
+    """Return vertices and triangles of a closed cylinder along x; rim vertices are doubled."""
     side = np.repeat(radius_m * _turned()[None], ALONG + 1, axis=0)
     side[..., 0] = length_m * np.linspace(-0.5, 0.5, ALONG + 1)[:, None]
     count = AROUND * (ALONG + 1)
@@ -183,7 +191,7 @@ def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
 
 
 def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
-    """Return a rectangle about the origin that faces +z."""
+    """Return vertices and triangles of a rectangle about the origin that faces +z."""
     x = np.linspace(-0.5, 0.5, PLANE_CELLS + 1)
     y, x = (v.ravel() for v in np.meshgrid(height_m * x, width_m * x, indexing="ij"))
     cell = np.arange(PLANE_CELLS)
@@ -197,7 +205,10 @@ def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
 
 
 def _directions() -> Floats:
-    """Return unit vectors (directions, 3): rows about the x axis from -x to +x, then both poles."""
+    """Return unit vectors (directions, 3) that cover the sphere.
+
+    They are ordered in rows around the x axis, from -x to +x; -x and +x themselves come last.
+    """
     polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
     rows = np.sin(polar)[:, None, None] * _turned()
     rows[..., 0] = -np.cos(polar)[:, None]
@@ -205,7 +216,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return a closed surface with one vertex along each of `_directions`."""
+    """Return vertices and triangles of a closed surface with one vertex per `_directions`."""
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
@@ -213,9 +224,10 @@ def _star(vertices: Floats) -> tuple[Floats, Indices]:
 
 
 def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
-    """Return where rays from the centre along `_directions` leave the solid, (directions, 3).
+    """Return the points (directions, 3) where rays from the centre leave a solid.
 
-    Every point of the solid must be visible from its centre.
+    The rays have the directions `_directions`. The solid must be star-shaped: each of its points
+    must be visible from the centre.
     """
     away = _directions()
     match geometry:
@@ -223,7 +235,7 @@ def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
             return radius * away
         case Ellipsoid(semi_axes_m=axes):
             return np.asarray(away / np.linalg.norm(away / np.array(axes), axis=1)[:, None])
-    # From outside, steps of the distance never pass the surface.
+    # Sphere tracing from outside: a step by the distance to the surface never crosses it.
     low, high = GEOMETRIES[geometry.shape].bounds_m(geometry)
     reach = np.full(len(away), float(np.linalg.norm(np.maximum(-low, high))))
     for _ in range(100):
@@ -235,7 +247,7 @@ def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
 
 
 def _cut_up(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
-    """Divide all triangles into four, repeatedly, until no edge is longer than `MAX_EDGE_M`."""
+    """Divide each triangle into four, repeatedly, until no edge is longer than `MAX_EDGE_M`."""
     while True:
         corners = vertices[triangles]
         longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())

@@ -1,4 +1,8 @@
-"""Apply an apparatus to a scene: replace the assumed devices by the true ones."""
+"""Replace the assumed parameters of a scene by the true parameters of the simulated hardware.
+
+The scene describes the object and the devices as the nodes assume them. The apparatus contains the
+deviations of the simulated devices from the scene.
+"""
 
 from __future__ import annotations
 
@@ -22,19 +26,20 @@ Floats = NDArray[np.float64]
 
 
 class SimulatorParameters(NodeParameters):
-    """Parameters of a simulator node; only these contain the apparatus."""
+    """Parameters of a simulator node; no other nodes receive the apparatus."""
 
     apparatus: Apparatus | None = Field(
-        default=None, description="true parameters; null: those of the scene. `--apparatus` sets it"
+        default=None,
+        description="true hardware parameters, set by `--apparatus`; null: those of the scene",
     )
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true devices; the scene itself for None.
+    """Return the scene with the true devices; without an apparatus, the scene itself.
 
-    The object and everything that is not a device stay as they are: they are virtual, or are
-    requirements. The camera's true lenses follow from its result by `make_true_camera`, since the
-    scene states a data sheet there.
+    Everything that is not a device remains unchanged, since it is virtual or a requirement. The
+    returned camera still has the lenses of its data sheet; `make_true_camera` adds the deviations
+    of the individual device.
     """
     if apparatus is None:
         return scene
@@ -95,7 +100,7 @@ def _true_camera(camera: StereoCamera, apparatus: Apparatus) -> StereoCamera:
     right = camera.right_from_left
     turn, shift = truth.right_rotation_offset_rad, truth.right_position_offset_m
     if any((*turn, *shift)):
-        # A camera that moves by a shift sees everything move by its inverse.
+        # If the camera is shifted, points in its frame move by the opposite vector.
         right = transform(rotation_from_vector(turn), -np.array(shift)) @ right
     return camera.model_copy(
         update={
@@ -137,9 +142,9 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 
 
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
-    """Return a pose moved in its outer frame and turned about its own origin.
+    """Return a pose that is translated in its parent frame and rotated about its own origin.
 
-    Without a rotation the angles keep all digits.
+    If the rotation is zero, the angles are returned unchanged, without rounding error.
     """
     rpy_rad = pose.rpy_rad
     if any(rotation_rad):
@@ -149,36 +154,40 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
-    """Return what is impossible of an apparatus in its scene: (key, value, what, remedy)."""
+    """List the impossible values of an apparatus in its scene: (key, value, problem, remedy)."""
     base = apparatus.nominal or scene
     found: list[tuple[tuple[str, ...], Any, str, str]] = []
     radius_m = base.finger.radius_m + apparatus.finger.radius_offset_m
     if radius_m <= 0.0:
         found.append(
             (("finger", "radius_offset_m"), apparatus.finger.radius_offset_m,
-             f"makes the radius {radius_m:g} m", "give more than minus the scene's radius")
+             f"makes the finger radius {radius_m:g} m",
+             "give more than minus the scene's finger.radius_m")
         )  # fmt: skip
     width_m = base.sheet.width_m + apparatus.sheet.slack_width_offset_m
     if width_m <= 0.0:
         found.append(
             (("sheet", "slack_width_offset_m"), apparatus.sheet.slack_width_offset_m,
-             f"makes the width {width_m:g} m", "give more than minus the scene's width")
+             f"makes the sheet width {width_m:g} m",
+             "give more than minus the scene's sheet.width_m")
         )  # fmt: skip
     if base.eyes.interocular_m + apparatus.eyes.interocular_offset_m < 0.0:
         found.append(
             (("eyes", "interocular_offset_m"), apparatus.eyes.interocular_offset_m,
-             "makes the distance of the eyes negative", "give at least minus the scene's distance")
+             "makes the distance between the eyes negative",
+             "give at least minus the scene's eyes.interocular_m")
         )  # fmt: skip
     hand = apparatus.finger
     given = [hand.hand_mass_kg, hand.hand_damping_ns_per_m, hand.hand_stiffness_n_per_m]
     if any(one is None for one in given) and any(one is not None for one in given):
         found.append(
             (("finger", "hand_mass_kg"), hand.hand_mass_kg,
-             "mass, damping and stiffness of the hand belong together", "give all three or none")
+             "hand mass, damping and stiffness are not given together", "give all three or none")
         )  # fmt: skip
     if hand.tremor_frequency_hz <= 0.5 * hand.tremor_width_hz:
         found.append(
             (("finger", "tremor_width_hz"), hand.tremor_width_hz,
-             "makes the band begin below 0 Hz", "give less than twice tremor_frequency_hz")
+             "makes the tremor band begin below 0 Hz",
+             "give less than twice finger.tremor_frequency_hz")
         )  # fmt: skip
     return found
