@@ -382,8 +382,8 @@ class Heartbeat:
 
     def beat(self) -> None:
         if self._fd is not None and self._starting <= 0:
-            # If the pipe is full, the launcher has enough bytes to read.  If it has ended, its
-            # lifeline (see `run_until_signal`) ends this process.
+            # A full pipe contains enough heartbeats.  If the launcher has ended, so will this
+            # process: its lifeline (a pipe to the launcher) is then closed.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
@@ -420,7 +420,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 async def run_until_signal(config: ProcessConfig) -> None:
     """Run the nodes of a process until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    # If the launcher ends, its lifeline and the kernel each send a signal; ignore the second one.
+    # If the launcher ends, the lifeline's thread and the kernel each send a signal.
     with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
         await run_nodes(config, stop)
 
