@@ -57,8 +57,7 @@ RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
 MAX_LOG_ROWS = 20_000
 RESEND_NS = 5_000_000_000
-"""Time after a node's start in which each status contains the full log of handler calls, so that
-a recorder that starts late receives all of it."""
+"""Time after the start in which each status contains the full execution log, for late recorders."""
 
 
 class NodeParameters(LimitedModel):
@@ -379,10 +378,7 @@ class Node:
         if change.node != self.name:
             return
         if change.parameter not in self.live_parameters:
-            raise ValueError(
-                f'parameter "{change.parameter}" cannot change while the node runs; change it in '
-                "the launch file"
-            )
+            raise ValueError(f'parameter "{change.parameter}" cannot change while the node runs')
         value = json.loads(change.value)
         kind = type(self.parameters)
         self.parameters = kind.model_validate({**dict(self.parameters), change.parameter: value})
@@ -485,9 +481,7 @@ class Mailbox:
             if self._overflow_is_error:
                 self._node.report_error(
                     f"on_{self._port}",
-                    OverflowError(
-                        f"queue of {self._capacity} messages overflowed, the oldest one is lost"
-                    ),
+                    OverflowError(f"queue of {self._capacity} messages overflowed, one is lost"),
                 )
         self._waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():

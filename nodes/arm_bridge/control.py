@@ -347,10 +347,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm as the operator commands; return why arming is refused, or None.
-
-        age_s: age of the command.
-        """
+        """Arm or disarm the arm by a command of this age; return why arming is refused, or None."""
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
             return None
@@ -403,11 +400,7 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the interlock that forbids motion, or None.
-
-        other: state of the other arm; None if it is silent.  An operator's command to disarm is not
-        an interlock.
-        """
+        """Return the interlock that forbids motion, or None; other: None if that arm is silent."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if self.faults:
@@ -489,10 +482,7 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """Stop because the other arm is not armed.
-
-        Before a motion has started, stay armed for MAX_WAIT_FOR_OTHER_S to wait for the other arm.
-        """
+        """Stop because the other arm is not armed; before a motion, wait for it for a moment."""
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
         if not self.auto_arming and (has_started or self._waited_s > MAX_WAIT_FOR_OTHER_S):
@@ -699,19 +689,13 @@ class ArmControl:
         return self._command_joints(goal_rad, geometry, other, step_s)
 
     def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        """Return the present limits of the sheet.
-
-        During an alignment they are widened so that its start is within them.
-        """
+        """Return the present limits of the sheet, which are wider during an alignment."""
         return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
     def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Move towards joints (6,) rad within the limiter's bounds.
-
-        Latch a fault instead if the step would violate a limit of flange or sheet.
-        """
+        """Move towards joints (6,) rad within speed limits; latch a fault for an unsafe sheet."""
         velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)

@@ -92,10 +92,7 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return points (4, 3), m, in the base frame, whose speed is limited as the tool speed.
-
-        They are the centre and both ends of the clamped edge, and the flange.
-        """
+        """Return centre and ends of the clamped edge, and the flange (4, 3), m, base frame."""
         return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:

@@ -41,8 +41,7 @@ WAIT_FROM_RAD = 0.12
 """Lead at which the leading arm waits; the limiter stops both arms at 0.2 rad."""
 
 MAX_PREDICTION_S = 0.15
-"""Maximum time by which a target may lie in the future: the horizon of fingertip predictions and a
-margin."""
+"""Maximum time by which a target may lie in the future: the prediction horizon and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
 """Maximum duration of a trajectory, for which an arm moves without a new message."""

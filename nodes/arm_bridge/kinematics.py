@@ -42,8 +42,8 @@ WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0)
 """|J5| up to which `solve_next_joints` keeps J4 constant, and from which it solves J4 exactly."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""Distances of the wrist centre from J1's axis, up to which J1 is kept, and from which it is exact.
-"""
+"""Distance of the wrist centre from J1's axis up to which `solve_next_joints` keeps J1 constant,
+and from which it solves J1 exactly."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
 """Maximum error between both bounds, as a multiple of the first bound: 1.05 degrees or 1 mm."""
@@ -54,8 +54,7 @@ per second it is half the maximum speed of these joints."""
 
 _ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
 ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
-"""Angle of J3 (29.4 degrees) at which shoulder, elbow and wrist centre are in line.  It is 30
-degrees out of the range of J3."""
+"""J3 with shoulder, elbow and wrist centre in line: 29.4 degrees, 30 degrees out of its range."""
 
 _LOWEST = tuple(float(angle) for angle in JOINT_MIN_RAD)
 _HIGHEST = tuple(float(angle) for angle in JOINT_MAX_RAD)
@@ -282,10 +281,9 @@ def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
 
 
 def _bend(out: float, height: float) -> float | None:
-    """Return the angle (0..pi) between the upper arm and the line from elbow to wrist centre.
+    """Return the angle (0..pi) between upper arm and elbow-wrist line, or None if out of reach.
 
     out, height: position of the wrist centre in the arm's plane, relative to the shoulder, m.
-    The result is None if it is out of reach.
     """
     cosine = (out * out + height * height - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
         2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
@@ -340,10 +338,7 @@ def _wrap(angle: float) -> float:
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Add revolutions to an angle so that it is in [low, high] and nearest to `near`.
-
-    The result is infinite if that is not possible.
-    """
+    """Return the angle plus revolutions, in [low, high] and nearest to `near`; infinite if none."""
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
         if low <= rotated <= high and abs(rotated - near) < abs(best - near):

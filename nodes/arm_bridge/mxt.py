@@ -131,10 +131,7 @@ def encode_pose(joints_rad: Floats) -> bytes:
 
 
 def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
-    """Return the controller's structure flags for joints: right, above and nonflip.
-
-    The range of J3 permits only "above".
-    """
+    """Return the structure flags of joints: right, above (always, by the range of J3), nonflip."""
     wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]
     ahead = wrist[0] * math.cos(joints_rad[0]) + wrist[1] * math.sin(joints_rad[0])
     shoulder = FLAG_RIGHT if ahead >= 0.0 else 0

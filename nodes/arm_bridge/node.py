@@ -107,10 +107,7 @@ class ArmBridge(Node):
         self._target_period = MeasuredPeriod(target_period_s)
 
     def _measure_target_period(self, source_ns: int) -> None:
-        """Measure the targets' period, in case the camera has another rate than in the scene.
-
-        A period that is given as a parameter is kept.
-        """
+        """Measure the targets' period, unless it is a parameter; cameras may have other rates."""
         if self.parameters.target_period_s is not None:
             return
         period_s = self._target_period.add(source_ns)

@@ -19,8 +19,7 @@ MAX_FUTURE_S = 0.02
 smaller.  Without this limit, such a state would count as fresh until that time."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
-"""Maximum time between the camera exposures from which two targets with overlapping trajectories
-were computed."""
+"""Maximum time between the camera exposures of two targets with overlapping trajectories."""
 
 MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
 """Maximum time from the camera exposure of a target to the end of its trajectory."""

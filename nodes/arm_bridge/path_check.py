@@ -129,8 +129,8 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 class Alignment:
     """Straight motion of an arm's joints from its position onto the sheet's path.
 
-    It is necessary after a fault, when the arms may have stopped with a twisted or skewed sheet, or
-    at the end of a joint's range.  Their joints may then correspond to no pose of a flat sheet.
+    It is necessary after a fault.  The arms may then have stopped with a twisted or skewed sheet,
+    or at the end of a joint's range, so that their joints correspond to no pose of a flat sheet.
 
     sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joints (6,) at start and end.

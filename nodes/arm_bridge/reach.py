@@ -74,8 +74,7 @@ SPEED_STEP_S = 1e-4
 """Time step of the central differences that give joint speeds."""
 
 MAX_STEP_RAD = 0.05
-"""Maximum change of a joint between two samples of a path.  If a finer sampling does not get below
-it, the joints jump."""
+"""Maximum change of a joint between two samples of a path; at a jump, any sampling exceeds it."""
 
 MIN_FRACTION = 1e-6
 
@@ -90,8 +89,7 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""Offsets of detours in the world, m, in the order of trial; the first ones are towards the user.
-"""
+"""Offsets of detours in the world, m, in the order of trial; those towards the user are first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,10 +267,7 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return the points of the tool whose speed is limited, (n, 4, 3) m in the world.
-
-    They are the centre and both ends of the clamped edge, and the flange.
-    """
+    """Return world points (n, 4, 3), m: centre and ends of the clamped edge, and the flange."""
     half = 0.5 * geometry.sheet_limits.height_m
     edge = apply(
         geometry.flange_from_edge, np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]])
@@ -290,10 +285,9 @@ def _joint_rates(
     angular: Floats,
     centre: Floats,
 ) -> Floats:
-    """Return joint speeds (n, 6) for a motion of the sheet.
+    """Return joint speeds (n, 6), as central differences of the inverse kinematics.
 
-    They are central differences of the inverse kinematics.
-    linear, angular: velocities (n, 3) of the sheet at its centre, centre (n, 3).
+    linear, angular: velocities (n, 3) of the sheet at its centre (n, 3).
     """
     found = []
     for time_s in (-SPEED_STEP_S, SPEED_STEP_S):
@@ -308,10 +302,7 @@ def _joint_rates(
 
 
 def _small_rotations(vectors: Floats) -> Floats:
-    """Return rotation matrices (n, 3, 3) of rotation vectors (n, 3) shorter than a milliradian.
-
-    They are accurate to second order.
-    """
+    """Return matrices (n, 3, 3) of rotation vectors (n, 3) below 1 mrad, to second order."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
     cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
@@ -346,8 +337,7 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """A path that the arms cannot follow; the text names arm, limit and position.
 
-    limit: the violated one of `LIMITS`, "jump" or "alignment".
-    fraction: position on the straight path, from 0 to 1.
+    limit: one of `LIMITS`, "jump" or "alignment".  fraction: position on the straight path, 0..1.
     """
 
     code = "path"
@@ -475,10 +465,7 @@ def _explain_jump(
     *,
     fraction: float,
 ) -> PathError:
-    """Return the error for an arm whose joints would jump to reach the next pose.
-
-    before_rad: joints (6,) at the previous pose.
-    """
+    """Return the error for joints that would jump from `before_rad` (6,) to reach the next pose."""
     reach = compute_reach(arm, other, _make_poses([there]), find_branch(before_rad))
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]

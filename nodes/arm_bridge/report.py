@@ -44,10 +44,7 @@ class LatencyMean:
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add an exchange, of which the first one with each target counts.
-
-        Return the mean latency (s) once per REPORTED_TARGETS targets, otherwise None.
-        """
+        """Add the first exchange with a target; return the mean (s) once per REPORTED_TARGETS."""
         target, before = exchange.target, self._target
         self._target = target
         if target is None or target is before or lag.estimate is None:

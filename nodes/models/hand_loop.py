@@ -1,9 +1,9 @@
 """Predict whether a hand that touches the sheet is stable, from the sampled closed loop.
 
 A finger pushes into the sheet.  The planner moves the sheet along its normal by `slope` times the
-measured depth: away from the finger (a retreat: slope > 0, a softer object) or towards it (an
-advance: slope < 0, a stiffer object).  The camera measures the depth once per period T, and the
-sheet follows after a delay, so its motion can add energy to the hand.  The hand has the mass m,
+measured depth.  If slope > 0, it moves away from the finger (a retreat, for soft objects).  If
+slope < 0, it moves towards the finger (an advance, for stiff ones).  The camera measures the depth
+once per period T.  The sheet follows after a delay, so it can add energy.  The hand has the mass m,
 damping b and stiffness k, the sheet the stiffness ks.  With the depth x and the sheet's offset s:
 
     m x'' + b x' + k x + ks (x - s) = 0
@@ -232,8 +232,8 @@ def compute_offset_bounds(
     """Compute the maximum slopes at which every hand is stable with margins of gain and delay.
 
     For an advance, the gain margin divides the critical slope.  For a retreat, it multiplies the
-    sheet's stiffness instead, because a slope is at most 1: the sheet never retreats by more than
-    the finger moves.
+    sheet's stiffness instead, because a slope cannot exceed 1.  The sheet never retreats by more
+    than the finger moves.
     """
     shape = len(DELAYS_S), len(FILTERS_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)

@@ -30,10 +30,7 @@ class ResidualMonitor:
     def __init__(
         self, components: int, *, threshold: float, memory_s: float = 1.5, confirm_s: float = 1.5
     ) -> None:
-        """Set the rule.
-
-        memory_s: time constant of the mean.  confirm_s: time above the threshold for a suspicion.
-        """
+        """Set the mean's time constant, `memory_s`, and the time to a suspicion, `confirm_s`."""
         self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
         self._memory_s, self._confirm_s = memory_s, confirm_s
         self._weight_s, self._above_s = 0.0, 0.0

@@ -156,10 +156,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return a body's pose after it has moved for `duration_s` with a constant twist.
-
-    The twist's linear part is the velocity of the body's origin.
-    """
+    """Return a body's pose after `duration_s` with a constant twist (velocity of its origin)."""
     rotation = rotation_from_vector(twist_world[3:] * duration_s) @ world_from_body[:3, :3]
     return transform(rotation, world_from_body[:3, 3] + twist_world[:3] * duration_s)
 

@@ -1,10 +1,10 @@
 """Estimate the lag of an arm behind its commands from commanded and measured joints.
 
 The measured joints are compared with the commanded ones at each lag of a grid.  The estimate is the
-lag at which the variance of the difference is smallest, which is the maximum-likelihood estimate
-for white noise (Knapp and Carter, The generalized correlation method for estimation of time delay,
-1976).  The weight of old samples decays exponentially.  A constant difference, by gravity or an
-encoder offset, has no influence.  Motion at constant velocity therefore gives no information.
+lag at which the variance of the difference is smallest.  For white noise, this is the
+maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for estimation of
+time delay, 1976).  The weight of old samples decays exponentially.  A constant difference, by
+gravity or an encoder offset, has no influence, so constant velocity gives no information.
 """
 
 from __future__ import annotations
@@ -30,15 +30,14 @@ MIN_SPEED_RAD_PER_S = 0.01
 """Standard deviation of the joints' speed below which the arm moves too little for an estimate."""
 
 MAX_MISFIT_RATIO = 0.05
-"""Unexplained fraction of the motion's variance above which there is no estimate, since the arm
-does not move, moves differently from its commands, or has joints with reversed signs."""
+"""Unexplained fraction of the motion's variance above which there is no estimate.  The arm then
+does not move as commanded, or its joints have reversed signs."""
 
 CORRELATION_S = 0.1
 """Time over which errors of the difference are correlated, so that they count as one sample."""
 
 MIN_NOISE_RATIO = 0.2
-"""Minimum fraction of the difference's variance that counts as noise, since the model of the servo
-is not exact."""
+"""Minimum fraction of the difference's variance that is noise, since the servo model is inexact."""
 
 MAX_UNCERTAINTY_S = 0.004
 """Standard deviation of an estimate above which it is not used."""
@@ -51,8 +50,7 @@ MIN_COMMANDS = 4
 """Number of stored commands, and minimum number with which a measurement is compared."""
 
 MIN_STEP_S = 0.02
-"""Minimum time between two measurements in use.  More would cost processor time without new
-information."""
+"""Minimum time between two used measurements; more would add computation, but no information."""
 
 MAX_JOINT_RAD = 10.0
 """Maximum angle of a joint; larger ones are errors."""

@@ -58,8 +58,8 @@ FORCE_JND_FLOOR_N = 0.05
 first 2 mm of an object of 4 kPa, have relative errors of at least a tenth."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""Forces of the contact (the larger of the object's and the sheet's) up to which the sheet does not
-advance, and from which it advances fully."""
+"""Contact forces up to which the sheet does not advance, and from which it advances fully.  The
+contact force is the larger one of object and sheet."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
 """Depths up to which the sheet does not advance, and from which it advances fully.  A smaller depth
@@ -113,9 +113,7 @@ class ObjectCurve:
                 "forces as depths, two or more"
             )
         if not (np.isfinite(depths).all() and np.isfinite(forces).all()):
-            raise UnfitCurveError(
-                "force curve: a depth or force is NaN or infinite; give finite numbers"
-            )
+            raise UnfitCurveError("force curve: a depth or force is not finite")
         if depths[0] != 0.0 or forces[0] != 0.0:
             raise UnfitCurveError(
                 f"force curve: the first row is {depths[0]:g} m, {forces[0]:g} N; it must be 0, 0"
@@ -314,10 +312,7 @@ def _indentation_for_edge_force(
     position_m: SheetPosition,
     finger_radius_m: float,
 ) -> float:
-    """Return the indentation (m) at which the force on each clamp reaches `edge_force_n`.
-
-    The result is 0 if the sheet without a push already exceeds the force.
-    """
+    """Return the indentation (m) with this force on each clamp; 0 if the flat sheet exceeds it."""
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, stretch_ratio)
     if flat >= edge_force_n:
@@ -388,10 +383,9 @@ class Compliance:
     def normal_offset_m(
         self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
     ) -> Floats:
-        """Return the sheet's distance (n,) behind the object's tangent plane, m.
+        """Return the sheet's distance (n,), m, behind the object's tangent plane; < 0 in front.
 
-        It is negative in front of the plane, and 0 without contact.  It is smooth (C1) over the
-        depth and continuous over the position.
+        It is 0 without contact, smooth (C1) over the depth and continuous over the position.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, position_m)
@@ -446,10 +440,7 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) for interpolation at a coordinate between grid points `nodes` (n,).
-
-    The weights are linear in the square of the coordinate, and constant beyond the last point.
-    """
+    """Return weights (n,) for interpolation, linear in the squared coordinate, between `nodes`."""
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -631,13 +622,9 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     note = ""
     if desired < least:
-        note = (
-            f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's minimum, "
-            f"{rendered:.0f} N/m"
-        )
+        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet, {rendered:.0f} N/m"
     elif desired > largest:
         note = (
-            f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's maximum, "
-            f"{rendered:.0f} N/m"
+            f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet, {rendered:.0f} N/m"
         )
     return StretchChoice(stretch, note)

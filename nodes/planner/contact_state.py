@@ -48,8 +48,7 @@ MAX_TILT_RAD = 1.4
 the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
-"""Minimum height of the object's rim around the contact that is reported; the elastic sheet
-compensates for smaller ones."""
+"""Minimum reported height of the object's rim around the contact; the sheet yields to less."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,4 @@
-"""Cache the bounds on the offset's slope for a camera's rate; their computation takes seconds.
-
-`nodes.models.hand_loop` defines the bounds.
-"""
+"""Cache the bounds of `nodes.models.hand_loop` for a camera's rate; computing them is slow."""
 
 from __future__ import annotations
 

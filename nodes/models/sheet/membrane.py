@@ -348,10 +348,7 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """Contact of the sheet's nodes with the fingertip: a penalty on nodes inside it.
-
-    Nodes that already stick to the fingertip are fixed and have no penalty.
-    """
+    """Penalty contact of nodes inside the fingertip; nodes that stick to it have no penalty."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -370,9 +367,7 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the penalty's gradient (nodes, 3), and the positive part of its second derivative
-        (nodes, 3, 3).
-        """
+        """Return gradient (nodes, 3) and positive part of the Hessian (nodes, 3, 3) of `energy`."""
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
