@@ -33,10 +33,10 @@ class NodeRole(StrEnum):
 
 
 class OmissionReason(StrEnum):
-    """Reason why the node of a launch file is not started.
+    """Reason why a node of a launch file is not started.
 
     rigid_object: the scene's object has no material. no_image: the scene has no projector.
-    no_reader: no node reads its topics. no_writer: the nodes that write its inputs are left out.
+    no_reader: no node reads its topics. no_writer: the nodes that write its inputs are omitted.
     """
 
     RIGID_OBJECT = "rigid_object"
@@ -62,14 +62,14 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """The node name is not in the table; the message suggests a similar one."""
+    """A node type that is not in `NODES`; the message suggests a similar one."""
 
     code = "unknown-node"
     remedy = "`flexsheet node types` prints all names."
 
 
 def node_class(name: str) -> type[Node]:
-    """Import the class of a node type: a name of the table, or "module:Class".
+    """Import the class of a node type, which is a name in `NODES` or "module:Class".
 
     Module names without the package, such as "nodes.planner.node" in old launch files and bags, are
     accepted. Raises UnknownNodeError for an unknown name, ImportError or AttributeError for a
@@ -84,5 +84,5 @@ def node_class(name: str) -> type[Node]:
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; known nodes: {', '.join(NODES)}"
-        raise UnknownNodeError(f'unknown node "{name}"{hint}')
+        raise UnknownNodeError(f'unknown node type "{name}"{hint}')
     return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]

@@ -8,7 +8,7 @@ MAX_NICE = 19
 
 
 def enter_background() -> None:
-    """Set the highest niceness and batch scheduling, so that other processes run first.
+    """Give this process the highest niceness and batch scheduling, so that others run first.
 
     A process of the batch class never preempts another one when it wakes up.
     """

@@ -1,7 +1,7 @@
-"""Cache results on disk: one file of arrays per result, written atomically and checked when read.
+"""Cache computed results on disk, in one file of arrays per result.
 
-A long computation stores checkpoints in a folder beside the file, and continues from them after an
-interruption.
+Files are written atomically and checked when they are read.  A long computation stores checkpoints
+in a folder beside the file, and continues from them after an interruption.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ Arrays = Mapping[str, NDArray[Any]]
 T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""Exceptions that reading a truncated, modified or foreign file can raise."""
+"""Exceptions that can occur when a truncated, modified or foreign file is read."""
 
 CACHED_S = 1.0
-"""Steps that finish within this time after the start were cached; the estimate excludes them."""
+"""Time after the start in which finished steps count as cached; the estimate excludes them."""
 MINUTE_S = 60.0
 
 
@@ -47,8 +47,8 @@ def make_digest(value: object) -> str:
 class Specification(Generic[T]):
     """Key of a cached result, and its conversion to arrays and back.
 
-    kind: first part of the file name. depends_on: JSON value of all inputs, with the version of the
-    code that computes the result. decode: raises one of `DAMAGE` for invalid arrays.
+    kind: first part of the file name. depends_on: JSON value of all inputs, including the version
+    of the code that computes the result. decode: raises one of `DAMAGE` for invalid arrays.
     """
 
     kind: str
@@ -57,18 +57,18 @@ class Specification(Generic[T]):
     decode: Callable[[dict[str, NDArray[Any]]], T]
 
     def path(self, cache_dir: Path | None) -> Path:
-        """Return the file of the result. cache_dir: None for the user's cache."""
+        """Return the path of the result's file. cache_dir: None for the user's cache."""
         return (
             cache_dir or default_cache_dir()
         ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
 
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
-        """Return the store for the checkpoints of the computation."""
+        """Return the store for checkpoints of the computation of this result."""
         return CheckpointStore(self.path(cache_dir).with_suffix(".parts"))
 
 
 def cached(specification: Specification[T], cache_dir: Path | None, compute: Callable[[], T]) -> T:
-    """Return the cached result, or compute and store it, then delete its checkpoints.
+    """Return the cached result; if there is none, compute and store it, and delete checkpoints.
 
     Raises OSError if the result cannot be written, and the exceptions of `compute`.
     """
@@ -121,7 +121,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
 def warn_damaged(path: Path, error: Exception) -> None:
     """Log that a file is damaged and that its content is computed again."""
     structlog.get_logger().warning(
-        "damaged cache file, computing it again", path=str(path), error=repr(error)
+        "damaged cache file, its content is computed again", path=str(path), error=repr(error)
     )
 
 
@@ -155,16 +155,16 @@ def _remove_leftovers(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStore:
-    """Store for the finished parts of a computation, one file each in a folder."""
+    """Store for finished parts of a computation, each in one file of a folder."""
 
     folder: Path
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return a stored part; None if it does not exist or is damaged."""
+        """Return a stored part of the computation; None if it does not exist or is damaged."""
         return load_arrays(self._path(name))
 
     def save(self, name: str, arrays: Arrays) -> None:
-        """Store a part. Raises OSError if the file cannot be written."""
+        """Store a part of the computation. Raises OSError if the file cannot be written."""
         save_arrays(self._path(name), arrays)
 
     def get(
@@ -186,16 +186,16 @@ class CheckpointStore:
 
 
 class EtaEstimator:
-    """Estimator of the remaining time of a long computation, from its finished steps."""
+    """Estimator of a long computation's remaining time from its finished steps."""
 
     def __init__(self) -> None:
         self._total = self._last = self._cached = 0
         self._start_s = 0.0
 
     def text(self, done: int, total: int, now_s: float) -> str:
-        """Format the progress at the time now_s, such as "40 %, about 3 min left".
+        """Return the progress at the time now_s as text, such as "40 %, about 3 min left".
 
-        A different total, or fewer finished steps than before, starts a new estimate.
+        If `total` changes, or `done` decreases, a new estimate starts.
         """
         if total != self._total or done < self._last:
             self._total, self._start_s = total, now_s

@@ -14,7 +14,7 @@ import structlog
 LIMITED_LEVELS = {"warning", "error", "critical"}
 REPORT_PERIOD_S = 60.0
 MAX_DISTINCT = 1000
-"""Maximum number of distinct records to count; the least recent one is dropped."""
+"""Maximum number of distinct records that are counted; beyond it, the least recent is dropped."""
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _IGNORED_KEYS = {"exc_info", "count"}
@@ -25,7 +25,7 @@ Key = tuple[tuple[str, str], ...]
 
 @dataclass(slots=True)
 class Repeats:
-    """Number of repetitions of a record, and the time it was last logged, s."""
+    """Number of occurrences of a log record, and the time at which it was last logged, s."""
 
     count: int = 0
     logged_s: float = float("-inf")

@@ -1,6 +1,6 @@
-"""Define method families: interchangeable functions with one reference, for benchmarks.
+"""Define method families for benchmarks: interchangeable methods and a common reference.
 
-A node's folder contains its methods as plain functions and a `Family` of them. The module
+A node's folder contains its methods as plain functions, and their `Family`. The module
 `launch.methods.charts` plots the time of each method against its error over the scene's working
 range.
 """
@@ -17,23 +17,23 @@ import numpy as np
 from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
-"""Total time after which a trial is not repeated further, and minimum number of repetitions."""
+"""Time after which a trial is not repeated further, and minimum number of repetitions."""
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
-"""Conditions of a measurement by name: {"depth_mm": 10}."""
+"""Conditions of a measurement by name, for instance {"depth_mm": 10}."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """Measurement of one method at one case: `run` is timed, `error` evaluates its result.
 
-    error: takes the result of `run`, returns the error in the family's unit.
+    error: function from the result of `run` to the error in the family's unit.
     in_range: whether the method's valid range includes the case.
     in_scene: whether the scene's working range includes the case.
-    size: size of the method's problem ({"skin_nodes": 1210}), reported with the case.
-    extra_metrics: computes further figures of the result of `run`, with units in their names.
-    reference_uncertainty: uncertainty of the reference for "error" and for extra metrics.
+    size: size of the solved problem ({"skin_nodes": 1210}), reported with the case.
+    extra_metrics: function from the result of `run` to further figures, with units in their names.
+    reference_uncertainty: uncertainty of the reference by figure: "error" or an extra metric.
     """
 
     method: str
@@ -48,18 +48,18 @@ class Trial:
 
 
 def prepare_nothing(scene: Scene, on_progress: Progress) -> None:
-    """Do nothing: default of `Family.prepare`."""
+    """Do nothing; this is the default of `Family.prepare`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """Set of interchangeable methods.
+    """Set of interchangeable methods whose errors are measured against one reference.
 
-    trials: yields the trials of every method over a scene's working range; each must be run before
-        the next one is requested.
-    tolerance: returns the scene's tolerance, in `unit`.
-    sweep_key: key of the case for a separate plot of the errors; None for no such plot.
-    prepare: computes and caches the data that `trials` uses; reports done and total steps.
+    trials: function that yields the trials of all methods over a scene's working range; each must
+        be run before the next one is requested.
+    tolerance: function that returns the scene's tolerance for the error, in `unit`.
+    sweep_key: key of the case over which errors are plotted separately; None: no such plot.
+    prepare: function that computes and caches the data for `trials`; it reports its progress.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Family:
 class Point:
     """Measured time and error of one method at one case; see `Trial`.
 
-    params: the case with the size of the method's problem.
+    params: the case and the size of the solved problem.
     """
 
     method: str
@@ -119,14 +119,14 @@ def measure(trial: Trial, *, repeats: int) -> Point:
 
 
 def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values below the end of a working range, and that end."""
+    """Return those values that are below the end of a working range, followed by the end."""
     return (*(value for value in values if value < end * (1.0 - 1e-6)), end)
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
-    """Return the methods that no other method dominates in at least one case of their range.
+    """Return the methods that are Pareto-optimal in at least one case of their valid range.
 
-    Methods are compared at equal cases only, and sorted by the maximum of their median times.
+    They are sorted by the maximum of their median times.
     """
     usable = [point for point in points if point.in_range]
     front = {
@@ -138,7 +138,7 @@ def pareto_front(points: Sequence[Point]) -> list[str]:
 
 
 def dominates(one: Point, other: Point) -> bool:
-    """Return whether a method is at least as fast and exact as another, and not equal to it."""
+    """Return whether `one` is at least as fast and accurate as `other`, and not equal to it."""
     return (
         one.median_s <= other.median_s
         and one.error <= other.error

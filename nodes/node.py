@@ -13,7 +13,7 @@
 A node does not use sockets.  Its arguments are parameters, a clock and a function that sends
 messages.  The same class therefore runs live (`nodes.runner`), in replay and in a unit test.
 Handlers are functions or coroutines.  Only one call of a coroutine handler runs at a time.  On a
-`latest` topic it skips messages that were superseded during its last call.
+topic with the delivery `latest`, it skips messages that were superseded during its last call.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
 MAX_LOG_ROWS = 20_000
 RESEND_NS = 5_000_000_000
-"""Time after the start in which each status contains the full log, for late recorders."""
+"""Time after the start in which each status contains the full execution log, for late recorders."""
 
 
 class NodeParameters(LimitedModel):
-    """Base class of a node's parameters, which subclasses declare as fields with defaults."""
+    """Base class for a node's parameters; subclasses declare them as fields with defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(slots=True)
 class PortCounts:
-    """Counters of a port, for the status message."""
+    """Counters of one input or output, which the status message reports."""
 
     messages: int = 0
     dropped: int = 0
@@ -103,9 +103,9 @@ class PortCounts:
 
 
 class ExecutionLog:
-    """Log of a node's handler calls in order, for a replay.
+    """Log of the order of a node's handler calls, with which a replay repeats them.
 
-    Rows are those of `flexsheet.messages.types.Status.execution_log`.
+    `flexsheet.messages.types.Status.execution_log` describes the rows.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -120,7 +120,7 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the rows (n, 4); delete them if RESEND_NS have passed since the start."""
+        """Return the rows (n, 4), and delete them if RESEND_NS have passed since the start."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
@@ -128,9 +128,10 @@ class ExecutionLog:
 
 
 class Input(Generic[M]):
-    """Latest message of a subscribed topic, with its header and counters.
+    """Subscribed topic with its latest message, header and counters.
 
-    All stamps are of this host's clock. clock_problem: the reason why they are not reliable, or "".
+    All timestamps are converted to this host's clock.
+    clock_problem: why the conversion is not reliable, or "".
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -144,9 +145,9 @@ class Input(Generic[M]):
         self._clock = clock
 
     def age_s(self) -> float:
-        """Return the time since the source stamp of the latest message; infinite before it.
+        """Return the time since the source timestamp of the latest message; infinite before it.
 
-        If the offset of the sender's clock is unknown, the age since the reception is returned.
+        If the offset of the sender's clock is unknown, return the time since the reception instead.
         """
         if self.header is None:
             return float("inf")
@@ -161,7 +162,7 @@ class Input(Generic[M]):
 
 
 class Output(Generic[M]):
-    """Publisher of a topic that numbers and stamps its messages."""
+    """Publisher of a topic, which adds sequence numbers and timestamps to the messages."""
 
     def __init__(
         self, topic: Topic, clock: Clock, send: Send, *, writer: str, epoch: int, plan: str
@@ -172,7 +173,7 @@ class Output(Generic[M]):
         self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
-        """Publish a message; source_ns: stamp of its source (default: now)."""
+        """Publish a message; source_ns: time of the measurement it follows from (default: now)."""
         now_ns = self._clock.now_ns()
         header = Header(
             sequence=self.counts.messages + 1,
@@ -190,7 +191,7 @@ class Output(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """Declared input or output of a node class."""
+    """Input or output that a node class declares; direction: "input" or "output"."""
 
     name: str
     direction: str
@@ -199,14 +200,14 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """Periodic method; rate_parameter: name of the parameter with its rate, Hz."""
+    """Method that is called periodically; rate_parameter: node parameter with the rate, Hz."""
 
     method: str
     rate_parameter: str
 
 
 def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate a method that is called at the rate (Hz) of the named parameter."""
+    """Mark a node's method to be called periodically, at the rate (Hz) in the named parameter."""
 
     def mark(method: Callable[..., Any]) -> Callable[..., Any]:
         method.__periodic__ = rate_parameter  # type: ignore[attr-defined]  # a function attribute
@@ -231,17 +232,17 @@ def find_ports(node_class: type[Node]) -> dict[str, Port]:
 
 
 def further_port(topic_name: str) -> str:
-    """Return the port name of a topic that `Node.further_inputs` returned."""
+    """Return the port name for a topic that `Node.further_inputs` has returned."""
     return f"in/{topic_name}"
 
 
 def find_parameters_type(node_class: type[Node]) -> type[NodeParameters]:
-    """Return the declared type of a node class's `parameters`."""
+    """Return the parameter class that a node class declares as the type of `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
 def find_role(node_class: type[Node]) -> NodeRole | None:
-    """Return the declared role of a node class; ARM_BRIDGE for one that publishes ArmState."""
+    """Return the role that a node class declares; by default ARM_BRIDGE if it writes ArmState."""
     publishes = {
         port.message for port in find_ports(node_class).values() if port.direction == "output"
     }
@@ -260,39 +261,39 @@ def find_timers(node_class: type[Node]) -> list[Timer]:
 
 
 class Node:
-    """Base class of all nodes; see the module's docstring."""
+    """Base class of all nodes; the module's docstring shows how to write one."""
 
     parameters: NodeParameters
     status: Output[Status]
 
     takes_frames: ClassVar[bool] = False
-    """Whether `deliver` is called with the undecoded frames of each message."""
+    """Whether `deliver` receives each message as raw frames that are not decoded."""
     measures_clocks: ClassVar[bool] = False
-    """Whether stamps of other hosts are not converted to this host's clock."""
+    """Whether timestamps of other hosts stay unconverted, since the node measures their clocks."""
     role: ClassVar[NodeRole | None] = None
     optional_inputs: ClassVar[frozenset[str]] = frozenset()
-    """Ports that stay unconnected in a graph in which no node writes their topic."""
+    """Ports that may stay unconnected if no node of the graph writes their topic."""
     live_parameters: ClassVar[frozenset[str]] = frozenset()
     """Parameters that may change while the node runs, because each use reads them from
     `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
     on_demand: ClassVar[bool] = False
-    """Whether it is left out of a graph in which no node reads its topics."""
+    """Whether the node is left out of a graph in which no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
-    """Whether it opens devices, ports or files, so that a replay must not start it."""
+    """Whether the node opens devices, ports or files, so that a replay must not start it."""
 
     async def settle(self) -> None:
         """Wait for the work that handlers have started; a replay awaits it after each step."""
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        """Return why `bag verify` cannot replay a node with these parameters; "" if it can."""
+        """Return why `flexsheet bag verify` cannot replay the node; "" if it can."""
         if cls.opens_devices:
             return "it reads devices, whose data are not in the bag"
         return ""
 
     @classmethod
     def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
-        """Return why a graph with this scene does not need the node; None if it may."""
+        """Return why a graph with this scene can omit the node; None if it may need the node."""
         return None
 
     @classmethod
@@ -322,8 +323,8 @@ class Node:
     ) -> None:
         """Connect the ports to topics.
 
-        topics: topic names by port, if they differ: {"arm": "arm_left"}.
-        epoch: identifier of one start of the node; default: the time of the start.
+        topics: topic names by port, where they differ from the port's name: {"arm": "arm_left"}.
+        epoch: number that identifies one start of the node; default: the time of the start, ns.
         Raises TypeError for a topic of another message type.
         """
         self.parameters = parameters
@@ -373,7 +374,7 @@ class Node:
         }
 
     def on_parameter(self, change: ParameterChange, _: Header) -> None:
-        """Change a parameter while the node runs.  Raises ValueError for one that is fixed."""
+        """Change a parameter while the node runs; raises ValueError if it is not live."""
         if change.node != self.name:
             return
         if change.parameter not in self.live_parameters:
@@ -417,14 +418,14 @@ class Node:
         return self.clock_table.localize(message, header, self.clock.now_ns())
 
     async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
-        """Pass a message with stamps of this clock to its input, and await its handler."""
+        """Pass a message with timestamps of this host's clock to its input; await its handler."""
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or timer; an exception is counted, logged and reported in the status."""
+        """Call a handler or timer; count, log and report its exception, if any.  what: its name."""
         try:
             result = function(*arguments)
             if inspect.isawaitable(result):
@@ -437,7 +438,7 @@ class Node:
         return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
-        """Call a periodic method and log the call."""
+        """Call a periodic method, and add the call to the execution log.  number: its index."""
         if not self.opens_devices:
             self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
@@ -449,7 +450,7 @@ class Node:
         self.log.error("handler failed", what=what, error=str(error), exc_info=error)
 
     def is_superseded(self, port: str) -> bool:
-        """Return whether a newer message waits for a port's coroutine handler; thread-safe."""
+        """Return whether a newer message waits for a port's coroutine handler (thread-safe)."""
         return self._mailboxes[port].has_waiting
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
@@ -462,7 +463,7 @@ class Node:
 
 
 class Mailbox:
-    """Queue of messages for a coroutine handler: the latest one, or a bounded number."""
+    """Queue of messages for a coroutine handler; it keeps the latest, or a bounded number."""
 
     def __init__(self, node: Node, port: str) -> None:
         self._node, self._port = node, port
@@ -479,7 +480,8 @@ class Mailbox:
             self._input.counts.dropped += 1
             if self._overflow_is_error:
                 self._node.report_error(
-                    f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
+                    f"on_{self._port}",
+                    OverflowError(f"queue of {self._capacity} messages overflowed, one is lost"),
                 )
         self._waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():

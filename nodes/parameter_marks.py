@@ -1,4 +1,4 @@
-"""Define annotated types of node parameters, by which the launcher identifies their use."""
+"""Define annotated types for node parameters, which tell the launcher what a value is used for."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """Use of a parameter's value."""
+    """Mark of a node parameter that tells the launcher what the value is used for."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"
@@ -33,25 +33,25 @@ DevicePort = Annotated[int, Field(ge=1, le=65535), ParameterMark.DEVICE_PORT]
 """TCP port of the device."""
 
 DeviceFile = Annotated[str, ParameterMark.DEVICE_FILE]
-"""Path of a device file, or the URL of a stream; the doctor checks that a path exists."""
+"""Path of a device file, or URL of a stream; `flexsheet doctor` checks that a path exists."""
 
 CameraCalibrationFile = Annotated[Path, ParameterMark.CAMERA_CALIBRATION]
-"""Stereo calibration file; the launcher checks it against the scene."""
+"""File with a stereo calibration; the launcher checks it against the scene."""
 
 SheetCalibrationFile = Annotated[Path, ParameterMark.SHEET_CALIBRATION]
-"""Sheet calibration file; the launcher checks it against the scene."""
+"""File with a sheet calibration; the launcher checks it against the scene."""
 
 MarkerCalibrationFile = Annotated[Path, ParameterMark.MARKER_CALIBRATION]
-"""Marker calibration file; the launcher checks it against the scene."""
+"""File with a marker calibration; the launcher checks it against the scene."""
 
 ParameterKey = tuple[str | int, ...]
-"""Path of a value in the parameters: ("source", "left")."""
+"""Path of a value in the parameters, for instance ("source", "left")."""
 
 
 def find_marked(parameters: BaseModel, mark: ParameterMark) -> dict[ParameterKey, Any]:
-    """Return the values of the marked parameters by key, except None.
+    """Return the values of all parameters with this mark, by key; None values are omitted.
 
-    Nested models, unions and sequences are included.
+    Parameters in nested models, unions and sequences are included.
     """
     return {key: value for key, value in _search_fields(parameters, (), mark) if value is not None}
 

@@ -1,8 +1,8 @@
 """Run nodes live: connect their ports, run their timers and publish their status.
 
 The launcher writes a `ProcessConfig` to a file and starts a process with it, which runs one or
-several nodes in one loop.  Nodes of one process exchange messages without serialization.  If one of
-them fails, the process ends.  A test can call `run_node` in its own loop.
+several nodes in one event loop.  Nodes of one process exchange messages without serialization.  If
+one of them fails, the process ends.  A test can call `run_node` in its own loop.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ KEYS_PERIOD_S = 1.0
 
 
 class PortConfig(BaseModel):
-    """Port of a node, its topic and its endpoints.
+    """Connection of a node's port to a topic.
 
     endpoints: ZeroMQ endpoints; those of an input can name the expected writer.
     """
@@ -59,9 +59,9 @@ class PortConfig(BaseModel):
 class NodeConfig(BaseModel):
     """Configuration of one node.
 
-    keys_file: file of a `KeyRing`; None for no encryption.
-    estop_resetters: writers that may reset an e-stop; None for all.
-    clocks: topic with the offsets of other hosts' clocks; None for a single host.
+    keys_file: file with the encryption keys, a `KeyRing`; None: no encryption.
+    estop_resetters: writers that may reset an e-stop or enable the arms; None: all.
+    clocks: connection to the topic with the offsets of other hosts' clocks; None: a single host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -81,7 +81,7 @@ class NodeConfig(BaseModel):
 class ProcessConfig(BaseModel):
     """Configuration of a process with its nodes.
 
-    ready_fd: pipe to the launcher; None without a launcher.
+    ready_fd: file descriptor of a pipe to the launcher; None without a launcher.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -92,9 +92,9 @@ class ProcessConfig(BaseModel):
 
 
 class NodeTransport:
-    """Sockets of one node, by topic (outputs) and by port (inputs).
+    """Sockets of one node's inputs and outputs.
 
-    local: bus of a process with several nodes.
+    local: bus between the nodes of one process; None if it has only one node.
     """
 
     def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
@@ -120,7 +120,7 @@ class NodeTransport:
                 )
 
     def _make_refusal_handler(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
-        """Return a function that counts and logs refused connections."""
+        """Return a function that counts and logs connections that an output has refused."""
 
         def on_refused(text: str) -> None:
             counts.rejected += 1
@@ -168,7 +168,7 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket that stops a node with devices even if its launcher does not respond."""
+        """Open a socket by which a tool can stop the node even if its launcher does not respond."""
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -199,7 +199,7 @@ class NodeTransport:
         return rejection_reason
 
     def renew_keys(self) -> None:
-        """Reload the keys if they have changed, and reconnect the affected sockets."""
+        """Reload the encryption keys if they have changed, and reconnect the affected sockets."""
         if self.keys is None:
             return
         try:
@@ -231,7 +231,7 @@ class NodeTransport:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on a fixed time grid; skip calls that are late."""
+    """Call a node's periodic method on a fixed time grid; skip grid times that have passed."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -245,7 +245,7 @@ async def run_timer(node: Node, number: int, timer: Timer) -> None:
 
 
 async def run_key_reload(transport: NodeTransport) -> None:
-    """Reload changed keys, once a second."""
+    """Check once a second whether encryption keys have changed, and reload them."""
     while True:
         await asyncio.sleep(KEYS_PERIOD_S)
         transport.renew_keys()
@@ -263,8 +263,8 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
 def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
     """Make the status message of a node.
 
-    The state is "degraded" after an error, a rejection or a gap (except on a `latest` topic) since
-    the last status.
+    The state is "degraded" if an error, a rejected message or a gap has occurred since the last
+    status.  Gaps on topics with the delivery `latest` are normal.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -302,7 +302,7 @@ async def run_node(
 ) -> None:
     """Build and connect a node, and run it until `stop` is set or one of its tasks fails.
 
-    heartbeat: pipe to the launcher; None without one. local: as of `NodeTransport`.
+    heartbeat: pipe to the launcher; None without one.  local: see `NodeTransport`.
     """
     heartbeat = heartbeat or Heartbeat(None)
     class_ = node_class(config.type)
@@ -334,7 +334,7 @@ async def run_node(
         tasks.append(asyncio.create_task(stop.wait()))
         if transport.keys is not None:
             tasks.append(asyncio.create_task(run_key_reload(transport)))
-        # This excludes the objects made by `setup` from garbage collection while the node runs.
+        # Exclude the objects that `setup` has made from garbage collection while the node runs.
         gc.collect()
         gc.freeze()
         heartbeat.report_ready()
@@ -353,8 +353,8 @@ async def run_node(
 async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
     """Cancel tasks repeatedly until they have ended.
 
-    A handler can suppress a cancellation: `wait_for` of Python 3.11 does so if its result arrives
-    at the same moment.
+    Once is not enough, because a handler can suppress a cancellation.  `wait_for` of Python 3.11
+    does so if its result arrives at the same moment.
     """
     pending = {task for task in tasks if not task.done()}
     while pending:
@@ -364,7 +364,7 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """Pipe to the launcher: the first byte reports that all nodes are ready, others that they run.
+    """Pipe to the launcher.  It reports first that all nodes are ready, then that they run.
 
     fd: write end of the pipe; None without a launcher.  Writing never blocks.
     nodes: number of nodes in the process.
@@ -376,14 +376,14 @@ class Heartbeat:
             os.set_blocking(fd, False)
 
     def report_ready(self) -> None:
-        """Count a node that is set up; the last one causes the first byte."""
+        """Record that one node is set up.  When all are, send the launcher the first heartbeat."""
         self._starting -= 1
         self.beat()
 
     def beat(self) -> None:
         if self._fd is not None and self._starting <= 0:
-            # A full pipe contains enough bytes.  If the launcher has ended, its lifeline ends this
-            # process.
+            # A full pipe contains enough heartbeats.  If the launcher has ended, so will this
+            # process: its lifeline (a pipe to the launcher) is then closed.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
@@ -403,7 +403,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
         try:
             await run_node(node, stop, heartbeat=heartbeat, local=local)
         except Exception as error:
-            # Nothing else logs why the process ends; the launcher reads the exit code.
+            # The launcher sees only the exit code, so the reason must be logged here.
             structlog.get_logger().error(
                 "node failed", node=node.name, error=str(error), exc_info=True
             )
@@ -418,15 +418,15 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 
 
 async def run_until_signal(config: ProcessConfig) -> None:
-    """Run the nodes until SIGINT or SIGTERM."""
+    """Run the nodes of a process until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    # If the launcher ends, the kernel and the lifeline each send a signal.
+    # If the launcher ends, the lifeline's thread and the kernel each send a signal.
     with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
         await run_nodes(config, stop)
 
 
 def main(config_path: str) -> int:
-    """Run the nodes of a configuration file, and return the exit code of the process."""
+    """Run the nodes in a configuration file, and return the exit code of the process."""
     config = ProcessConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[

@@ -1,4 +1,4 @@
-"""Handle the signals that end a process in its event loop."""
+"""Handle in the event loop those signals that end a process."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def handle_signals(
 ) -> Iterator[None]:
     """Call `handler` in the running loop for each of these signals, until the context ends.
 
-    ignore_afterwards: then ignore the signals instead of restoring their actions, for a process
-        that ends after its clean-up.
+    ignore_afterwards: whether to ignore the signals afterwards instead of restoring their actions,
+        for a process that ends after its clean-up.
 
-    A loop that removes its handler of SIGINT installs Python's default, which raises an exception.
-    The signals are therefore blocked until the former actions are restored.
+    When the loop removes its handler of SIGINT, it installs Python's default, which raises an
+    exception.  The signals are therefore blocked until the former actions are restored.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}

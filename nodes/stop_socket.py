@@ -1,8 +1,8 @@
 """Receive e-stops on a unix socket of a launcher or a node.
 
-Only one command-line tool at a time can use their shared endpoint of the topic `estop`, but any
-number can connect to this socket. Each sends one packet and receives one. The module imports only
-light modules, so that these tools start quickly.
+Only one command-line tool at a time can use the tools' shared endpoint of the topic `estop`, but
+any number can connect to this socket. Each sends one packet and receives an answer. The module
+imports only light modules, so that these tools start quickly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Kind = Literal["launcher", "node"]
 REQUEST, ANSWER = b"stop ", b"stopped"
 MAX_REQUEST_BYTES = 4096
 MAX_CONNECTIONS = 32
-"""Maximum number of open connections; a further one closes the oldest."""
+"""Maximum number of open connections; when another one opens, the oldest is closed."""
 
 _PEER = struct.Struct("3i")
 
@@ -39,7 +39,7 @@ class StopSocket:
         self._connections: list[socket.socket] = []
 
     def open(self) -> None:
-        """Listen in the running loop. Raises OSError if the path is too long."""
+        """Listen in the running event loop. Raises OSError if the path is too long."""
         self._path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
@@ -54,7 +54,7 @@ class StopSocket:
         self._loop.add_reader(listener.fileno(), self._accept, listener)
 
     def close(self) -> None:
-        """Stop listening, and remove the socket's file; has no effect if it is closed."""
+        """Stop listening, and remove the socket's file; has no effect on a closed socket."""
         if self._listener is None:
             return
         self._path.unlink(missing_ok=True)
@@ -86,7 +86,7 @@ class StopSocket:
                 self._on_stop(request.removeprefix(REQUEST).decode(errors="replace"))
                 connection.send(ANSWER)
         except (BlockingIOError, ConnectionError):
-            # The peer closed before the answer; the stop that it sent is engaged.
+            # The peer has closed before the answer; a stop that it sent is engaged nevertheless.
             pass
         finally:
             self._drop(connection)
@@ -98,7 +98,7 @@ class StopSocket:
 
 
 def read_peer(connection: socket.socket) -> tuple[int, int]:
-    """Return process ID and user ID of the peer of a unix socket."""
+    """Return process ID and user ID of the process at the other end of a unix socket."""
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
     process, user, _ = _PEER.unpack(packed)
     return process, user

@@ -1,9 +1,10 @@
 """Decide one arm's command in each cycle: follow the sheet's target, pause, stop or relax.
 
-This module uses no sockets and no clock.  The node passes in the inputs and the duration of the
-cycle, and sends the returned command.  `state_machine` defines the states and their transitions.
-Both bridges bound the sheet's motion equally in the sheet's frame, which synchronizes the two arms
-on long paths.  Each arm's joints then pass the limiter.
+Two arms hold an elastic sheet between them; each is controlled by its own node, the bridge.  To
+relax means to slacken the sheet.  This module uses no sockets and no clock.  The node passes in the
+inputs and the duration of the cycle, and sends the returned command.  `state_machine` defines the
+states and their transitions.  Both bridges apply the same speed bounds to the sheet, which
+synchronizes the two arms on long paths.  The limiter then bounds each arm's joint speeds.
 """
 
 from __future__ import annotations
@@ -74,14 +75,15 @@ Floats = NDArray[np.float64]
 MAX_REST_RAD_PER_S = 1e-6
 """Joint speed below which an arm is at rest."""
 
-# The sheet becomes slack in about a second.
+# At this stretch rate the sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-"""Distance to the target at which the sheet changes to FOLLOW_BOUNDS, until the next stop."""
+"""Distance to the target below which the sheet moves with FOLLOW_BOUNDS instead of START_BOUNDS,
+until the next stop."""
 
 MEASURED_SLACK_M = 0.002
-"""Maximum excess of a measured flange over a limit of commands; servos ripple."""
+"""Distance by which a measured flange may exceed a limit of commands, because servos ripple."""
 
 SLACK_STRETCH = 1.0005
 """Stretch ratio at which the sheet counts as slack; its tension is then 0.1 N."""
@@ -92,10 +94,10 @@ IMPLAUSIBLE_LENGTH_RATIO = 1.1
 """A measured sheet longer than this multiple of its limit is a measurement error."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""A goal further away than this in one cycle is on another branch of solutions."""
+"""Change of the goal in one cycle above which it is on another branch of joint solutions."""
 
 RELAX_DELAY_S = 0.5
-"""An arm without a target slackens the sheet after this time; a short gap changes nothing."""
+"""Time without a target or permission to move after which an arm slackens the sheet."""
 
 STALE_REASONS = {
     Freshness.STALLED: "the counters of its status stand still, its joints are not used",
@@ -106,13 +108,13 @@ MAX_WAIT_FOR_OTHER_S = 1.0
 """An armed arm is disarmed if the other one is not armed within this time."""
 
 MAX_ARMING_AGE_S = 1.0
-"""Maximum age of an arming command; a later one may contradict the operator's intention."""
+"""Maximum age of an arming command.  The operator may no longer intend an older one."""
 
 ALIGNED_RAD = 1e-4
-"""Joints this near to the end of an alignment have reached it."""
+"""Distance from the end of an alignment (see `path_check`) at which joints have reached it."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""Measured joints further outside the joint ranges are a measurement error."""
+"""Distance outside the joint ranges above which measured joints are a measurement error."""
 
 RECHECK_PERIOD_S = 0.5
 """Time after which a blocked path is checked again, since the target may have moved."""
@@ -120,7 +122,7 @@ RECHECK_PERIOD_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """Lateness (s) of an input after which the arm decelerates, and after which it stops."""
+    """Delays (s) of an input after which the arm decelerates, and after which it is disarmed."""
 
     hold_after_s: float
     stop_after_s: float
@@ -135,14 +137,15 @@ class Command:
 
 
 class ArmControl:
-    """Control of one arm, cycle by cycle.
+    """Controller of one arm, called once per cycle.
 
     state: changes only by `handle`, through the table of `state_machine`.
     mode, faults, reason: published for the operator and the other arm.  faults are latched until
-        `reset`.  reason: why the arm does not follow.
-    ready: whether the arm may move.  The operator arms it; every interlock disarms it, also after
-        its cause has ended.  With `auto_arming` the arm is armed whenever there is no interlock.
-    pending_check: the path whose check is awaited by `on_path_result`, or None.
+        `reset`.  reason: why the arm does not follow the target.
+    ready: whether the arm is armed, which means that it may move.  The operator arms it.  Every
+        interlock disarms it, and it stays disarmed when the cause has ended.  With `auto_arming`
+        the arm is armed whenever there is no interlock.
+    pending_check: path whose check is under way; `on_path_result` receives the result.
     """
 
     def __init__(
@@ -188,7 +191,7 @@ class ArmControl:
 
     @property
     def mode(self) -> ArmMode:
-        """Return the mode that the bridge publishes."""
+        """Return the mode that the bridge publishes for the state."""
         return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
 
     @property
@@ -198,14 +201,14 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return the faults for the other arm: own faults, an e-stop, a lost connection."""
+        """Return all faults to report to the other arm, with an e-stop or a lost connection."""
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
 
     @property
     def path_blocked(self) -> bool:
-        """Return whether the arm rests because no path to the target is clear."""
+        """Return whether the arm rests because every path to the target violates a limit."""
         return self._blocked is not None and self._state in CHECKING_STATES
 
     @property
@@ -215,11 +218,11 @@ class ArmControl:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the arm rests until a command of the operator, with fewer exchanges."""
+        """Return whether the arm rests until an operator's command; it may be polled less often."""
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
-        """Change the state by the table; an ignored event changes nothing."""
+        """Change the state by the transition table, unless the present state ignores the event."""
         target = TRANSITIONS[self._state, event]
         if target is None:
             return
@@ -231,7 +234,8 @@ class ArmControl:
     def on_answer_missed(self, text: str) -> bool:
         """Tolerate one exchange without an answer; return False for a second one in a row.
 
-        The arm's own watchdog covers the gap, and the next command continues from this one.
+        text: reason for the operator.  The arm's own watchdog stops the arm if the gap becomes too
+        long.  The next command continues from this one.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -259,7 +263,7 @@ class ArmControl:
         return newly
 
     def on_connection_lost(self, text: str) -> None:
-        """Discard the motion; a latched fault or e-stop remains."""
+        """Disarm the arm and discard its motion; a latched fault or e-stop remains."""
         self.measured_rad = None
         self._standstill.forget()
         self._inhibit(text, Event.CONNECTION_LOST)
@@ -272,7 +276,7 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the arm's answer: joints (6,) rad if they are fresh, and the arm's faults."""
+        """Store the arm's answer: faults, and measured joints (6,) rad if they are fresh."""
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
         if self.last_measured_rad is None or freshness in (Freshness.FIRST, Freshness.FRESH):
@@ -283,7 +287,7 @@ class ArmControl:
         if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
         if arm_faults == (ArmFault.WATCHDOG,):
-            # A cycle was late, and the arm has stopped automatically: restart from its position.
+            # A command was late, so the arm has stopped itself: restart from its position.
             self._restart_idle()
             self.reason = NodeNote.ARM_WATCHDOG.phrase
             self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
@@ -291,13 +295,13 @@ class ArmControl:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
     def _restart_idle(self) -> None:
-        """Discard the motion and command `idle` next; the arm rests without a command."""
+        """Discard the motion, and send the mode `idle` next to restart the arm's controller."""
         self._discard_motion()
         self._standstill.restart()
         self._must_idle = True
 
     def on_scene_changed(self) -> None:
-        """Stop, and check the path again before the next motion."""
+        """Stop the arm, and check the path again before the next motion."""
         self.pending_check = self._clear_path = self._blocked = None
         self.handle(Event.SCENE_CHANGED)
 
@@ -310,14 +314,14 @@ class ArmControl:
     ) -> str | None:
         """Engage or reset the e-stop; return why a reset is refused, or None.
 
-        stamp_ns: time of the message.  clock_problem: why that time is uncertain.
+        stamp_ns: timestamp of the message.  clock_problem: why the timestamp is uncertain, or "".
 
         Several nodes write e-stops, and a late reader receives the last message of each in any
-        order.  A reset from before the last stop therefore clears nothing, and neither does one
-        that is stamped in the future.
+        order.  A reset is therefore refused if it is older than the last stop, or if its timestamp
+        is in the future.
         """
         if estop.engaged:
-            # A stamp from the future would block every reset until then.
+            # With a timestamp in the future, the stop would block every reset until that time.
             engaged_ns = now_ns if clock_problem else min(stamp_ns, now_ns)
             self._engaged_ns = max(self._engaged_ns, engaged_ns)
             self.engage_estop(estop.reason)
@@ -343,7 +347,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm by the operator's command; return why arming is refused, or None."""
+        """Arm or disarm the arm by a command of this age; return why arming is refused, or None."""
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
             return None
@@ -362,7 +366,7 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm by an event, and store the reason."""
+        """Disarm the arm by an event, and store the reason, which also prevents arming."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -391,12 +395,12 @@ class ArmControl:
         if clock_problem:
             self._inhibit(clock_problem)
         if silent or stopped or clock_problem:
-            # The arm may relax the sheet only at a stop, not after the other arm has been silent.
+            # From now on the arm must not slacken the sheet (see the states TAUT and SLACK).
             self.handle(Event.ISOLATED)
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return why the arm must not move, except an operator's command; other None: silent."""
+        """Return the interlock that forbids motion, or None; other: None if that arm is silent."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if self.faults:
@@ -412,7 +416,7 @@ class ArmControl:
         return None
 
     def _settle(self) -> None:
-        """Apply latched stops, and the end of a deceleration, to the state."""
+        """Change the state after a latched stop, and when the arm has come to rest."""
         for _ in range(2):
             if self.estop_reason is not None:
                 self.handle(Event.ESTOP)
@@ -431,7 +435,8 @@ class ArmControl:
     ) -> Command:
         """Compute this cycle's command, which covers `step_s` seconds.
 
-        clock_problem: why the ages of `goal` and `other` are unknown; empty: they are known.
+        goal, other: target of the sheet and state of the other arm; None until received.
+        clock_problem: why the ages of `goal` and `other` are unknown; empty if they are known.
         """
         measured = self.measured_rad
         if measured is None or self._must_idle:
@@ -466,7 +471,7 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
-        """Stop, slacken the sheet if it may be taut, and rest until both arms are ready."""
+        """Stop, slacken the sheet if it may be taut, and rest until both arms are armed."""
         self._waited_s += step_s
         if self.ready:
             return self._wait_for_other(geometry, step_s)
@@ -479,7 +484,7 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """Stop because the other arm is not ready; before a motion, wait for it for a while."""
+        """Stop because the other arm is not armed; before a motion, wait for it for a moment."""
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
         if not self.auto_arming and (has_started or self._waited_s > MAX_WAIT_FOR_OTHER_S):
@@ -515,7 +520,7 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Move with the target; decelerate while it, or the other arm's state, is late."""
+        """Move the sheet with its target; decelerate while target or other arm's state is late."""
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = late_s > self._timeouts.hold_after_s
         self.handle(Event.LATE if is_late else Event.IN_TIME)
@@ -544,7 +549,7 @@ class ArmControl:
     def _check_measurement(
         self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats
     ) -> None:
-        """Latch a fault when the measured poses violate a limit of the motion."""
+        """Latch a fault if the measured joints trail the command or violate a limit."""
         if self.faults or self._state not in TRACKING:
             return
         violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
@@ -573,7 +578,7 @@ class ArmControl:
     ) -> Command:
         """Start the motion if its path has been checked; otherwise rest and request a check.
 
-        The other bridge checks the same path of the same arms.  No arm moves before both follow.
+        The other arm's bridge checks the same path.  No arm moves before both checks have passed.
         """
         if not self._stands_still(measured):
             return self._decelerate("waits for the arm to stand still", geometry, step_s)
@@ -599,9 +604,10 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
-        """Store the result of a check: the alignment, or why the path is blocked.
+        """Store the result of a path check: an alignment, None, or why the path is blocked.
 
-        None starts the motion without an alignment.  The result of an older request is dropped.
+        An alignment moves the joints to the start of the path first; None: it is not necessary.
+        The result of an older request is ignored.
         """
         if request is not self.pending_check:
             return
@@ -619,7 +625,7 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Start the motion; its first command is the measured pose."""
+        """Start the motion along a checked path; the first command is the measured joints."""
         self.handle(Event.PATH_CLEAR)
         self._sheet = sheet if alignment is None else alignment.sheet
         self._alignment, self._aligned_s = alignment, 0.0
@@ -658,7 +664,7 @@ class ArmControl:
     ) -> SheetMotion:
         """Return the sheet's next motion: slow until it has reached its target, then with it.
 
-        speed_factor: of the speed bounds, below 1 for the arm that leads the other.
+        speed_factor: factor on the speed bounds, below 1 for the arm that leads the other.
         """
         if not self._settled:
             distance_m, angle_rad = measure_distance(sheet, target)
@@ -672,7 +678,7 @@ class ArmControl:
     def _command_sheet(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Command the joints that bring this arm's edge to the sheet's pose."""
+        """Command the joints at which this arm's edge is where the sheet's pose requires it."""
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
@@ -685,13 +691,13 @@ class ArmControl:
         return self._command_joints(goal_rad, geometry, other, step_s)
 
     def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        """Return the present limits of the sheet; during an alignment they include its start."""
+        """Return the present limits of the sheet, which are wider during an alignment."""
         return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
     def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Move towards joints (6,) through the limiter; latch a fault for an unsafe sheet."""
+        """Move towards joints (6,) rad within speed limits; latch a fault for an unsafe sheet."""
         velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)
@@ -714,7 +720,7 @@ class ArmControl:
     def _slacken(
         self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Stop; at rest, slacken the sheet by moving this edge towards the other one."""
+        """Stop; once at rest, slacken the sheet by moving this edge towards the other one."""
         self._settle()
         measured = self.measured_rad
         starts = self._state is State.TAUT
@@ -739,13 +745,14 @@ class ArmControl:
             else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
         if refusal is not None:
-            # The arm does not obey; further commands would make it jump when it obeys again.
+            # The arm does not follow commands.  Further ones would make it jump when it does again.
             self.handle(Event.RELAX_ENDED)
             return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
         if starts or self._sheet is None or self._relax_from is None:
             self._restart_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
-        # The other arm rests, so this arm covers the whole stretch: twice its half.
+        # Half of a change of stretch falls to each arm.  The other arm rests, so this arm commands
+        # twice the change: from a stretch ratio s to 2 - s instead of to 1.
         target = replace(
             self._sheet,
             twist_world=np.zeros(6),
@@ -769,7 +776,7 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
-        """Decelerate along the path; at rest, command no motion."""
+        """Decelerate along the path; at rest, command no motion.  reason: for the operator."""
         self.handle(Event.RELAX_BLOCKED)
         self._drop_path()
         self._settle()
@@ -796,7 +803,7 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        """Return joint velocities towards a goal that moves as it did since the last cycle."""
+        """Return joint velocities (6,) rad/s towards a goal, assumed to keep its velocity."""
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
         return limit_velocity(
             self.commanded_rad,
@@ -816,8 +823,8 @@ class ArmControl:
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
         """Return the command for these joints; every command is made here.
 
-        Two final checks apply to every decision.  A state without motion sends no motion.  No
-        command exceeds the joint speeds or the tool speed.  A violation of either is a fault.
+        Two final checks apply to every command, and a violation is a fault.  A state without motion
+        sends no motion.  No command exceeds the joint speeds or the tool speed.
         """
         before = self.commanded_rad
         if mode == "move" and self._state not in MOTION_STATES:
@@ -845,7 +852,7 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats) -> bool:
-        """Return whether the arm is so near to its last command that it may restart there."""
+        """Return whether measured joints are so near the last command that it may restart there."""
         return bound_edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
@@ -854,8 +861,8 @@ class ArmControl:
     def _restart_refusal(self, measured: Floats) -> str | None:
         """Return why a motion must not restart from the measured joints, or None.
 
-        The arm must be at rest.  At its last command it may restart.  At another position, either
-        the arm has not obeyed, or the measurement is wrong and would make the arm jump.
+        The arm must be at rest.  At its last commanded position it may restart.  At another one,
+        either the arm has not followed, or the measurement is wrong and would make the arm jump.
         """
         beyond = max(
             float((JOINT_MIN_RAD - measured).max()), float((measured - JOINT_MAX_RAD).max())

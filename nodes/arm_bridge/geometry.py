@@ -27,12 +27,12 @@ Floats = NDArray[np.float64]
 RANGE_MARGIN_RAD = np.radians(2.0)
 
 EDGE_SPEED_FRACTION = 0.95
-"""Fraction of the tool speed that the sheet's motion may use; the limiter clamps the rest."""
+"""Fraction of the limiter's tool speed that the sheet's motion may use."""
 
 
 @lru_cache(maxsize=16)
 def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
-    """Return the cached flange pose of joints (6,) rad, read-only."""
+    """Return the flange pose at joints (6,) rad; it is cached and read-only."""
     pose = forward(joints_rad)
     pose.flags.writeable = False
     return pose
@@ -43,7 +43,7 @@ def _transform(pose: Pose) -> Floats:
 
 
 class ArmGeometry:
-    """Geometry of one arm: poses of its base and of its edge of the sheet, and its limits."""
+    """Geometry of one arm: poses of its base and of the edge that it holds, and its limits."""
 
     def __init__(self, scene: Scene, side: Side) -> None:
         self.side: Side = side
@@ -84,21 +84,21 @@ class ArmGeometry:
         )
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the flange for joints (6,) rad."""
+        """Return the world pose (4, 4) of the flange at joints (6,) rad."""
         return self.world_from_base @ _base_from_flange(tuple(joints_rad.tolist()))
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the clamped edge for joints (6,) rad."""
+        """Return the world pose (4, 4) of the clamped edge at joints (6,) rad."""
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return centre and both ends of the clamped edge, and the flange (4, 3) m, base frame."""
+        """Return centre and ends of the clamped edge, and the flange (4, 3), m, base frame."""
         return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad for this arm's edge of the sheet, near the present ones.
+        """Return joints (6,) rad that place this arm's edge for a pose of the sheet.
 
-        Raises UnreachableError if there are none.
+        They are near the present joints.  Raises UnreachableError if there are none.
         """
         edges = edge_poses(
             motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
@@ -107,7 +107,7 @@ class ArmGeometry:
         return solve_next_joints(self.base_from_world @ flange, present_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the resting sheet between this arm's edge and the other's (world poses)."""
+        """Return the sheet at rest between this arm's edge and the other one (world poses)."""
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
         distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
         stretch = distance / self.sheet_limits.width_m
@@ -116,7 +116,7 @@ class ArmGeometry:
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
     ) -> tuple[float | None, float | None]:
-        """Return measured distance of the edges (m) and force (N); None without the other arm."""
+        """Return distance (m) and force (N) of the edges; None without the other flange's pose."""
         if world_from_other_flange is None:
             return None, None
         other_edge = world_from_other_flange @ self.other_flange_from_edge

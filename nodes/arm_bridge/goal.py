@@ -35,26 +35,26 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""Difference of the edges from which the leading arm slows."""
+"""Lead of one edge over the other from which the leading arm slows."""
 
 WAIT_FROM_RAD = 0.12
-"""Difference of the edges at which the leading arm waits; the limiter stops both at 0.2 rad."""
+"""Lead at which the leading arm waits; the limiter stops both arms at 0.2 rad."""
 
 MAX_PREDICTION_S = 0.15
-"""Maximum time of a target ahead of now: the horizon of fingertip predictions and a margin."""
+"""Maximum time by which a target may lie in the future: the prediction horizon and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
-"""Longest trajectory that is followed.  An arm then moves this long without a message."""
+"""Maximum duration of a trajectory, for which an arm moves without a new message."""
 
 SKEW_LENGTH_M = 0.25
-"""Skew of an edge to the other one that counts as 1 rad of difference."""
+"""Offset between two sheet poses that counts like a rotation of 1 rad between them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Target of the sheet at the time when a command acts.
+    """Target of the sheet at the time at which a command takes effect.
 
-    overdue_s: time since the next target was due; below 0 while it is not.
+    overdue_s: how late the next target is; negative if it is not yet due.
     """
 
     motion: SheetMotion
@@ -66,9 +66,9 @@ def extrapolate_goal(
 ) -> Goal:
     """Extrapolate the target by `ahead_s` (positive or negative), limited to `max_extrapolation_s`.
 
-    overdue_s: time since the next target was due.  A target that needs a longer extrapolation is
-    overdue by the rest, whenever it has arrived.  So is one too far in the future, whose clock
-    must be wrong.
+    overdue_s: time since the next target was due.  If the target needs a longer extrapolation, it
+    also counts as overdue, by the remaining time.  The same applies to a target that is too far in
+    the future, since its clock must be wrong.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -79,7 +79,7 @@ def extrapolate_goal(
 class GoalTiming:
     """Times (s) for the conversion of a target to a goal.
 
-    servo_lag_s: time from sending a command until it acts.
+    servo_lag_s: time from sending a command until it takes effect.
     target_period_s: time from a target's arrival until the next is due.
     max_extrapolation_s: maximum extrapolation of a target.
     """
@@ -90,7 +90,10 @@ class GoalTiming:
 
 
 def find_trajectory(target: SheetTarget) -> SheetTrajectory | None:
-    """Return the target's trajectory if its speeds and decelerations are within FOLLOW_BOUNDS."""
+    """Return the target's trajectory if the arm may follow it; otherwise None.
+
+    Its speeds and decelerations must be within FOLLOW_BOUNDS, its duration within MAX_TRAJECTORY_S.
+    """
     trajectory, bounds = target.trajectory, FOLLOW_BOUNDS
     if trajectory is None or not trajectory.brake_s > 0.0 <= trajectory.keep_s:
         return None
@@ -112,12 +115,12 @@ def make_goal(
     timing: GoalTiming,
     trajectory: SheetTrajectory | None = None,
 ) -> Goal:
-    """Return a target's goal for a command that is sent now.
+    """Convert a target to the goal of a command that is sent now.
 
-    trajectory: from `find_trajectory`, if the other arm agrees; the target is then overdue from its
-        end, whenever it has arrived.  None: the target is extrapolated by its twist.
+    trajectory: result of `find_trajectory`, if the other arm follows it too; the target is then
+        overdue from the trajectory's end.  None: the target is extrapolated by its twist.
 
-    A target has no rate of stretch, so the arms follow a changing stretch with a lag.
+    A target contains no rate of the stretch, so the arms follow a changing stretch with a lag.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
@@ -139,12 +142,12 @@ def compute_sync_factor(
 ) -> float:
     """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
 
-    own_edge, other_edge: world poses of the commanded edges; left: whether the own edge is the
-    sheet's left one.  target: world_from_sheet.
+    own_edge, other_edge: world poses of the commanded edges; left: whether this arm's edge is the
+    sheet's left one.  target: target pose world_from_sheet.
 
-    Each bridge moves the sheet in its own cycles, and a late cycle on one side rotates the edges
-    against each other.  The arm that leads on the path to the target slows in proportion to its
-    lead.  One arm's lead is the other's lag, so the arms never wait for each other.
+    Each arm's node computes its commands in its own cycles, so a late cycle on one side twists the
+    sheet.  The arm that is ahead on the path to the target slows in proportion to its lead.  Only
+    one of the arms can be ahead, so they never wait for each other.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))
@@ -172,14 +175,14 @@ def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
 
 
 def _sheet_centre(edge: Floats, along_m: float) -> Floats:
-    """Return the sheet's pose (4, 4) from one edge; its centre is at `along_m` on the edge's x."""
+    """Return the sheet's pose (4, 4) from that of an edge; its centre is at `along_m` on x."""
     return transform(edge[:3, :3], edge[:3, 3] + along_m * edge[:3, 0])
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
     """Return the difference (6,) of two poses: rotation (rad), then offset over SKEW_LENGTH_M.
 
-    Exchanging the poses negates it exactly.
+    If the poses are exchanged, the result is exactly negated.
     """
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

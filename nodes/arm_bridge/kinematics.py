@@ -1,6 +1,7 @@
-"""Compute the kinematics of the Mitsubishi RV-1A.
+"""Compute the forward and inverse kinematics of the Mitsubishi RV-1A arm.
 
-Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.
+Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  A branch is one of up to eight
+joint solutions of a pose.
 
 The chain follows two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube
 `mrv1a.urdf`).  At zero the arm is upright, and every frame is parallel to the base.  J1, J4, J6
@@ -32,26 +33,28 @@ JOINT_MAX_RAD = np.radians([150.0, 120.0, 155.0, 160.0, 90.0, 200.0])
 JOINT_SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
 
 WRIST_SINGULAR = 1e-7
-"""|sin J5| below which the axes of J4 and J6 coincide; J4 then stays constant."""
+"""|sin J5| below which the axes of J4 and J6 count as coincident; J4 then stays constant."""
 
 SHOULDER_SINGULAR_M = 1e-7
 """Distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""|J5| up to which J4 stays constant, and from which J4 is exact."""
+"""|J5| up to which `solve_next_joints` keeps J4 constant, and from which it solves J4 exactly."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""The same bounds for J1: distances of the wrist centre from its axis."""
+"""Distance of the wrist centre from J1's axis up to which `solve_next_joints` keeps J1 constant,
+and from which it solves J1 exactly."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
-"""Maximum error between both bounds, as a multiple of the first: 1.05 degrees, 1 mm."""
+"""Maximum error between both bounds, as a multiple of the first bound: 1.05 degrees or 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""Maximum rotation of J4 or J1 in one step near a singularity: half their speed at 140 Hz."""
+"""Maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140 steps
+per second it is half the maximum speed of these joints."""
 
 _ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
 ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
-"""J3 (29.4 degrees) with shoulder, elbow and wrist centre in line, 30 degrees out of its range."""
+"""J3 with shoulder, elbow and wrist centre in line: 29.4 degrees, 30 degrees out of its range."""
 
 _LOWEST = tuple(float(angle) for angle in JOINT_MIN_RAD)
 _HIGHEST = tuple(float(angle) for angle in JOINT_MAX_RAD)
@@ -63,7 +66,7 @@ MAX_WRIST_M = float(
         + 2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.cos(_LOWEST[2] - ELBOW_ANGLE_RAD)
     )
 )
-"""Maximum distance of the wrist centre from the shoulder (0.4185 m), at the end of J3."""
+"""Maximum distance of the wrist centre from the shoulder (0.4185 m), with J3 at its minimum."""
 
 
 Shoulder = Literal["front", "back"]
@@ -74,10 +77,10 @@ Wrist = Literal["plain", "flipped"]
 class Branch(NamedTuple):
     """One of the eight joint solutions for a flange pose.
 
-    shoulder: whether the wrist centre is before or behind the plane through the axes of J1 and
-        J2.
-    elbow: "up" with J3 beyond `ELBOW_ANGLE_RAD`, as in its whole range, else "down".
-    wrist: "flipped" with J5 below zero.
+    shoulder: whether the wrist centre is in front of the plane through the axes of J1 and J2, or
+        behind it.
+    elbow: "up" if J3 is above `ELBOW_ANGLE_RAD`, as in its whole range, otherwise "down".
+    wrist: "flipped" if J5 is negative.
     """
 
     shoulder: Shoulder
@@ -91,13 +94,13 @@ BRANCHES = tuple(
     for elbow in get_args(Elbow)
     for wrist in get_args(Wrist)
 )
-"""All branches, in the order of the result of `branches`."""
+"""All branches, in the order in which `branches` returns their joints."""
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """A flange pose without joint angles within the ranges.
+    """A flange pose for which no joint solution is within the joint ranges.
 
-    limit: "reach", or the joint that the nearest branch has out of range.
+    limit: "reach", or the joint ("J1" to "J6") that is out of range in the nearest solution.
     """
 
     code = "unreachable"
@@ -115,7 +118,7 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 
 
 def forward(joints_rad: ArrayLike) -> Floats:
-    """Return base_from_flange (4, 4) of joints (6,) rad."""
+    """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
     q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
     s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
     out = UPPER_ARM_M * s2 - ELBOW_SHIFT_M * c23 + FOREARM_M * s23
@@ -139,9 +142,9 @@ def forward(joints_rad: ArrayLike) -> Floats:
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
     """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
 
-    The order is that of `BRANCHES`.  A joint that a singularity leaves undefined equals that of
-    `present_rad` (6,).  Angles are within a revolution of zero.  The list is empty when the wrist
-    centre is too far or too near.
+    The order is that of `BRANCHES`.  A joint that is undefined at a singularity keeps its value in
+    `present_rad` (6,).  Other angles are less than a revolution from zero.  The list is empty if
+    the wrist centre is too far from the shoulder or too near to it.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
@@ -175,8 +178,9 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
 def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     """Return joints (6,) within the ranges for a flange pose, nearest to the present joints.
 
-    The distance is the largest change of any joint.  J6 has a range of 400 degrees, so one
-    revolution more or less is tried too.  Raises UnreachableError when no branch is in range.
+    The nearest solution is the one whose largest joint change is the smallest.  Since J6 has a
+    range of 400 degrees, one revolution more and less is also tried.  Raises UnreachableError if no
+    branch is within the ranges.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     nearest, least = None, inf
@@ -197,17 +201,18 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
 def solve_next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     """Return joints (6,) rad for the next step of a motion, on the present branch without jumps.
 
-    The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
-    vector of length sin(J5), which rotates arbitrarily fast when it passes zero closely.  There J4
-    may lag.  J5 takes the component of the vector along J4, which may be negative.  The rest is an
-    error of the flange's orientation of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
+    The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the direction
+    of a vector of length sin(J5).  It rotates arbitrarily fast when the vector passes close to
+    zero, so J4 may lag there.  J5 then follows the component of the vector along J4, which may be
+    negative.  The other component is ignored.  This causes an orientation error of the flange of at
+    most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
 
-    J1 does the same for a wrist centre near its axis.  A path that passes a singularity within the
-    first length is therefore followed straight, with little motion of J4 or J1.  A path further
-    away rotates them like the exact solution, and the caller bounds their speeds.
+    J1 is treated in the same way when the wrist centre is near its axis.  A path that passes a
+    singularity closely (WRIST_FIXED_RAD, SHOULDER_FIXED_M) therefore hardly moves J4 or J1.
+    Further away they rotate as in the exact solution, and the caller bounds their speeds.
 
-    At a joint's range the nearest other branch is used, by `inverse_kinematics`, which raises
-    UnreachableError if there is none.
+    If the solution is out of a joint's range, `inverse_kinematics` selects another branch.  It
+    raises UnreachableError if there is none.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
@@ -247,11 +252,11 @@ def solve_next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Float
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
     """Return the rotation (rad) of an axis towards a vector, or towards its opposite if nearer.
 
-    along, across: the vector's components along the axis, and 90 degrees further.
-    fixed, near: lengths up to which there is no rotation, and from which there is full rotation.
+    along, across: components of the vector along the axis, and 90 degrees further.
+    fixed, near: lengths of the vector up to which there is no rotation, and from which it is full.
 
-    In between, the direction may be off by an angle that falls from 90 degrees to zero.  The rest
-    is corrected by at most MAX_FREE_ROTATION_RAD.
+    In between, the axis may deviate from the vector by an angle that falls from 90 degrees to zero.
+    A deviation within this tolerance is reduced by at most MAX_FREE_ROTATION_RAD per step.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -266,7 +271,7 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 
 
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """Return the J6 (rad) that brings R4 R5 R6 nearest to the wrist's rotation (3, 3)."""
+    """Return J6 (rad) such that the rotation by J4, J5 and J6 is nearest to `wrist` (3, 3)."""
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)
     second = (-s4, c4, 0.0)
@@ -276,7 +281,10 @@ def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
 
 
 def _bend(out: float, height: float) -> float | None:
-    """Return the angle (0..pi) between upper arm and elbow-wrist line; None: out of reach."""
+    """Return the angle (0..pi) between upper arm and elbow-wrist line, or None if out of reach.
+
+    out, height: position of the wrist centre in the arm's plane, relative to the shoulder, m.
+    """
     cosine = (out * out + height * height - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
         2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
     )
@@ -286,14 +294,14 @@ def _bend(out: float, height: float) -> float | None:
 
 
 def _solve_shoulder(out: float, height: float, q3: float) -> float:
-    """Return the J2 (rad) that brings the wrist centre to a point in the arm's plane."""
+    """Return J2 (rad) at which the wrist centre is at a point of the arm's plane, as in `_bend`."""
     along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
     up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
     return _wrap(atan2(out, height) - atan2(along, up))
 
 
 def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
-    """Return the error for a pose without a solution within the joint ranges."""
+    """Make the error for a pose whose `solutions` are all out of the joint ranges."""
     # Adding zero removes the sign of a negative zero.
     x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
     where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
@@ -315,7 +323,7 @@ def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -
 
 
 def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-    """Return how far (rad) each joint is out of range, with its number and its angle."""
+    """Return for each joint how far (rad) it is out of range, its index and its angle."""
     found = []
     for joint, (angle, low, high) in enumerate(zip(solution, _LOWEST, _HIGHEST, strict=True)):
         middle = 0.5 * (low + high)
@@ -325,12 +333,12 @@ def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
 
 
 def _wrap(angle: float) -> float:
-    """Return the angle within -pi..pi."""
+    """Return the equivalent angle from -pi to pi."""
     return atan2(sin(angle), cos(angle))
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Return `angle` plus revolutions, in [low, high], nearest to `near`; infinite for none."""
+    """Return the angle plus revolutions, in [low, high] and nearest to `near`; infinite if none."""
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
         if low <= rotated <= high and abs(rotated - near) < abs(best - near):
@@ -339,7 +347,7 @@ def _nearest_revolution(angle: float, near: float, low: float, high: float) -> f
 
 
 def find_branch(joints_rad: ArrayLike) -> Branch:
-    """Return the branch of joints (6,) rad; at a singularity, the first of those that meet."""
+    """Return the branch of joints (6,) rad; at a singularity, the first one that applies."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     return Branch(
         "front" if _out(joints) >= 0.0 else "back",
@@ -349,10 +357,11 @@ def find_branch(joints_rad: ArrayLike) -> Branch:
 
 
 def solve_joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
-    """Return joints (n, 6) rad of flange poses (n, 4, 4) on one branch, in or out of range.
+    """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch, in or out of range.
 
-    NaN where the wrist centre is out of reach.  J4 and J6 are the nearest to `near_rad` (6,) of
-    all angles in range, or else of all.  At a singularity the free joint is 0.
+    Joints are NaN where the wrist centre is out of reach.  Of the equivalent angles of J4 and J6,
+    one within the range is preferred, then the nearest to `near_rad` (6,).
+    At a singularity the undefined joint is 0.
     """
     poses = np.asarray(base_from_flange, dtype=np.float64)
     wrist = poses[:, :3, 3] - FLANGE_M * poses[:, :3, 2]
@@ -393,10 +402,10 @@ def solve_joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: A
 
 @dataclass(frozen=True, slots=True)
 class Singularities:
-    """Distances of joints (..., 6) to the arm's three singularities.
+    """Distances of joints (..., 6) from the arm's three singularities.
 
     shoulder_m: distance of the wrist centre from the axis of J1.
-    elbow_rad: difference of J3 from its angle with shoulder, elbow and wrist centre in line.
+    elbow_rad: difference of J3 from the nearest angle with shoulder, elbow and wrist in line.
     wrist_rad: absolute value of J5.
     """
 
@@ -406,7 +415,7 @@ class Singularities:
 
 
 def singularities(joints_rad: ArrayLike) -> Singularities:
-    """Return the distances of joints (..., 6) to the arm's singularities, arrays (...)."""
+    """Return the distances (...) of joints (..., 6) from the arm's singularities."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     elbow = np.remainder(joints[..., 2] - ELBOW_ANGLE_RAD + 0.5 * pi, pi) - 0.5 * pi
     wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi
@@ -414,7 +423,7 @@ def singularities(joints_rad: ArrayLike) -> Singularities:
 
 
 def _out(joints: Floats) -> Floats:
-    """Return the distance (m) of the wrist centre before the axis of J1; negative behind it."""
+    """Return how far (m) the wrist centre is in front of the axis of J1; negative behind it."""
     q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
     return np.asarray(
         UPPER_ARM_M * np.sin(q2) - ELBOW_SHIFT_M * np.cos(q23) + FOREARM_M * np.sin(q23)
@@ -422,4 +431,4 @@ def _out(joints: Floats) -> Floats:
 
 
 CENTRE_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-"""Joints of an arm that reaches forward, far from all singularities and ranges."""
+"""Joints of an arm that reaches forward, far from all singularities and range limits."""

@@ -1,8 +1,9 @@
 """Limit every command to an arm.
 
-Speed, acceleration and tool speed are clamped, which delays the arm.  No clamp makes an
-overstretched or twisted sheet, flanges too near, or a position outside the workspace safe.  The
-checks return these as text, and the caller stops the arm.
+Speed, acceleration and tool speed (the speed of the flange and of the edge that it holds) are
+clamped, which delays the arm.  Clamping does not make an overstretched or twisted sheet safe, nor
+flanges too close to each other, nor a position outside the workspace.  For these, the checks return
+a text, and the caller stops the arm.
 
 Plain functions: joints (6,) rad, poses 4x4, metres.
 """
@@ -23,26 +24,26 @@ from flexsheet.nodes.models.sheet import edge_force_n
 Floats = NDArray[np.float64]
 
 TOOL_SPEED_FRACTION = 0.82
-"""Fraction of the tool speed that commands may use.  An arm that receives positions ripples about
-its mean speed.  The ripple is largest where wrist joints rotate fast against each other, because
-each ripples with its own speed (benchmarks/limiter.py)."""
+"""Fraction of the maximum tool speed that commands may use.  The speed of an arm that receives
+positions ripples about its mean.  The ripple is largest where wrist joints rotate fast against each
+other, because each one ripples with its own speed (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""Maximum duration whose travel one command may cover.  After a longer gap the arm would catch up
-faster than the tool speed allows."""
+"""Maximum duration for which one command may move the arm.  After a longer gap the arm would catch
+up faster than the tool speed allows."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""Minimum and maximum duration of a command; speeds over less are rounding errors."""
+"""Minimum and maximum duration of a command; speeds over a shorter one are rounding errors."""
 
 MIN_BLEND = 0.02
-"""Minimum blend from decelerating to the desired velocity that is tried."""
+"""Minimum weight of the desired velocity that is tried in its blend with a decelerating one."""
 
 ROUNDING_FACTOR = 1.0 + 1e-6
 """Factor by which rounding errors may exceed a limit."""
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""Margin on a limit that is exceeded at the start of a motion; servos ripple, and measurements are
-noisy."""
+"""Margins on limits that are exceeded at the start of a motion, because servos ripple and
+measurements are noisy."""
 
 RANGE_BRAKE_FRACTION = 2.0 / 3.0
 """Fraction of a joint's acceleration that is reserved for stopping within its range."""
@@ -60,7 +61,7 @@ class JointLimits:
 
 @dataclass(frozen=True, slots=True)
 class SheetLimits:
-    """Limits of the sheet and of the two arms that stretch it."""
+    """Limits of the sheet and of the two arms that hold it."""
 
     width_m: float
     height_m: float
@@ -74,7 +75,7 @@ class SheetLimits:
     workspace_max_m: Floats
 
     def force_n(self, length_m: float) -> float:
-        """Return the force (N) on each edge of a sheet of this length."""
+        """Return the force (N) on each edge of the sheet when the edges are this far apart."""
         return edge_force_n(
             length_m / self.width_m,
             young_modulus_pa=self.young_modulus_pa,
@@ -99,11 +100,11 @@ def limit_velocity(
 
     goal_rad: joints at the end of the step; a goal that is not finite decelerates.
     velocity: result of the last call.
-    tool_points: from joints to points (n, 3) m, none of which may exceed `max_tool_speed`.
+    tool_points: function from joints to points (n, 3) m, none of which may exceed `max_tool_speed`.
 
     For any goal, joints_rad + result * step_s is in range, and joint and tool speeds are within
-    their limits.  So is the acceleration, unless range or tool speed need more.  Raises ValueError
-    for a `step_s` outside MIN_STEP_S to MAX_STEP_S.
+    their limits.  The acceleration exceeds its limit only if range or tool speed require it.
+    Raises ValueError for a `step_s` outside MIN_STEP_S to MAX_STEP_S.
     """
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
         raise ValueError(f"step_s is {step_s} s; a command covers {MIN_STEP_S} to {MAX_STEP_S} s")
@@ -132,7 +133,7 @@ def find_desired_velocity(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the velocities (6,) that reach the goal at once, or approach it to stop there."""
+    """Return the velocities (6,) that reach the goal in this step, or that can still stop there."""
     max_speed = limits.speed_rad_per_s
     goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
     along = _clamp(goal_velocity, -max_speed, max_speed)
@@ -145,7 +146,7 @@ def find_desired_velocity(
 def clamp_to_range(
     joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
-    """Clamp velocities to the acceleration, and to speeds that can stop within the range."""
+    """Clamp velocities to the maximum acceleration, and to speeds that can stop within range."""
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
     down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
@@ -153,22 +154,22 @@ def clamp_to_range(
     result = _clamp(_clamp(desired, -down, up), velocity - reach, velocity + reach)
     lower = (limits.min_rad - joints_rad) / step_s
     upper = (limits.max_rad - joints_rad) / step_s
-    # Outside the range, as after a start there, only motion back into it is allowed.
+    # Outside the range, where a motion may start, only motion back into it is allowed.
     return _clamp(result, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
 
 
 def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip like numpy.clip, at a fifth of its cost for six numbers."""
+    """Clip values like numpy.clip, which is five times as slow for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
 def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    """Return the largest speeds from which the joints can stop within these distances."""
+    """Return the highest speeds from which the joints can stop within these distances."""
     return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
 
 
 def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Return velocities (6,) one step nearer to rest; all joints slow in proportion."""
+    """Return velocities (6,) after one step of braking; all joints slow in proportion."""
     stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
     return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
@@ -183,10 +184,10 @@ def limit_tool_speed(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the velocities (6,) nearest to the desired ones within the tool speed.
+    """Return the velocities (6,) nearest to the desired ones at which tool points are not too fast.
 
-    Any blend of the desired velocities and of decelerating ones is within acceleration and range.
-    If even decelerating is too fast, it is scaled down and exceeds the acceleration.
+    They are blends of the desired and the decelerating velocities, which keep acceleration and
+    range.  If even the latter are too fast, they are scaled down and exceed the acceleration.
     """
     here = tool_points(joints_rad)
     max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
@@ -230,8 +231,9 @@ def bound_step(
 ) -> Floats:
     """Return the joints (6,) towards `desired_rad` that one step can reach.
 
-    Joint speeds and tool speed bound the step.  The result is `desired_rad` itself within these
-    bounds, joints on the straight line to it beyond them, and `joints_rad` if it is not finite.
+    Joint speeds and tool speed bound the step.  Within these bounds the result is `desired_rad`
+    itself, beyond them a point on the straight line to it.  If `desired_rad` is not finite, the
+    result is `joints_rad`.
     """
     if desired_rad is joints_rad:
         return desired_rad
@@ -261,9 +263,9 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend from slow to fast shifts (n, 3) within a length, linearly.
+    """Return the largest blend from slow to fast shifts (n, 3) none of which is too long.
 
-    Solves |slow + blend (fast - slow)| = max_shift_m for each shift.
+    It is the least solution of |slow + blend (fast - slow)| = max_shift_m over all shifts.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
@@ -281,10 +283,10 @@ def relax_limits(
     *,
     left: bool,
 ) -> SheetLimits:
-    """Widen the limits where the arms (world poses) exceed them, or nearly do.
+    """Widen those limits that the arms exceed, or nearly exceed, at the start of a motion.
 
-    A motion that starts beyond a limit may return within it, and must not go further.  left: see
-    `check_sheet`.
+    The motion can then return within the limit, but must not exceed it further.  All poses are in
+    the world; for `left` see `check_sheet`.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     apart = other_flange[:3, 3] - flange[:3, 3]
@@ -315,8 +317,8 @@ def _twist(edge: Floats, other_edge: Floats) -> float:
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
     """Return which limit the sheet between two edges (world poses) violates, or None.
 
-    edge: of this arm; left: whether it is the sheet's left one.  Numbers that are not finite
-    violate every limit.
+    edge: edge that this arm holds; left: whether it is the sheet's left one.  Numbers that are not
+    finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     distance = math.sqrt(float(across @ across))
@@ -334,7 +336,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
     if not skew_rad <= limits.max_twist_rad:
         return (
-            f"edge skewed by {np.degrees(skew_rad):.1f} degrees to the line between both, "
+            f"edge skewed by {np.degrees(skew_rad):.1f} degrees to the line between both edges, "
             f"at most {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None
@@ -343,7 +345,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return which limit a flange (world pose) violates, or None: workspace or flange distance.
+    """Return whether a flange (world pose) violates the workspace or flange distance; None if not.
 
     slack_m: tolerance on both limits.  Numbers that are not finite violate both.
     """
@@ -365,7 +367,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return the violation if a command (6,) is too far from the measured joints, or None."""
+    """Return a violation if commanded joints (6,) are too far from the measured ones, or None."""
     lag = float(np.abs(joints_rad - measured_rad).max())
     if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"

@@ -18,21 +18,21 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""Maximum time for which counters may be unchanged.  Two exchanges within a controller's cycle of
-7.1 ms may return the same counters; 50 ms are seven cycles."""
+"""Maximum time for which a controller's counters may stay unchanged: seven of its cycles of 7.1 ms.
+Two exchanges within one cycle may return the same counters."""
 
 _COUNTER_PERIOD = 2**32
 
 
 class ArmLinkError(FlexsheetError):
-    """A failed exchange with an arm; the text gives the reason in one line."""
+    """A failed exchange with an arm, with the reason in one line."""
 
     code = "arm-link"
     remedy = "Check the arm's address, power, cable and program."
 
 
 class ArmSilentError(ArmLinkError):
-    """No connection, or no answer in time."""
+    """No connection to an arm, or no answer from it in time."""
 
     code = "arm-silent"
     remedy = (
@@ -42,14 +42,14 @@ class ArmSilentError(ArmLinkError):
 
 
 class ArmRefusedError(ArmLinkError):
-    """The arm rejected the command."""
+    """An arm's answer that rejects the command."""
 
     code = "arm-refused"
     remedy = "Read the reason on the controller's teach pendant: enabled, no alarm, in remote mode?"
 
 
 class ArmAnswerError(ArmLinkError):
-    """The answer has another protocol, is damaged, or belongs to another command."""
+    """An arm's answer that is damaged, follows another protocol or answers another command."""
 
     code = "arm-answer"
     remedy = (
@@ -74,18 +74,18 @@ FAULT_TEXTS = {
     ArmFault.WATCHDOG: "watchdog: no command",
     ArmFault.SERVO: "servo",
 }
-"""The text of each fault, for logs and for `ArmState.faults`."""
+"""Text of each fault, for logs and for `ArmState.faults`."""
 
 
 class Freshness(StrEnum):
-    """Age of measured joints by the controller's counters."""
+    """Whether measured joints are new, judged by the counters in the controller's answer."""
 
     FIRST = "first"
-    """The first answer since the start of the link or of the controller."""
+    """This is the first answer since the start of the link or of the controller."""
     FRESH = "fresh"
     """The counters have advanced, so the joints are measured again."""
     REPEATED = "repeated"
-    """The counters of the previous answer, for at most MAX_UNCHANGED_S."""
+    """The counters equal those of the previous answer, for at most MAX_UNCHANGED_S so far."""
     STALLED = "stalled"
     """The counters have not advanced for longer than MAX_UNCHANGED_S."""
     REVERSED = "reversed"
@@ -98,7 +98,7 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """Monitor of a controller's 32-bit counters, which may wrap around."""
+    """Monitor of a controller's 32-bit counters, which detects measurements that are not new."""
 
     def __init__(self) -> None:
         self._last: tuple[int, ...] = ()
@@ -109,7 +109,7 @@ class CounterMonitor:
     ) -> Freshness:
         """Return the freshness of an answer with these counters.
 
-        counters: all must advance; the first counts measurements, or is their time.
+        counters: all must advance; the first is the number of measurements, or their time.
         sent_ns, received_ns: times of the command and of its answer, on this computer's clock.
         may_restart: whether a counter that runs backwards means a restarted controller.
         """
@@ -134,7 +134,7 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """Answer of an arm: measured joints (6,) rad, faults, and freshness."""
+    """Answer of an arm: measured joints (6,) rad, faults, and whether the joints are new."""
 
     joints_rad: Floats
     faults: tuple[ArmFault, ...]
@@ -145,7 +145,7 @@ class ArmStatus:
 class BlockField:
     """Field of a register block or packet.
 
-    kind: a struct code, H (u16), I (u32), f (float32) or x (pad).
+    kind: code of Python's `struct`: H (u16), I (u32), f (float32) or x (padding).
     """
 
     name: str
@@ -175,9 +175,9 @@ class ArmLink(Protocol):
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
-    """Return the six angles as numbers; ValueError unless there are six and all are finite.
+    """Return joints as numbers; raises ValueError unless there are six, all finite.
 
-    The limiter ensures this; the driver checks it once more before sending.
+    The limiter already ensures this.  Drivers check it once more before they send a command.
     """
     joints = tuple(float(angle) for angle in joints_rad)
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
@@ -186,10 +186,10 @@ def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
 
 
 def propagate_cancellation() -> None:
-    """Raise a cancellation that Python 3.11's time-outs swallow.
+    """Raise CancelledError again if a time-out of Python 3.11 has suppressed it.
 
-    This happens when an answer or a time-out arrives in the same iteration of the event loop.  The
-    task would then never end.
+    This happens if an answer or a time-out arrives in the same iteration of the event loop as the
+    cancellation.  Otherwise the task would never end.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():

@@ -1,4 +1,4 @@
-"""Create the driver that a launch file names."""
+"""Create the driver of an arm's controller by its name in a launch file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Driver = Literal["modbus", "mxt", "mxt_pose"]
 
 
 def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
-    """Create an arm's link, not yet open; timeout_s None: the driver's default."""
+    """Create the link to an arm, without opening it; timeout_s None: the driver's default."""
     options = {} if timeout_s is None else {"timeout_s": timeout_s}
     if driver == "modbus":
         return ModbusLink(host, port, **options)

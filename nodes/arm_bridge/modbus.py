@@ -1,8 +1,9 @@
-"""Exchange commands by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
+"""Exchange commands with an arm by Modbus TCP.
 
+Each cycle sends one request (function code 23) with magic number, version, sequence and CRC.
 `COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
-docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one first.  The
-CRC-32 (zlib's) covers every register before it in its block, high byte first.
+docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one first.  The CRC-32
+(as in zlib) covers all registers before it in its block, high byte first.
 """
 
 from __future__ import annotations
@@ -85,16 +86,16 @@ FAULT_BITS = {
 
 
 def make_struct_format(block: Sequence[BlockField]) -> str:
-    """Return the struct format of a block, big-endian."""
+    """Return the block's format for Python's `struct`, big-endian."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
 def count_registers(block: Sequence[BlockField]) -> int:
-    """Return the number of 16-bit registers of a block."""
+    """Return the number of 16-bit registers in a block."""
     return struct.calcsize(make_struct_format(block)) // 2
 
 
-# Every failure is raised as ArmLinkError; the library's log would repeat it with hex dumps.
+# Failures are raised as ArmLinkError; the log of pymodbus would repeat them with hex dumps.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 _COMMAND_FORMAT, _STATUS_FORMAT = make_struct_format(COMMAND), make_struct_format(STATUS)
@@ -103,7 +104,7 @@ _STATUS_REGISTERS = count_registers(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """Contents of a status block."""
+    """Contents of a status block; `STATUS` describes the fields."""
 
     accepted: int
     cycle: int
@@ -163,7 +164,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """Framer that fails the pending request when an answer cannot be decoded.
 
-    The library raises the error into the event loop.  That ends the connection, prints a trace,
+    pymodbus itself raises the error into the event loop.  This ends the connection, prints a trace,
     and lets the request wait for its time-out.
     """
 
@@ -182,7 +183,7 @@ class _Framer(FramerSocket):
             awaited = self._client.ctx.response_future
             if not awaited.done():
                 awaited.set_exception(error)
-                # If no task waits for it, asyncio must not report the exception as lost.
+                # Mark the exception as read; asyncio would report it if no task waits for it.
                 awaited.exception()
             return len(data), None
 
@@ -190,10 +191,10 @@ class _Framer(FramerSocket):
 class ModbusLink:
     """`ArmLink` by one Modbus TCP connection to one arm.
 
-    Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
-    pass a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
-    connection reopens at once after a first failure, then after pauses that double up to
-    `max_pause_s`.
+    Any failure after which an answer can still arrive closes the connection, because pymodbus
+    3.16.1 can return a late answer to the next request.  Other false answers are detected by their
+    sequence and CRC.  The connection reopens at once after a first failure, then after pauses that
+    double up to `max_pause_s`.
     """
 
     def __init__(
@@ -241,7 +242,7 @@ class ModbusLink:
             self._pause_s = min(doubled_s, self._max_pause_s)
             raise
         except asyncio.CancelledError:
-            # The answer is still outstanding, and the next request would receive it.
+            # The answer can still arrive, and the next request would receive it.
             self.close()
             raise
         finally:

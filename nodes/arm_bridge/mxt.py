@@ -44,7 +44,7 @@ TYPE_JOINTS_MEASURED = 8
 FLAG_RIGHT, FLAG_ABOVE, FLAG_NONFLIP = 4, 2, 1
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
-"""Maximum plausible angle of a joint; an answer with a larger one is invalid."""
+"""Maximum plausible angle of a joint; an answer with a larger angle is invalid."""
 
 PACKET = (
     BlockField("command", "H", 1, "0 none, 1 move, 255 end"),
@@ -79,7 +79,7 @@ PACKET = (
 
 
 def make_struct_format(packet: Sequence[BlockField]) -> str:
-    """Return the struct format of a packet, little-endian without padding by the compiler."""
+    """Return the packet's format for Python's `struct`: little-endian, without padding."""
     return "<" + "".join(f"{field.count}{field.kind}" for field in packet)
 
 
@@ -88,7 +88,7 @@ _PACKET = struct.Struct(make_struct_format(PACKET))
 
 @dataclass(frozen=True, slots=True)
 class MxtStatus(ArmStatus):
-    """Contents of an answer; count and timeouts are counters of the controller."""
+    """Contents of an answer packet; count and timeouts are counters of the controller."""
 
     count: int
     timeouts: int
@@ -97,21 +97,22 @@ class MxtStatus(ArmStatus):
 def encode(
     command: int, *, send_type: int = 0, data: Sequence[float] = (), flags: int = 0
 ) -> bytes:
-    """Encode a command packet that requests the measured joints; data: up to 8 numbers."""
+    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers."""
     padded = (*data, *([0.0] * (8 - len(data))))
     return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, flags, *([0] * 8))
 
 
 def encode_joints(joints_rad: Floats) -> bytes:
-    """Encode a motion to joints (6,) rad; ValueError unless six and finite."""
+    """Encode a motion to joints (6,) rad; raises ValueError unless there are six finite ones."""
     return encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=validate_joints(joints_rad))
 
 
 def encode_pose(joints_rad: Floats) -> bytes:
-    """Encode a motion of the flange to its pose at these joints, on their branch."""
+    """Encode a motion of the flange to its pose at joints (6,) rad, with their structure flags."""
     pose = forward(validate_joints(joints_rad))
     rotation = pose[:3, :3]
-    # Rotations about the fixed axes x, y, z in this order; at b = +-90 degrees only a - c counts.
+    # a, b, c: rotations about the fixed axes x, y, z in this order; at b = +-90 degrees only the
+    # difference of a and c matters.
     level = math.hypot(rotation[0, 0], rotation[1, 0])
     b = math.atan2(-rotation[2, 0], level)
     if level > 1e-9:
@@ -130,7 +131,7 @@ def encode_pose(joints_rad: Floats) -> bytes:
 
 
 def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
-    """Return the structure flags of joints: right, above (always, by J3), nonflip."""
+    """Return the structure flags of joints: right, above (always, by the range of J3), nonflip."""
     wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]
     ahead = wrist[0] * math.cos(joints_rad[0]) + wrist[1] * math.sin(joints_rad[0])
     shoulder = FLAG_RIGHT if ahead >= 0.0 else 0
@@ -146,29 +147,30 @@ def decode_answer(packet: bytes) -> MxtStatus:
     )
     if command not in (COMMAND_NONE, COMMAND_MOVE):
         raise ArmRefusedError("the controller has ended external control")
-    # The manual puts the answer's type in both fields; one of them may be empty.
+    # According to the manual, both fields contain the type of the answer's data.
     if {send_type, receive_type} - {TYPE_NONE} != {TYPE_JOINTS_MEASURED}:
         raise ArmAnswerError(
-            f"answer of types {send_type} and {receive_type}, expected {TYPE_JOINTS_MEASURED}"
+            f"answer of types {send_type} and {receive_type}, expected {TYPE_JOINTS_MEASURED} "
+            "(measured joints)"
         )
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
-        raise ArmAnswerError("measured joints are not angles")
+        raise ArmAnswerError("measured joints are not angles: a value is too large or NaN")
     return MxtStatus(joints_rad=joints, faults=(), count=count, timeouts=timeouts)
 
 
 def has_advanced(count: int, before: int, steps: int) -> bool:
-    """Return whether a 32-bit counter has advanced by `steps` to half its range."""
+    """Return whether a 32-bit counter has advanced by at least `steps`, and not run backwards."""
     return steps <= (count - before) % 2**32 < 2**31
 
 
 class MxtLink:
     """`ArmLink` for a controller that runs an `Mxt` program.
 
-    The socket, and so the port that the controller answers to, stays open.  Late answers are
-    dropped before the next command.  The controller's counter detects the rest, since it must
-    advance by all commands sent since the last answer.  A lost command therefore costs two answers.
-    `idle` restarts the comparison of the counter.
+    The socket stays open, so that the controller always answers to the same port.  Late answers are
+    dropped before the next command.  Others are detected by the controller's counter, which must
+    advance by the number of commands since the last answer.  After a lost command, the next answer
+    is therefore dropped too.  The mode `idle` restarts the comparison of the counter.
     """
 
     def __init__(
@@ -189,7 +191,7 @@ class MxtLink:
         self._unanswered = 0
 
     def due(self, now_ns: int) -> bool:
-        """Return True, since UDP has no connection to wait for."""
+        """Return True: UDP has no connection that would have to be opened first."""
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
@@ -246,7 +248,7 @@ class MxtLink:
             except BlockingIOError:
                 return
             except ConnectionError:
-                # An earlier packet found no listener; the next exchange shows whether there is one.
+                # Nobody received an earlier packet; the next exchange shows whether that persists.
                 continue
             self.stale += 1
 

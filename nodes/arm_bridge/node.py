@@ -33,7 +33,7 @@ from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 MIN_SERVO_LAG_S = 0.002
-"""Minimum lag that is measured; no arm's servo is faster."""
+"""Minimum lag of an arm that is accepted as measured; no arm's servo is faster."""
 
 CHECK_PERIOD_NS = 100_000_000
 """Period of the self-checks of the arm, whose results are published once per second."""
@@ -82,7 +82,7 @@ class ArmBridge(Node):
         self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
-        """Stop the arm; if the command fails, the arm's own watchdog stops it."""
+        """Send the arm a stop; if this fails, the arm's own watchdog stops it."""
         async with self._cycling:
             self._geometry, joints_rad = None, self._control.commanded_rad
             try:
@@ -107,7 +107,7 @@ class ArmBridge(Node):
         self._target_period = MeasuredPeriod(target_period_s)
 
     def _measure_target_period(self, source_ns: int) -> None:
-        """Adapt to a camera with another rate than the scene's, unless the period is given."""
+        """Measure the targets' period, unless it is a parameter; cameras may have other rates."""
         if self.parameters.target_period_s is not None:
             return
         period_s = self._target_period.add(source_ns)
@@ -126,7 +126,7 @@ class ArmBridge(Node):
             self.log.warning("arming refused", reason=refusal)
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
-        """Use a target when it arrives; the next periodic command would be up to 7 ms later."""
+        """Send a command as soon as a target arrives, up to 7 ms before the next periodic one."""
         if self._geometry is not None:
             self._measure_target_period(header.source_ns)
         if self._control.is_idle:
@@ -138,7 +138,7 @@ class ArmBridge(Node):
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
-        """Send periodic commands between targets, and without any."""
+        """Send periodic commands to the arm when no target arrives."""
         if self._geometry is None:
             self.note = "waiting for a scene"
             return
@@ -173,7 +173,7 @@ class ArmBridge(Node):
         command = control.step(geometry, goal, other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
             control.on_path_result(*result)
-        # A target that arrives during the exchange is not the one behind this command.
+        # Store the target now: another one, which may arrive during the exchange, is not used here.
         last.target, last.received_ns = self.sheet_target.header, self.sheet_target.received_ns
         last.trajectory_ends_ns = 0
         if target is not None and trajectory is not None:
@@ -194,7 +194,7 @@ class ArmBridge(Node):
             self._measure_lag(command, status)
 
     def _measure_lag(self, command: Command, status: ArmStatus) -> None:
-        """Update the lag from an exchange that commanded a motion."""
+        """Update the estimated lag of the arm from an exchange that commanded a motion."""
         if command.mode != "move":
             self._lag.restart()
             return
@@ -210,9 +210,9 @@ class ArmBridge(Node):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
-        """Return the newest sheet target at the time when this command acts.
+        """Return the newest sheet target, moved to the time at which this command takes effect.
 
-        trajectory: that of the target, if the other arm agrees.
+        trajectory: trajectory of the target, if the other arm follows it too.
         """
         target = self.sheet_target.message
         if target is None:

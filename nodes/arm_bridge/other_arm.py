@@ -1,4 +1,4 @@
-"""Represent the other arm as its bridge reports it."""
+"""Represent the other arm of the sheet by the state that its node publishes."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_FUTURE_S = 0.02
-"""Maximum time of a state in the future.  Measured clock offsets are smaller.  Without this limit,
-a future state would count as fresh until its time."""
+"""Maximum time by which a state's timestamp may lie in the future; errors of clock offsets are
+smaller.  Without this limit, such a state would count as fresh until that time."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
-"""Largest time between the exposures behind adjacent targets, whose trajectories overlap."""
+"""Maximum time between the camera exposures of two targets with overlapping trajectories."""
 
 MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
-"""Latest end of a trajectory after the exposure behind its target."""
+"""Maximum time from the camera exposure of a target to the end of its trajectory."""
 
 
 @dataclass(frozen=True)
 class OtherArm:
     """State of the other arm: joints (6,) rad, world poses (4, 4), mode, faults, and its age.
 
-    ready: whether it may move.  estop_engaged: whether its bridge has latched an e-stop.
-    agrees: whether it may follow the trajectory of the same or an adjacent target.  Its age then
-        counts from the end of that trajectory.
+    ready: whether the other arm may move.  estop_engaged: whether its node has latched an e-stop.
+    agrees: whether the other arm may follow the trajectory of the same or an adjacent target.  The
+        age is then counted from the end of that trajectory.
     """
 
     joints_rad: Floats
@@ -49,9 +49,9 @@ class OtherArm:
     def from_state(
         cls, state: ArmState, age_s: float, *, target_source_ns: int = 0, now_ns: int = 0
     ) -> OtherArm:
-        """Convert the other bridge's message, which is `age_s` old.
+        """Convert a message from the other arm's node, which is `age_s` old.
 
-        target_source_ns: exposure behind this arm's own target.
+        target_source_ns: time of the camera exposure from which this arm's target was computed.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
@@ -86,12 +86,12 @@ class OtherArm:
 
     @property
     def estopped(self) -> bool:
-        """Return whether an e-stop stops it; then no arm moves, not even to slacken the sheet."""
+        """Return whether an e-stop is engaged; no arm then moves, not even to slacken the sheet."""
         return self.mode == "estop" or self.estop_engaged
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return why this arm must not move together with it, or None."""
+        """Return why the other arm's state forbids this arm's motion, or None."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -1,4 +1,4 @@
-"""Define the parameters of an arm's bridge."""
+"""Define the parameters of `arm_bridge`, the node that commands one arm."""
 
 from __future__ import annotations
 
@@ -19,47 +19,51 @@ class ArmBridgeParameters(NodeParameters):
     side: Side = Field(description="arm of the scene that this bridge commands")
     host: DeviceHost = Field(default="127.0.0.1", description="address of the arm's controller")
     port: DevicePort = Field(default=5020, description="port of the arm's controller")
-    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0, description="rate of commands")
+    rate_hz: float = Field(
+        default=140.0, ge=10.0, le=1000.0, description="rate of commands to the arm, Hz"
+    )
     resting_rate_hz: float = Field(
-        default=40.0, ge=20.0, le=1000.0, description="rate of commands to an idle arm"
+        default=40.0, ge=20.0, le=1000.0, description="rate of commands to an idle arm, Hz"
     )
     driver: Driver = Field(default="modbus", description="protocol of the arm's controller")
     timeout_s: Positive | None = Field(
-        default=None, description="maximum wait for an answer; null: the driver's default"
+        default=None, description="maximum wait for the arm's answer, s; null: the driver's default"
     )
     servo_lag_s: NonNegative = Field(
         default=0.03,
-        description="lag of the arm behind a command of constant velocity; with "
-        "measure_servo_lag, until it is measured",
+        description="lag of the arm behind commands of constant velocity, s; with "
+        "measure_servo_lag, the value until the lag is measured",
     )
     measure_servo_lag: bool = Field(
-        default=True, description="measure the lag while the arm moves, and use the measured one"
+        default=True, description="measure the arm's lag while it moves, and use the measured value"
     )
     max_servo_lag_s: Positive = Field(
-        default=0.1, description="maximum lag that is measured and used"
+        default=0.1, description="maximum lag of the arm that is measured and used, s"
     )
     target_period_s: Positive | None = Field(
         default=None,
-        description="period of the targets; null: measured, at first the scene's camera's",
+        description="period of the sheet targets, s; null: it is measured, and until then that of "
+        "the camera in the scene",
     )
     hold_after_s: Positive = Field(
         default=0.02,
-        description="lateness of a target or of the other arm, from the end of the trajectory, "
-        "after which it decelerates",
+        description="delay of a sheet target or of the other arm's state, beyond the end of the "
+        "trajectory, after which the arm decelerates, s",
     )
     stop_after_s: Positive = Field(
         default=0.1,
-        description="lateness of a target or of the other arm, from the end of the trajectory, "
-        "after which it stops",
+        description="delay of a sheet target or of the other arm's state, beyond the end of the "
+        "trajectory, after which the arm stops, s",
     )
     max_extrapolation_s: Positive = Field(
-        default=0.06, description="maximum extrapolation of a target"
+        default=0.06, description="maximum time by which a sheet target is extrapolated, s"
     )
     max_tracking_error_rad: Positive = Field(
-        default=0.12, description="maximum lag of a measured joint behind its command"
+        default=0.12,
+        description="difference between a measured joint and its command that is a fault, rad",
     )
     arming: Literal["manual", "auto"] = Field(
         default="manual",
-        description="manual: the operator arms it with `flexsheet arms enable`, at first and after "
-        "each stop; auto: it arms itself, only for simulated arms",
+        description="manual: the operator enables the arm's motion with `flexsheet arms enable`, "
+        "at first and after each stop; auto: it enables itself, only for simulated arms",
     )

@@ -1,8 +1,9 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-Each bridge receives both arms' joints.  It simulates the sheet's motion and checks at each pose
+Each arm's node receives both arms' joints.  It simulates the sheet's motion and checks at each pose
 whether both arms are within their limits.  A check needs some milliseconds and therefore runs
-outside the cycle that sends commands.
+outside the cycle that sends commands.  If necessary, the arms first align: they move from their
+positions to joints at which the sheet is flat and on the path.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
-# From rest to the target, while the user may touch the sheet: a quarter of the tool speed.
+# Slow bounds (a quarter of the tool speed) for the motion from rest to the target, because the user
+# may touch the sheet.
 START_BOUNDS = SheetBounds(
     speed_m_per_s=0.06,
     acceleration_m_per_s2=0.3,
@@ -47,26 +49,26 @@ START_BOUNDS = SheetBounds(
 
 REHEARSAL_STEP_S = 0.05
 MAX_REHEARSAL_S = 60.0
-"""Maximum simulated motion; with START_BOUNDS it crosses the workspace in less."""
+"""Maximum duration of a simulated motion.  With START_BOUNDS, crossing the workspace takes less."""
 
 CORNER_EVERY = 4
-"""Steps between two corners of the checked path; it deviates by less than 1 mm between them."""
+"""Number of simulated steps between two corners of the checked path.  Straight lines between the
+corners deviate from the motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""Distance of a target from the checked one up to which the check remains valid."""
+"""Distance from the checked target up to which the check is also valid for a newer target."""
 
 MAX_START_MOTION_RAD = 0.002
-"""Joint motion since the check up to which it remains valid."""
+"""Joint motion since a check up to which the check remains valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Fractions of the path at which the arms may align to the sheet; the first feasible one is used.
-"""
+"""Fractions of the path to which the arms may align; the first feasible one is used."""
 
 MAX_ALIGN_STEP_RAD = 0.02
-"""Maximum joint step between two checked points of an alignment."""
+"""Maximum change of a joint between two checked points of an alignment."""
 
 MAX_ALIGN_RAD = 1.0
-"""Maximum joint motion of an alignment; beyond it the arm would change its branch."""
+"""Maximum joint motion of an alignment; a larger one would change the branch of joint solutions."""
 
 ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
 """Maximum speed of any point of an edge, and of any joint, during an alignment."""
@@ -93,7 +95,7 @@ class PathCheckRequest:
         return moved_rad <= MAX_START_MOTION_RAD
 
     def leads_to(self, target: SheetMotion) -> bool:
-        """Return whether a target that has moved since is still near the end of this path."""
+        """Return whether a target that has moved since the check is still near the path's end."""
         distance_m, angle_rad = measure_distance(self.goal, target)
         stretch = abs(target.stretch_ratio - self.goal.stretch_ratio)
         return distance_m <= NEAR_M and angle_rad <= NEAR_RAD and stretch <= NEAR_STRETCH
@@ -107,7 +109,7 @@ def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, fl
 
 
 def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
-    """Simulate the bridges' motion from the start to a resting goal; return its corners."""
+    """Simulate the sheet's motion from the start to a resting goal; return points on its path."""
     resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
     sheet, corners = start, [start]
     for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
@@ -125,14 +127,14 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Straight motion in joint space of an arm from its position onto the sheet's path.
+    """Straight motion of an arm's joints from its position onto the sheet's path.
 
-    After a fault, the arms may have stopped with a twisted or skewed sheet, or at the end of a
-    joint's range.  Both arms may then have no solution for any pose of a flat sheet.
+    It is necessary after a fault.  The arms may then have stopped with a twisted or skewed sheet,
+    or at the end of a joint's range, so that their joints correspond to no pose of a flat sheet.
 
     sheet: first pose on the path that both arms can reach.
-    from_rad, to_rad: this arm's joints (6,) at both ends.
-    duration_s: equal for both arms; 0: they are there already.
+    from_rad, to_rad: this arm's joints (6,) at start and end.
+    duration_s: duration, equal for both arms; 0 if they need not move.
     """
 
     sheet: SheetMotion
@@ -148,7 +150,7 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the alignment of this arm to the path, or why an arm cannot follow the path.
+    """Return the alignment of this arm to the path, or the reason why an arm cannot follow it.
 
     The reason names the arm, the limit and the position.
     """
@@ -179,7 +181,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
             )
         except PathError as error:
             first = first or error
-            # A start before the blocked position would lead to it again.
+            # A start at a smaller fraction would lead to the blocked position again.
             blocked = fraction + error.fraction * (1.0 - fraction)
             continue
         to_rad = there.left_rad if arm.left else there.right_rad
@@ -191,9 +193,9 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Raise PathError unless both arms can move straight in their joints between two steps.
+    """Raise PathError unless both arms' joints can move straight from `begin` to `there`.
 
-    The limits of the sheet apply to the whole motion, relaxed where the start exceeds them.
+    The sheet's limits apply to the whole motion, widened where the start exceeds them.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -224,7 +226,7 @@ def _check_alignment(
 
 
 def _find_duration_s(begin: PathStep, there: PathStep) -> float:
-    """Return the duration of an alignment at its speeds."""
+    """Return the duration (s) of an alignment at its maximum speeds."""
     duration_s = 0.0
     for start, end in (
         (begin.left_rad, there.left_rad),
@@ -239,7 +241,7 @@ def _find_duration_s(begin: PathStep, there: PathStep) -> float:
 
 
 class PathChecker:
-    """Checker of one path after another in a thread, in parallel with the cycles."""
+    """Runner of path checks in a thread, one at a time, while command cycles continue."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -248,9 +250,9 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request with its result, or None; call in every cycle.
+        """Return a finished request with its result, or None; must be called in every cycle.
 
-        The given request starts if no other one runs.
+        request: check to start unless another one runs; None: no check is wanted.
         """
         if self._running is None:
             if request is not None:

@@ -1,8 +1,9 @@
 """Check whether the arms can reach poses of the sheet: many at once, and along a path.
 
-Poses of the sheet are (n, 4, 4) in the world with stretch ratios (n,); joints are (n, 6) rad.  A
-limit's margin is positive within the limit.  Margins of speeds are fractions of the limit.
-Both edges follow from the sheet's pose and stretch, so they always agree.
+Two arms hold the sheet by its left and right edges.  Poses of the sheet are (n, 4, 4) in the world
+with stretch ratios (n,); joints are (n, 6) rad.  A margin is the distance to a limit, positive
+within it; for speeds it is a fraction of the limit.  A branch is one of the discrete joint
+solutions of a pose.
 """
 
 from __future__ import annotations
@@ -59,26 +60,26 @@ POSE_LIMITS = (
     "edge force",
 )
 COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force")
-"""Limits that the limiter enforces for every command."""
+"""Limits of a pose that the limiter also enforces for every command."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
-"""The first violated limit in this order is the binding one."""
+"""All limits.  The first violated one in this order is reported (`ArmReach.binding`)."""
 
 ELBOW_NEAR_RAD = WRIST_NEAR_RAD
 
 BRANCH_SAMPLES = 500
-"""Approximate number of poses that select the branch."""
+"""Approximate number of poses from which `find_best_reach` selects the branch."""
 
 SPEED_STEP_S = 1e-4
-"""Step of the central differences for joint speeds."""
+"""Time step of the central differences that give joint speeds."""
 
 MAX_STEP_RAD = 0.05
-"""Maximum joint step between two poses of a path; a jump exceeds it at any spacing."""
+"""Maximum change of a joint between two samples of a path; at a jump, any sampling exceeds it."""
 
 MIN_FRACTION = 1e-6
 
 ROUNDING = 1e-9
-"""Rounding error by which a margin may shrink."""
+"""Amount by which rounding errors may reduce a margin."""
 
 DETOURS_M = (
     (0.0, 0.0, 0.05),
@@ -88,7 +89,7 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""Offsets of detours in the world, m; towards the user first."""
+"""Offsets of detours in the world, m, in the order of trial; those towards the user are first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return the poses that an index array, or a boolean one, selects."""
+        """Return the poses that an array of indices or booleans selects."""
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
@@ -121,8 +122,9 @@ class SheetPoses:
 class ArmReach:
     """Joints and margins of one arm for n poses of the sheet on one branch.
 
-    joints_rad: (n, 6), NaN out of reach.
-    margins: (n,) for each of `LIMITS`; NaN without joints where they depend on joints.
+    joints_rad: (n, 6), NaN for poses out of reach.
+    margins: margins (n,) by limit, for each of `LIMITS`.  Those that depend on joints are NaN for
+        poses out of reach.
     """
 
     branch: Branch
@@ -131,7 +133,7 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return the index in `LIMITS` of the first violated limit, (n,); -1 for none."""
+        """Return for each pose the index in `LIMITS` of the first violated limit, (n,), or -1."""
         found = np.full(len(self.joints_rad), -1)
         for number in reversed(range(len(LIMITS))):
             found[self.margins[LIMITS[number]] < 0.0] = number
@@ -139,18 +141,18 @@ class ArmReach:
 
     @property
     def reachable(self) -> Bools:
-        """Return whether the arm can reach each pose at rest, (n,)."""
+        """Return for each pose whether the arm can reach it at rest, (n,)."""
         binding = self.binding
         return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
     def trackable(self) -> Bools:
-        """Return whether the arm can also follow the twists from each pose, (n,)."""
+        """Return for each pose whether the arm can also follow the twists there, (n,)."""
         return np.asarray(self.binding < 0)
 
 
 def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
-    """Return world_from_flange (n, 4, 4) of an arm for poses of the sheet."""
+    """Return the flange poses world_from_flange (n, 4, 4) of an arm for poses of the sheet."""
     width = geometry.sheet_limits.width_m
     outwards = -0.5 if geometry.left else 0.5
     edges = places.world_from_sheet.copy()
@@ -162,7 +164,7 @@ def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
 def compute_reach(
     geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Branch
 ) -> ArmReach:
-    """Return how an arm reaches the poses on one branch; other: the other arm."""
+    """Compute joints and margins of an arm for poses on one branch; other: the other arm."""
     flanges = compute_flange_poses(geometry, places)
     joints = solve_joints_on_branch(geometry.base_from_world @ flanges, branch, CENTRE_RAD)
     others = compute_flange_poses(other, places)
@@ -173,9 +175,9 @@ def compute_reach(
 
 
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
-    """Return the reach on the branch with most reachable poses, then with the largest margins.
+    """Return the reach on the branch that reaches most poses; among equals, with larger margins.
 
-    An arm cannot change its branch with the sheet clamped, so one branch serves all poses.
+    One branch is used for all poses, because an arm cannot change it while it holds the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -199,9 +201,10 @@ def _margins(
     others: Floats,
     places: SheetPoses,
 ) -> dict[str, Floats]:
-    """Return every limit's margin (n,) for joints (n, 6) and world flange poses (n, 4, 4).
+    """Return the margins (n,) of all limits for n poses of the sheet.
 
-    branch: of the joints; joint speeds are evaluated on it.
+    branch: branch of the joints, on which joint speeds are evaluated.
+    joints: (n, 6).  flanges, others: world poses (n, 4, 4) of this arm's and the other's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     away = singularities(joints)
@@ -224,7 +227,7 @@ def _margins(
     base_from_flange = geometry.base_from_world @ flanges
     wrist = base_from_flange[:, :3, 3] - FLANGE_M * base_from_flange[:, :3, 2]
     reach = MAX_WRIST_M - np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M], axis=1)
-    # Slightly beyond the reach, joints still exist with J3 out of its range.
+    # Slightly beyond the reach there are still joint solutions, with J3 out of its range.
     reachable = np.isfinite(joints).all(axis=1)
     speeds, tool_speed = _speeds(geometry, branch, joints, flanges, places)
     spare = 1.0 - speeds / joint_limits.speed_rad_per_s
@@ -264,7 +267,7 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return centre and ends of the clamped edge, and the flange, (n, 4, 3) m in the world."""
+    """Return world points (n, 4, 3), m: centre and ends of the clamped edge, and the flange."""
     half = 0.5 * geometry.sheet_limits.height_m
     edge = apply(
         geometry.flange_from_edge, np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]])
@@ -282,7 +285,10 @@ def _joint_rates(
     angular: Floats,
     centre: Floats,
 ) -> Floats:
-    """Return joint speeds (n, 6) for a motion of the sheet, by central differences of the IK."""
+    """Return joint speeds (n, 6), as central differences of the inverse kinematics.
+
+    linear, angular: velocities (n, 3) of the sheet at its centre (n, 3).
+    """
     found = []
     for time_s in (-SPEED_STEP_S, SPEED_STEP_S):
         rotation_step = _small_rotations(angular * time_s)
@@ -296,7 +302,7 @@ def _joint_rates(
 
 
 def _small_rotations(vectors: Floats) -> Floats:
-    """Return rotations (n, 3, 3) by vectors (n, 3) below a milliradian, to second order."""
+    """Return matrices (n, 3, 3) of rotation vectors (n, 3) below 1 mrad, to second order."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
     cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
@@ -308,8 +314,8 @@ class SheetPath:
     """Path of the sheet that both arms can follow: m poses from start to goal.
 
     left_rad, right_rad: joints (m, 6) of both arms, on one branch each.
-    times_s: (m,) from 0, the shortest within the speed limits of joints and edges.
-    via_m: offset of the detour in the world, m; None: the path is straight.
+    times_s: (m,) times from 0, as short as the speed limits of joints and edges allow.
+    via_m: offset of the detour in the world, m; None if the path is straight.
     """
 
     places: SheetPoses
@@ -321,7 +327,7 @@ class SheetPath:
 
 @dataclass(frozen=True, slots=True)
 class PathStep:
-    """Pose on a path with the joints (6,) of both arms."""
+    """Pose of the sheet on a path, with the joints (6,) of both arms."""
 
     sheet: SheetMotion
     left_rad: Floats
@@ -331,7 +337,7 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """A path that the arms cannot follow; the text names arm, limit and position.
 
-    limit: of `LIMITS`, or "jump".  fraction: position on the straight path, 0..1.
+    limit: one of `LIMITS`, "jump" or "alignment".  fraction: position on the straight path, 0..1.
     """
 
     code = "path"
@@ -362,11 +368,11 @@ def plan_path(
 ) -> SheetPath:
     """Plan a path for both arms between two poses and stretches of the sheet.
 
-    left_rad, right_rad: joints (6,) at the start; without them every branch is tried.
+    left_rad, right_rad: joints (6,) at the start; None: all branches are tried.
 
-    The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If that
-    is blocked, the path goes through start and goal shifted by one of the detours.  Raises
-    PathError with the limit that blocks the straight path.
+    The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If a
+    limit blocks this path, the sheet first shifts by an offset of `detours_m`, and shifts back at
+    the end.  Raises PathError with the limit that blocks the straight path.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None
@@ -390,9 +396,9 @@ def plan_path_through(
     left_rad: Floats,
     right_rad: Floats,
 ) -> SheetPath:
-    """Plan the path for both arms through all corners, straight between them.
+    """Plan a path for both arms through all corners, straight between them.
 
-    left_rad, right_rad: joints (6,) at the first corner.  Raises PathError if it is blocked.
+    left_rad, right_rad: joints (6,) at the first corner.  Raises PathError if a limit blocks it.
     """
     begin = PathStep(
         corners[0],
@@ -459,7 +465,7 @@ def _explain_jump(
     *,
     fraction: float,
 ) -> PathError:
-    """Return why an arm's branch ends between joints `before_rad` and the next pose."""
+    """Return the error for joints that would jump from `before_rad` (6,) to reach the next pose."""
     reach = compute_reach(arm, other, _make_poses([there]), find_branch(before_rad))
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]
@@ -470,9 +476,10 @@ def _explain_jump(
 
 
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Return the possible joints (6,) at the start: the given ones, or one per branch in range.
+    """Return the joints (6,) that an arm may have at the start of a path.
 
-    The branch with the largest distance to the ranges comes first.
+    They are those near the given ones, or one solution per branch within the joint ranges.  The
+    branch with the largest distance to the range limits is first.
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
@@ -512,8 +519,8 @@ def solve_step(
 ) -> PathStep:
     """Solve both arms' joints for a pose of the sheet, near those of another step.
 
-    Raises PathError if a limit of commands is violated: range, workspace, flange distance or edge
-    force.  Distances to singularities are not checked.  fraction: of the path, for the error.
+    Raises PathError if one of COMMAND_LIMITS is violated.  Distances to singularities are not
+    checked.  fraction: position on the path, which the error states.
     """
     step = PathStep(
         sheet,
@@ -544,7 +551,7 @@ def solve_step(
 
 
 def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
-    """Return the resting sheet at a fraction of the straight path between two poses."""
+    """Return the sheet at rest at a fraction (0..1) of the straight path between two poses."""
     begin, end = start.world_from_sheet, goal.world_from_sheet
     rotation_vector = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)
     rotation = rotation_from_vector(fraction * rotation_vector) @ begin[:3, :3]
@@ -569,7 +576,7 @@ def _check_limits(
 ) -> SheetPath:
     """Return the path if all poses are within the limits of both arms; raises PathError otherwise.
 
-    A limit that is violated at the start must not be violated more.
+    A limit that is violated at the start may stay violated, but not by more.
     """
     places = _make_poses([step.sheet for step in track])
     joints = (

@@ -1,4 +1,4 @@
-"""Build the message that a bridge publishes about its arm."""
+"""Build the messages that an arm's node publishes: the arm's state, and its mean latency."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 REPORTED_TARGETS = 12
-"""Number of targets in one reported mean; five reports per second at 60 Hz load no reader."""
+"""Number of targets in one reported mean: at 60 Hz, five reports per second."""
 
 
 @dataclass(slots=True)
 class LastExchange:
     """Times of the newest exchange with the arm, ns on this computer's clock; 0: never.
 
-    target, received_ns: header and arrival of the sheet target behind the command.
-    trajectory_ends_ns: time of the last command by that target's trajectory; 0: it has none.
+    target, received_ns: header and arrival of the sheet target from which the command was computed.
+    trajectory_ends_ns: time of the last command that follows that target's trajectory; 0: none.
     sent_ns, measured_ns: times of the last command and of the last answer.
     """
 
@@ -32,19 +32,19 @@ class LastExchange:
     duration_s: float = 0.0
 
     def on_answer(self, now_ns: int) -> None:
-        """Store the time of the answer."""
+        """Store the time of an answer, and the duration of the exchange."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
 
 
 class LatencyMean:
-    """Mean of the time from the exposure behind each new target until the arm has moved by it."""
+    """Mean latency from the camera exposure of each new target until the arm has moved to it."""
 
     def __init__(self) -> None:
         self._target: Header | None = None
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add the first command with a target; return the mean (s) once per REPORTED_TARGETS."""
+        """Add the first exchange with a target; return the mean (s) once per REPORTED_TARGETS."""
         target, before = exchange.target, self._target
         self._target = target
         if target is None or target is before or lag.estimate is None:
@@ -66,7 +66,7 @@ def make_arm_state(
     lag: ServoLagEstimator,
     now_ns: int,
 ) -> ArmState:
-    """Return the state of an arm that has been measured at least once."""
+    """Make the state message of an arm that has been measured at least once."""
     measured = control.last_measured_rad
     assert measured is not None
     if other is not None and other.invalid_reason is not None:

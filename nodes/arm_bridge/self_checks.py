@@ -1,4 +1,4 @@
-"""Compare an arm's measured lag and tracking error with what is configured and expected."""
+"""Compare an arm's measured lag and tracking error with the configured and expected values."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""Deviation of the lag: five standard deviations of a calibrated lag (2 ms), half of 20 ms."""
+"""Deviation from the configured lag above which it is suspected to be wrong: five standard
+deviations of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""Tracking error beyond that of a servo with the measured lag: 2 mm at 0.4 m, four times what the
-largest tabulated backlash (0.6 mrad per joint) leaves."""
+"""Excess of the tracking error over that of an ideal servo with the measured lag, above which the
+arm is suspected not to follow.  It is 2 mm at 0.4 m, four times the effect of the largest tabulated
+backlash (0.6 mrad per joint)."""
 
 
 class ServoCheck:
-    """Self-checks of one arm from the estimates of its lag."""
+    """Self-checks of one arm, which use the estimates of its lag."""
 
     def __init__(self, side: Side, configured_lag_s: float) -> None:
         self._side, self._configured_lag_s = side, configured_lag_s
@@ -26,7 +28,7 @@ class ServoCheck:
         self._expected_rad = 0.0
 
     def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate; return the checks that have data."""
+        """Add the newest estimate of the lag; return the checks that have enough data."""
         if estimate is not None:
             self._lag.add(np.array([estimate.lag_s - self._configured_lag_s]), at_ns)
             self._expected_rad = estimate.expected_error_rad

@@ -1,4 +1,4 @@
-"""Detect the standstill of an arm from fresh and plausible measurements."""
+"""Detect from an arm's measured joints whether it stands still; repeated answers do not count."""
 
 from __future__ import annotations
 
@@ -10,48 +10,48 @@ from flexsheet.nodes.arm_bridge.link import Freshness
 Floats = NDArray[np.float64]
 
 STANDSTILL_COUNT = 5
-"""Number of fresh, unchanged measurements in a row that are a standstill."""
+"""Number of fresh, unchanged measurements in a row that show a standstill."""
 
 SETTLED_COUNT = 100
-"""The same number for an arm that is not at its last command.  Within this time, a measurement
-with a lag of 0.7 s has reached the arm's position."""
+"""The same number for an arm that is not at its last command.  It is large enough for measurements
+that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
-"""Maximum difference of unchanged measurements; encoder noise is 200 times smaller."""
+"""Maximum difference of measurements that count as unchanged, 200 times the encoder noise."""
 
 JOINT_LEVER_M = np.array([0.6, 0.6, 0.4, 0.2, 0.2, 0.15])
 """Upper bound of the distance from each joint's axis to the arm's edge of the sheet."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""Maximum distance of the edge from its command at a restart from the measurement.  Joint servos
-with a lag of 15 ms or more cover 5 mm with less than 0.25 m/s."""
+"""Maximum distance between commanded and measured edge at which the arm may restart from the
+measurement.  Joint servos with a lag of 15 ms or more cover it with less than 0.25 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
 JUMP_SPEED_RAD_PER_S = 0.5
-"""Margin and speed by which measurements may change without a command.  The operator may move
+"""Step and speed by which measurements may change without a command, because the operator may move
 the arm with its teach pendant."""
 
 OVERSPEED = 1.5
 """Factor by which an arm may exceed its commanded speed while it catches up."""
 
 MEMORY_S = 0.1
-"""Time constant of the decay of recent commanded speeds and joints."""
+"""Time constant with which recent commanded speeds and joints are forgotten."""
 
 ON_PATH_RAD = 0.005
 """Distance from the recently commanded joints within which any measurement is plausible."""
 
 
 def bound_edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
-    """Return an upper bound of the distance (m) of an edge between two sets of joints (6,) rad."""
+    """Return an upper bound of the edge's displacement (m) between two sets of joints (6,) rad."""
     return float(JOINT_LEVER_M @ np.abs(joints_rad - other_rad))
 
 
 class StandstillMonitor:
     """Counter of fresh, unchanged measurements since the last command that moved the arm.
 
-    is_alive: some measurements differ in the last digits, as encoders do.  A frozen reading repeats
-    itself exactly.
-    has_jumped: the reading has changed faster than the arm can move.
+    is_alive: whether measurements differ in the last digits, as those of encoders do.  A frozen
+        reading repeats itself exactly.
+    has_jumped: whether measurements have changed faster than the arm can move.
     """
 
     def __init__(self) -> None:
@@ -72,11 +72,11 @@ class StandstillMonitor:
         return self._alive
 
     def restart(self) -> None:
-        """Count again from zero."""
+        """Count measurements from zero again, after a motion."""
         self._count, self._alive = 0, False
 
     def forget(self) -> None:
-        """Count again from any position, after a gap in the measurements."""
+        """Forget the position too, after a gap in the measurements."""
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
@@ -105,7 +105,7 @@ class StandstillMonitor:
             return
         if freshness == Freshness.FIRST:
             self.forget()
-        # Comparisons with NaN are false, so after `forget` nothing has jumped and nothing stands.
+        # After `forget`, comparisons with NaN are false: there is neither a jump nor a standstill.
         change = np.abs(joints_rad - self._last_rad)
         speeds = JUMP_SPEED_RAD_PER_S + OVERSPEED * self._speeds_rad_per_s
         off_path = (joints_rad < self._lowest_rad - ON_PATH_RAD) | (

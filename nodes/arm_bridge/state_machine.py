@@ -1,4 +1,4 @@
-"""Define the states of an arm's control, its events, and the one table of transitions.
+"""Define the states and events of an arm's control, and the table of all transitions.
 
 `ArmControl` changes its state only through `TRANSITIONS`.  docs/arms.md renders the table, and
 tests/test_arm_state_machine.py checks every pair of state and event.
@@ -13,9 +13,9 @@ from flexsheet.messages.types import ArmMode
 
 
 class State(Enum):
-    """States of an arm's control; the value describes the state for the documentation.
+    """States of an arm's control, with their descriptions for the documentation.
 
-    `_TAUT`: the sheet may be stretched by an earlier motion, so the arm may slacken it.
+    In states `..._TAUT` an earlier motion may have stretched the sheet, so the arm may slacken it.
     """
 
     STARTING = "the arm has not answered since its bridge started"
@@ -38,7 +38,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """Events of an arm's control; the value describes the event for the documentation."""
+    """Events of an arm's control, with their descriptions for the documentation."""
 
     CONNECTION_LOST = "two exchanges without an answer, or an invalid answer"
     CONNECTED = "the arm has answered"
@@ -97,13 +97,13 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""Published mode of each state; TAUT with a latched fault publishes `fault`."""
+"""Mode that is published for each state; for TAUT with a latched fault it is `fault`."""
 
 Row = dict[tuple[State, Event], State | None]
 
 
 def _row(event: Event, to: Mapping[State, State], *ignored_in: Iterable[State]) -> Row:
-    """Return one event's transitions; ValueError for a state that is given twice."""
+    """Return the transitions of one event; raises ValueError for a state that is given twice."""
     ignored = [state for group in ignored_in for state in group]
     row: Row = {(state, event): None for state in ignored} | {
         (state, event): target for state, target in to.items()

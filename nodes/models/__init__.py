@@ -1,1 +1,1 @@
-"""Compute what several nodes need: arrays in, arrays out; no sockets, no clock, no files."""
+"""Compute what several nodes need, in functions of arrays without sockets, clocks or files."""

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """Return the 3x3 matrix K of a pinhole camera."""
+    """Return the 3x3 matrix of a pinhole camera from focal lengths and principal point, pixels."""
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
@@ -21,9 +21,9 @@ MAX_ITERATIONS = 20
 
 
 def distort(normalized: Floats, distortion: Floats) -> Floats:
-    """Distort undistorted normalized image coordinates (..., 2).
+    """Apply lens distortion to normalized image coordinates (..., 2).
 
-    distortion: k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
+    distortion: coefficients k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
     """
     k1, k2, p1, p2, k3 = distortion
     x, y = normalized[..., 0], normalized[..., 1]
@@ -39,10 +39,10 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
 
 
 def undistort(distorted: Floats, distortion: Floats) -> Floats:
-    """Invert `distort` by fixed-point iteration; normalized coordinates (..., 2).
+    """Remove lens distortion from normalized image coordinates (..., 2) by fixed-point iteration.
 
     The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`. It
-    converges where the distortion's slope is well below one, as inside the image of usual lenses.
+    converges where the distortion changes slowly, as it does inside the image of usual lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
@@ -67,6 +67,6 @@ def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats
 
 
 def normalize(pixels: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return undistorted normalized coordinates (..., 2) of pixels: the ray is (x, y, 1)."""
+    """Return undistorted normalized coordinates (..., 2) of pixels; a pixel's ray is (x, y, 1)."""
     distorted = (pixels - matrix[:2, 2]) / np.array([matrix[0, 0], matrix[1, 1]])
     return undistort(distorted, distortion)

@@ -1,4 +1,4 @@
-"""Define the finger's frame: origin at the pad, x to the hand, z out of the nail."""
+"""Define the frame of a finger: origin at the pad, x towards the hand, z out of the nail."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Floats = NDArray[np.float64]
 def world_from_finger(
     direction_world: Sequence[float], tilt_rad: Sequence[float] | Floats = (0.0, 0.0)
 ) -> Floats:
-    """Return the rotation (3, 3) of a finger.
+    """Return the rotation matrix (3, 3) from a finger's frame to the world.
 
-    direction_world: (3,) from the tip to the hand; without a tilt, y is level.
-    tilt_rad: rotation of the finger about the world's x and y.
+    direction_world: vector (3,) from the tip to the hand; without a tilt, y is horizontal.
+    tilt_rad: rotation vector of the finger about the world's x and y axes.
     """
     x = np.asarray(direction_world, dtype=np.float64)
     x = x / np.linalg.norm(x)

@@ -1,14 +1,15 @@
 """Predict whether a hand that touches the sheet is stable, from the sampled closed loop.
 
-A hand holds its finger in the sheet.  The planner moves the sheet along its normal by `slope` times
-the measured depth: away from the finger (slope > 0, a softer object) or towards it (slope < 0, a
-stiffer object).  The camera measures the depth once per period, and the sheet follows after a
-delay, so the sheet's motion can add energy to the hand.  With depth x and the sheet's offset s:
+A finger pushes into the sheet.  The planner moves the sheet along its normal by `slope` times the
+measured depth.  If slope > 0, it moves away from the finger (a retreat, for soft objects).  If
+slope < 0, it moves towards the finger (an advance, for stiff ones).  The camera measures the depth
+once per period T.  The sheet follows after a delay, so it can add energy.  The hand has the mass m,
+damping b and stiffness k, the sheet the stiffness ks.  With the depth x and the sheet's offset s:
 
     m x'' + b x' + k x + ks (x - s) = 0
     s(t) = slope (y_j + y'_j (t - j T - delay)),  y_j filtered x(j T),  y'_j its rate
 
-The state over one period T is a linear map.  Its eigenvalues decide: no continuous approximation.
+The change of the state over one period is an exact linear map, whose eigenvalues give stability.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from scipy.linalg import expm
 Floats = NDArray[np.float64]
 
 MIN_DECAY_PER_S = 0.5
-"""Decay of the slowest oscillation that counts as stable."""
+"""Minimum decay rate of the slowest mode at which the loop counts as stable."""
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
-"""Margins of gain and delay with which slopes are permitted."""
+"""Margins of gain (a factor) and of delay (added) that a permitted slope must have."""
 
 MAX_SLOPE = 20.0
-"""Upper limit of the search for the critical slope; far above any slope in use."""
+"""Upper limit of the search for the critical slope, far above any slope in use."""
 
 SLOPES = 32
-"""Number of slopes in the search."""
+"""Number of slopes at which the search evaluates the decay."""
 
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
 FILTERS_S = (0.03, 0.08, 0.16)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""Grid of the table of bounds."""
+"""Grid points of the table of bounds (`OffsetBoundsTable`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +61,22 @@ HANDS = {
     "arm": Hand(1.0, 15.0, 600.0),
     "arm of low damping": Hand(1.5, 5.2, 100.0),
 }
-"""Hands over the range of the literature.
+"""Hands that cover the range of measurements in the literature.
 
 Finger: Hajian and Howe 1997.  Wrist: from its resonance of 6 to 12 Hz, Lakie 2015.  Arm:
 Mussa-Ivaldi, Hogan and Bizzi 1985.  Damping ratios of wrist and arm: 0.15 to 0.4.
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""Hands that determine the bounds: those of low damping are the first to become unstable."""
+"""Hands that determine the bounds, because hands of low damping become unstable first."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
     """Timing and filter of the path from the finger's depth to the sheet's offset.
 
-    period_s: between two measurements.
-    delay_s: from a measurement until the sheet reaches the position that follows from it.
+    period_s: time between two measurements.
+    delay_s: time from a measurement until the sheet reaches the position that follows from it.
     filter_s: time constant of the depth's low-pass filter; 0 for none.
     lead_s: time by which the filtered depth is extrapolated (prediction); 0 for none.
     """
@@ -94,10 +95,10 @@ class SampledLoop:
 def make_loop_matrices(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the maps (k, n, n) of the state over one period, for slopes (k,).
+    """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
 
-    State: depth, speed, the newest two filtered depths, and the offsets with their rates that have
-    not yet taken effect, newest first.
+    The state contains depth, speed and the newest two filtered depths.  The offsets that have not
+    yet taken effect follow with their rates, newest first.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -111,7 +112,7 @@ def make_loop_matrices(
     )
     first, second = expm(flow * loop.period_s * np.array([fraction, 1.0 - fraction])[:, None, None])
 
-    # The measurement: state -> state with the new filtered depth, offset and rate.
+    # `measure` adds a measurement: it maps the state to one with new filtered depth, offset, rate.
     measure = np.zeros((len(slopes), size + 2, size))
     measure[:, :2, :2] = np.eye(2)
     weight = loop.filter_weight
@@ -121,8 +122,8 @@ def make_loop_matrices(
     measure[:, 5] = slopes[:, None] * rate
     measure[:, 6:, 4:] = np.eye(2 * waiting)
 
-    # The motion: until `fraction` of the period by the oldest offset, then by the next one.  The
-    # oldest has been in effect for the rest of the period before.
+    # `move` moves the hand: until `fraction` of the period with the oldest offset, then with the
+    # next one.  The oldest took effect in the previous period, (1 - fraction) T ago.
     start = np.zeros((4, size + 2))
     start[:2, :2] = np.eye(2)
     start[2, -2], start[2, -1], start[3, -1] = 1.0, (1.0 - fraction) * loop.period_s, 1.0
@@ -138,7 +139,7 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rates (k,) of the slowest mode, 1/s; negative for a mode that grows."""
+    """Return the decay rate of the slowest mode for each slope, (k,), 1/s; negative if it grows."""
     matrices = make_loop_matrices(
         hand, loop, sheet_stiffness_n_per_m=sheet_stiffness_n_per_m, slopes=slopes
     )
@@ -154,9 +155,10 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the magnitude of the smallest slope that is not stable, at most `max_slope`.
+    """Return the smallest magnitude of a slope at which the loop is unstable, up to `max_slope`.
 
-    The decay is interpolated between the slopes of a grid.  Stability can return at larger slopes.
+    The decay rate is interpolated between the slopes of a grid.  At larger slopes the loop may be
+    stable again, which is ignored.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -177,11 +179,11 @@ def compute_critical_slope(
 
 @dataclass(frozen=True, slots=True)
 class OffsetBounds:
-    """Largest slopes of the sheet's offset over the depth at which every hand is stable.
+    """Maximum slopes of the sheet's offset over the depth at which every hand is stable.
 
     filters_s (f,): time constants of the depth's low-pass filter.
     sheet_stiffnesses_n_per_m (k,): stiffness of the sheet under the finger.
-    max_advances, max_retreats (f, k): slopes towards the finger and away from it.
+    max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
     """
 
     filters_s: Floats
@@ -190,11 +192,11 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the largest advance per depth (n,) at stiffnesses (n,)."""
+        """Return the maximum slope (n,) towards the finger for stiffnesses (n,) of the sheet."""
         return self._interpolate(self.max_advances, filter_s, stiffnesses_n_per_m)
 
     def max_retreat(self, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the largest retreat per depth (n,) at stiffnesses (n,)."""
+        """Return the maximum slope (n,) away from the finger for stiffnesses (n,) of the sheet."""
         return self._interpolate(self.max_retreats, filter_s, stiffnesses_n_per_m)
 
     def _interpolate(self, slopes: Floats, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
@@ -206,7 +208,7 @@ class OffsetBounds:
 
 @dataclass(frozen=True, slots=True)
 class OffsetBoundsTable:
-    """Bounds for a camera's period over delays (d,): slopes (d, f, k)."""
+    """Table of `OffsetBounds` over delays (d,), for one camera period; the slopes are (d, f, k)."""
 
     delays_s: Floats
     filters_s: Floats
@@ -215,7 +217,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the next longer delay of the table; no offset beyond the last."""
+        """Return the bounds at the next longer delay of the table; beyond the last they are 0."""
         row = int(np.searchsorted(self.delays_s, delay_s - 1e-9))
         axes = self.filters_s, self.sheet_stiffnesses_n_per_m
         if row == len(self.delays_s):
@@ -227,10 +229,11 @@ class OffsetBoundsTable:
 def compute_offset_bounds(
     period_s: float, *, advance_limit: float, hands: Sequence[Hand] = LIMITING_HANDS
 ) -> OffsetBoundsTable:
-    """Return the bounds that keep every hand stable with margins of gain and delay.
+    """Compute the maximum slopes at which every hand is stable with margins of gain and delay.
 
-    An advance has its gain margin by the slope.  A retreat has it by the sheet's stiffness, because
-    a slope above 1 has no meaning.
+    For an advance, the gain margin divides the critical slope.  For a retreat, it multiplies the
+    sheet's stiffness instead, because a slope cannot exceed 1.  The sheet never retreats by more
+    than the finger moves.
     """
     shape = len(DELAYS_S), len(FILTERS_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)
@@ -262,13 +265,13 @@ def compute_offset_bounds(
         np.array(DELAYS_S),
         np.array(FILTERS_S),
         np.array(SHEET_STIFFNESSES_N_PER_M),
-        # Bounds must not rise with stiffness or delay, so that values between are bounded too.
+        # Bounds must not rise with stiffness or delay.  They then also hold between grid points.
         _descend(advances),
         _descend(retreats),
     )
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Make slopes (d, f, k) fall along delay and stiffness."""
+    """Reduce slopes (d, f, k) so that they never rise with the delay or the stiffness."""
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

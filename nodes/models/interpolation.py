@@ -56,7 +56,7 @@ def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats
 
 
 def _slope(path: Floats, i: int) -> Floats:
-    """Return the second-order slope (3,) per step at point `i` of a path."""
+    """Return the slope (3,) per step at point `i` of a path, by second-order differences."""
     last = len(path) - 1
     if last == 1:
         return np.asarray(path[1] - path[0])

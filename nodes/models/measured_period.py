@@ -8,14 +8,14 @@ from statistics import median
 INTERVALS = 15
 MIN_INTERVALS = 8
 MAX_PERIOD_S = 0.1
-"""Maximum period; longer intervals are interruptions."""
+"""Maximum period; longer intervals count as interruptions."""
 
 TOLERANCE_RATIO = 0.2
-"""Maximum deviation at which the scene's period is returned."""
+"""Maximum relative deviation up to which the period in the scene is used."""
 
 
 class MeasuredPeriod:
-    """Estimate of a message period, initially the scene's."""
+    """Estimator of the period of messages; it starts with the period in the scene."""
 
     def __init__(self, scene_period_s: float) -> None:
         self._scene_period_s = scene_period_s
@@ -23,7 +23,7 @@ class MeasuredPeriod:
         self._last_ns = 0
 
     def add(self, source_ns: int) -> float:
-        """Add a message with the stamp of its exposure; return the period (s)."""
+        """Add a message, given the time of its camera exposure; return the period (s)."""
         interval_s = (source_ns - self._last_ns) * 1e-9
         self._last_ns = source_ns
         if 0.0 < interval_s <= MAX_PERIOD_S:

@@ -1,7 +1,7 @@
 """Follow a moving target with bounded speed and acceleration.
 
-The target's velocity is fed forward, so there is no lag on the target. Off the target, the follower
-approaches it without overshoot if the target's velocity is constant.
+The target's velocity is fed forward, so that a follower that has reached the target does not lag.
+Before that, it approaches without overshoot if the target's velocity is constant.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from flexsheet.nodes.models.rigid import (
 Floats = NDArray[np.float64]
 
 BRAKE_FRACTION = 1.0 / 3.0
-"""Fraction of the acceleration for braking onto the target; the rest is for following it."""
+"""Fraction of the acceleration for braking towards the target; the rest is for following it."""
 
 
 def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s: float) -> Floats:
     """Return the maximum speeds at which a point can still stop within distances (n,) >= 0.
 
-    In discrete time the point moves by speed * step_s per step, and the speed then decreases by
-    deceleration * step_s. So w^2/(2 a) + w dt/2 = distance; the last distance takes one step.
+    In each step the point moves by speed * step_s, then its speed decreases by deceleration *
+    step_s. So w^2/(2 a) + w dt/2 = distance, with speed w, deceleration a and step dt. A distance
+    shorter than that takes one step.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -47,8 +48,8 @@ def follow(
 ) -> tuple[Floats, Floats]:
     """Return the displacement (n,) over a step towards a moving target, and the velocity after it.
 
-    error: target at the end of the step minus the current point. The change of the mean velocity is
-    bounded by `max_acceleration`.
+    error: target at the end of the step minus the current point. `max_acceleration` bounds the
+    change of the mean velocity from one step to the next.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(
@@ -87,7 +88,7 @@ def desired_velocity(
 
 
 def measure_length(vector: Floats) -> float:
-    """Return the norm of a short vector, five times as fast as `numpy.linalg.norm`."""
+    """Return the norm of a small vector, five times as fast as `numpy.linalg.norm`."""
     return sqrt(float(vector @ vector))
 
 
@@ -123,16 +124,16 @@ class SheetBounds:
 class EdgeBound:
     """Limit of the speed of all points of the clamped edges.
 
-    reach_m: maximum distance of an edge point from the sheet's centre. Translation and rotation are
-    scaled by the same factor. If each arm limited its edge separately, the edges would leave the
-    sheet's path and their distance would change.
+    reach_m: half the length of an edge. Translation and rotation are scaled by the same factor. If
+    each arm limited the speed of its edge separately, the edges would leave the sheet's path and
+    their distance would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0..1) on linear and angular speed that meets the edges' limit."""
+        """Return the factor (0..1) on linear and angular speed that keeps the edges' limit."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -140,7 +141,7 @@ class EdgeBound:
 def follow_sheet(
     now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
-    """Return the sheet after a step towards `target`, which applies at the end of the step."""
+    """Return the sheet after a step towards `target`, the target at the end of the step."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
@@ -230,7 +231,7 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
 def follow_trajectory(
     motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
 ) -> SheetMotion:
-    """Return the motion `time_s` later: constant twist for `keep_s`, then even braking to rest."""
+    """Return the motion `time_s` later: constant twist for `keep_s`, then uniform deceleration."""
     braked_s = min(max(time_s - keep_s, 0.0), brake_s)
     travelled_s = min(time_s, keep_s) + braked_s - 0.5 * braked_s * braked_s / brake_s
     return replace(
@@ -247,7 +248,7 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Return the pose with its rotation made orthonormal (Gram-Schmidt on x, then y)."""
+    """Return the pose with rounding errors removed from its rotation (Gram-Schmidt on x, y)."""
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -1,7 +1,7 @@
-"""Decide from noisy residuals whether an assumption about the apparatus is false.
+"""Decide from noisy residuals whether the scene describes the hardware incorrectly.
 
-A residual is averaged exponentially over time.  It is suspicious once its mean has deviated from
-the expected value by more than a threshold for some time without interruption.
+A residual is averaged with exponentially decaying weights.  It is suspicious when its mean has
+deviated from the expected value by more than a threshold for some time without interruption.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ MAX_GAP_S = 1.0
 """Maximum duration of one sample; a longer pause contains no information."""
 
 CLEAR_RATIO = 0.8
-"""Fraction of the threshold below which a suspicion ends, so that it does not flicker."""
+"""Fraction of the threshold below which a suspicion ends; below 1, so that it does not flicker."""
 
 
 class ResidualMonitor:
-    """Monitor of the mean of a residual with any number of components.
+    """Monitor of the mean of a residual vector.
 
-    mean: weighted mean of the samples, in their unit; zeros before the first.
-    suspected: whether the deviation exceeds the threshold.
+    mean: weighted mean of the samples, in their unit; zeros before the first one.
+    suspected: whether the mean has exceeded the threshold for long enough.
     """
 
     def __init__(
         self, components: int, *, threshold: float, memory_s: float = 1.5, confirm_s: float = 1.5
     ) -> None:
-        """Set the rule: `confirm_s` is the time above the threshold before a suspicion."""
+        """Set the mean's time constant, `memory_s`, and the time to a suspicion, `confirm_s`."""
         self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
         self._memory_s, self._confirm_s = memory_s, confirm_s
         self._weight_s, self._above_s = 0.0, 0.0
@@ -38,7 +38,7 @@ class ResidualMonitor:
 
     @property
     def has_data(self) -> bool:
-        """Return whether the mean covers enough samples to be judged."""
+        """Return whether the mean covers enough time to be judged."""
         return self._weight_s >= 0.5 * self._memory_s
 
     @property
@@ -47,7 +47,7 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual (components,) minus its expected value; not finite ones are ignored."""
+        """Add a residual (components,), measured minus expected value; ignore it if not finite."""
         if not np.isfinite(residual).all():
             return
         step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9

@@ -44,7 +44,7 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
 
 
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
-    """Return the matrix of a rotation vector (Rodrigues), accurate near zero.
+    """Return the matrix of a rotation vector (Rodrigues' formula), accurate near zero.
 
     The result is NaN for a vector that is not finite.
     """
@@ -77,7 +77,7 @@ def vector_from_rotation(rotation: Floats) -> Floats:
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+    """Return the unit quaternion (w, x, y, z), w >= 0, for a rotation matrix.
 
     Shepperd's method computes the largest component first, to avoid division by a small number.
     """
@@ -136,7 +136,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
     """
     if matrix.shape != (4, 4):
         return False
-    # Comparisons with NaN are false.  For numbers of this size numpy takes ten times as long.
+    # Comparisons with NaN are false.  For such a small matrix, numpy takes ten times as long.
     (ax, ay, az, x), (bx, by, bz, y), (cx, cy, cz, z), (p, q, r, one) = matrix.tolist()
     unit = tolerance + 1e-5
     return (
@@ -156,7 +156,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return the body's pose after `duration_s` of a constant twist about its origin."""
+    """Return a body's pose after `duration_s` with a constant twist (velocity of its origin)."""
     rotation = rotation_from_vector(twist_world[3:] * duration_s) @ world_from_body[:3, :3]
     return transform(rotation, world_from_body[:3, 3] + twist_world[:3] * duration_s)
 

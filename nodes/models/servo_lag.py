@@ -1,10 +1,10 @@
 """Estimate the lag of an arm behind its commands from commanded and measured joints.
 
-The measured joints are compared with the commanded ones at each lag of a grid.  The lag with the
-smallest variance of the difference is the estimate: the maximum-likelihood estimate for white noise
-(Knapp and Carter, The generalized correlation method for estimation of time delay, 1976).  Old
-samples are forgotten exponentially.  A constant difference, by gravity or an encoder offset, has no
-influence; motion at constant velocity therefore gives no information.
+The measured joints are compared with the commanded ones at each lag of a grid.  The estimate is the
+lag at which the variance of the difference is smallest.  For white noise, this is the
+maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for estimation of
+time delay, 1976).  The weight of old samples decays exponentially.  A constant difference, by
+gravity or an encoder offset, has no influence, so constant velocity gives no information.
 """
 
 from __future__ import annotations
@@ -18,50 +18,50 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 GRID_STEP_S = 0.004
-"""Step of the grid of lags; a parabola through three of them gives the minimum."""
+"""Step of the grid of lags.  A parabola through three grid points gives the minimum."""
 
 MEMORY_S = 1.2
-"""Time constant with which samples are forgotten."""
+"""Time constant with which the weight of samples decays."""
 
 MIN_OBSERVED_S = 1.0
-"""Weight of moving samples, in seconds, before the first estimate."""
+"""Duration of observed motion that is necessary for the first estimate."""
 
 MIN_SPEED_RAD_PER_S = 0.01
-"""Standard deviation of the joints' speed below which the arm does not move enough."""
+"""Standard deviation of the joints' speed below which the arm moves too little for an estimate."""
 
 MAX_MISFIT_RATIO = 0.05
-"""Unexplained fraction of the motion's variance above which the measurements are not the commanded
-motion: an arm that does not move, moves otherwise, or has reversed signs."""
+"""Unexplained fraction of the motion's variance above which there is no estimate.  The arm then
+does not move as commanded, or its joints have reversed signs."""
 
 CORRELATION_S = 0.1
-"""Time in which errors of the difference are correlated; it reduces the number of samples."""
+"""Time over which errors of the difference are correlated, so that they count as one sample."""
 
 MIN_NOISE_RATIO = 0.2
-"""Least part of the difference's variance that counts as noise; real servos are no exact model."""
+"""Minimum fraction of the difference's variance that is noise, since the servo model is inexact."""
 
 MAX_UNCERTAINTY_S = 0.004
 """Standard deviation of an estimate above which it is not used."""
 
 MAX_SLEW_S_PER_S = 0.02
-"""Maximum rate at which the lag in use changes, so that no target jumps."""
+"""Maximum rate at which the lag in use changes, so that targets do not jump."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""Number of stored commands, and the fewest with which a measurement is compared."""
+"""Number of stored commands, and minimum number with which a measurement is compared."""
 
 MIN_STEP_S = 0.02
-"""Minimum time between two measurements in use; more would cost time without new information."""
+"""Minimum time between two used measurements; more would add computation, but no information."""
 
 MAX_JOINT_RAD = 10.0
 """Maximum angle of a joint; larger ones are errors."""
 
 MAX_GAP_S = 0.05
-"""Gap between commands after which the motion is not known, and the history starts again."""
+"""Gap between commands after which the motion is unknown, so that the history starts again."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagBounds:
-    """Bounds of the lag (s)."""
+    """Minimum and maximum of the lag (s) that may be used."""
 
     min_s: float
     max_s: float
@@ -75,8 +75,9 @@ class LagBounds:
 class LagEstimate:
     """Identified lag with its standard deviation, s.
 
-    tracking_error_rad: standard deviation of the difference at this lag, norm over the joints.
-    expected_error_rad: the same of a critically damped servo with this lag on the same motion.
+    tracking_error_rad: standard deviation of measured minus commanded joints at this lag (norm over
+        the joints).
+    expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     """
 
     lag_s: float
@@ -88,12 +89,12 @@ class LagEstimate:
 class ServoLagEstimator:
     """Estimator of one arm's lag; `lag_s` is always finite and within the bounds.
 
-    estimate: the newest identified lag; None before the first.
-    lag_s: the lag in use: the initial one, then a slowly changing one towards the estimate.
+    estimate: newest estimate; None before the first.
+    lag_s: lag in use; it starts at the initial lag and changes slowly towards the estimate.
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Start at the initial lag, s, which the bounds limit."""
+        """Start with an initial lag, s, that is clipped to the bounds."""
         self.estimate: LagEstimate | None = None
         self.lag_s = bounds.clip(initial_s)
         self._bounds = bounds
@@ -104,7 +105,7 @@ class ServoLagEstimator:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the motion; `lag_s` and `estimate` remain."""
+        """Discard the recorded motion, after a gap; `lag_s` and `estimate` remain."""
         self._count = 0
         count = len(self._lags_s)
         self._weight = 0.0
@@ -154,9 +155,12 @@ class ServoLagEstimator:
         self.lag_s = self._bounds.clip(self.lag_s + min(max(change_s, -limit_s), limit_s))
 
     def _add(self, measured: Floats, wanted_s: Floats, step_s: float) -> None:
-        """Update the weighted moments of all lags by one measurement that covers `step_s`."""
+        """Add one measurement to the weighted means and variances of all lags.
+
+        wanted_s: times of the commands to compare, one per lag.  step_s: weight of the measurement.
+        """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
-        # Before the first lag of the grid, the newest command is held.
+        # For times after the newest command, that command is used.
         index = np.clip(np.searchsorted(times, wanted_s) - 1, 0, len(times) - 2)
         spans = np.diff(times)
         share = np.clip((wanted_s - times[index]) / spans[index], 0.0, 1.0)
@@ -180,7 +184,7 @@ class ServoLagEstimator:
         self._bend_square += gain * (float(bend @ bend) - self._bend_square)
 
     def _solve(self) -> LagEstimate | None:
-        """Return the lag with the smallest variance, or None if the motion does not identify it."""
+        """Return the lag with the smallest variance; None if the motion does not determine it."""
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
         if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
@@ -197,9 +201,9 @@ class ServoLagEstimator:
         lag_s = self._bounds.clip(
             float(self._lags_s[best]) + GRID_STEP_S * min(max(shift, -0.5), 0.5)
         )
-        # Expansion of 1 / (1 + s L / 2)^2 against exp(-s L): the difference is (s L)^2 / 4.
+        # The model 1 / (1 + s L / 2)^2 of a servo differs from the delay exp(-s L) by (s L)^2 / 4.
         expected = 0.25 * lag_s**2 * math.sqrt(self._bend_square)
-        # A servo's distortion of the motion is no noise, and grows with the square of the lag.
+        # A servo's distortion of the motion, which grows with the lag squared, is not noise.
         noise = max(smallest - expected**2, MIN_NOISE_RATIO * smallest)
         samples = max(self._weight / CORRELATION_S, 1.0)
         uncertainty_s = math.sqrt(noise / (samples * self._speed_square))
@@ -209,12 +213,12 @@ class ServoLagEstimator:
 
 
 def _are_joints(joints_rad: Floats) -> bool:
-    """Return whether joints (6,) are finite angles; comparisons with NaN are false."""
+    """Return whether joints (6,) are plausible angles; NaN is not, since comparisons are false."""
     return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return the weighted mean (6,) and the total variance with one more value (6,)."""
+    """Return weighted mean (6,) and total variance after a value (6,) with the weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

@@ -1,16 +1,18 @@
 """Choose the sheet's stretch and normal offset, so that it renders the object's force.
 
-A finger at depth `d` in the object would indent a sheet in the object's tangent plane by `d`.  The
-sheet would then have the object's force at one depth only.  So the sheet also moves along its
-normal: by an offset r(d) behind the tangent plane (in front of it where r is negative).  The
-remaining indentation i = d - r is the one at which the sheet's model gives the object's force:
+Two arms hold a stretched sheet where the surface of a virtual object is.  A finger at depth `d` in
+the object would indent a sheet that stays in the object's tangent plane by `d`.  Such a sheet would
+have the object's force at one depth only.  So the sheet also moves along its normal: by an offset
+r(d) behind the tangent plane (in front of it where r is negative).  The sheet's force then equals
+the object's, at the indentation d - r:
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-While the sheet lags behind, a growing offset removes energy from a pushing finger, so it damps
-slow motion.  An advance (r falls with d) adds energy.  `nodes.models.hand_loop` gives the largest
-slopes at which every hand is stable with the delay that is measured.  The stretch is the least one
-that renders the curve without an advance, or else the one with the smallest advance.
+A retreat is an offset that grows with the depth: the sheet moves away from the finger.  Since the
+sheet lags behind, a retreat removes energy from slow pushes and so damps them.  An advance (r falls
+with d) adds energy.  `nodes.models.hand_loop` gives the largest slopes dr/dd at which every hand
+is stable with the measured delay.  The chosen stretch is the lowest one that renders the curve
+without an advance, or else the one with the smallest advance.
 
 Below the threshold of touch the sheet does not advance.  Otherwise it would respond to the noise of
 the camera while a finger only strokes.
@@ -45,42 +47,43 @@ from flexsheet.nodes.models.sheet.force_models import (
 Floats = NDArray[np.float64]
 
 USABLE_FRACTION = 0.85
-"""Fraction of the maximum edge force and strain that is planned with.
+"""Fraction of the maximum edge force and strain that the planner uses.
 
 The bridges stop the arms where commanded or measured poses reach the limits.  Two moving arms are
 never exactly as far apart as planned, since each receives the other's state a cycle or two late.
 """
 
 FORCE_JND_FLOOR_N = 0.05
-"""Lower bound on the reference of relative force errors.  The relative error of smaller forces is
-at least a tenth, as in the first 2 mm of an object of 4 kPa."""
+"""Minimum force by which a force error is divided to make it relative.  Smaller forces, as in the
+first 2 mm of an object of 4 kPa, have relative errors of at least a tenth."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""Up to the first force, of the object or the sheet, the sheet does not advance; from the second on
-it advances fully."""
+"""Contact forces up to which the sheet does not advance, and from which it advances fully.  The
+contact force is the larger one of object and sheet."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The same for depths: a third of a millimetre may be a fingertip that rests on the object."""
+"""Depths up to which the sheet does not advance, and from which it advances fully.  A smaller depth
+may be a fingertip that only rests on the object."""
 
 TARGET_ERROR_RATIO = 0.10
-"""Relative error of the rendered force that is aimed for."""
+"""Relative error of the rendered force above which a note reports it."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""Minimum relative difference of stiffness that users notice.  The first: with the deformation of
-the skin as a cue (Bergmann Tiest & Kappers 2009); the second: without work or terminal force as a
-cue (Tan et al. 1995)."""
+"""Minimum relative difference of stiffness that users notice.  0.15: if the deformation of the skin
+is a cue (Bergmann Tiest & Kappers 2009).  0.22: if neither work nor terminal force is a cue (Tan et
+al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""Maximum advance of the sheet per depth of the push: 1.5 times the sheet's own stiffness.
+"""Maximum advance of the sheet per depth of the push; 0.5 feels 1.5 times as stiff as the sheet.
 
-The bounds of the closed loop with the hand are usually lower.
+The bounds for a stable loop with the hand are usually lower.
 """
 
 SLOPE_TOLERANCE = 0.03
-"""Excess of a slope over its bound that is accepted; the bounds have larger margins."""
+"""Amount by which a slope may exceed its bound, since the bounds contain larger margins."""
 
 STRETCH_CANDIDATES = 17
-"""Number of stretches that are tried between minimum and maximum."""
+"""Number of stretch ratios that are tried from minimum to maximum."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
@@ -92,9 +95,9 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """Force of the object over depth: rows (n,) from (0, 0), ascending.
+    """Force of the object over depth: n ascending points from (0, 0).
 
-    Between the rows it is a monotone cubic, beyond the last a straight line with the last slope.
+    Between the points the curve is a monotone cubic, beyond the last a line with the last slope.
     """
 
     depths_m: Floats
@@ -102,7 +105,7 @@ class ObjectCurve:
     _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Raise UnfitCurveError unless there are two or more finite, ascending rows."""
+        """Raise UnfitCurveError unless there are two or more finite, ascending points."""
         depths, forces = self.depths_m, self.forces_n
         if depths.ndim != 1 or len(depths) < 2 or depths.shape != forces.shape:
             raise UnfitCurveError(
@@ -110,7 +113,7 @@ class ObjectCurve:
                 "forces as depths, two or more"
             )
         if not (np.isfinite(depths).all() and np.isfinite(forces).all()):
-            raise UnfitCurveError("force curve: entries are not finite")
+            raise UnfitCurveError("force curve: a depth or force is not finite")
         if depths[0] != 0.0 or forces[0] != 0.0:
             raise UnfitCurveError(
                 f"force curve: the first row is {depths[0]:g} m, {forces[0]:g} N; it must be 0, 0"
@@ -121,16 +124,16 @@ class ObjectCurve:
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """Make the curve of `SoftBody.force_curve`: (n, 2) depth and force."""
+        """Make the curve from `SoftBody.force_curve`: rows (n, 2) of depth, m, and force, N."""
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     @classmethod
     def linear(cls, stiffness_n_per_m: float, max_depth_m: float) -> ObjectCurve:
-        """Make the curve of a spring."""
+        """Make the force curve of a linear spring up to `max_depth_m`."""
         return cls(np.array([0.0, max_depth_m]), np.array([0.0, stiffness_n_per_m * max_depth_m]))
 
     def force_n(self, depths_m: Floats) -> Floats:
-        """Return forces (n,) at depths (n,); 0 for negative depths."""
+        """Return forces (n,), N, at depths (n,), m; 0 for negative depths."""
         last = self.depths_m[-1]
         inside = self._curve(np.clip(depths_m, 0.0, last))
         beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
@@ -140,9 +143,10 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """Limits of the sheet, of the arms that stretch it, and of the loop with the hand.
+    """Limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
 
-    bounds: of the offset's slope; None for an analysis without a hand.
+    edge_force_n: maximum force on each clamp.
+    bounds: bounds on the offset's slope; None for an analysis without a hand.
     """
 
     min_stretch_ratio: float
@@ -152,7 +156,7 @@ class StretchLimits:
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the largest advance per depth (n,) at stiffnesses (n,) of the sheet."""
+        """Return the maximum advance per depth (n,) where the sheet has stiffnesses (n,)."""
         result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
         if self.bounds is None:
             return result
@@ -164,9 +168,10 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the usable fraction of the scene's limits, for the flat sheet.
+    """Return the stretch limits within the usable fraction of the scene's limits.
 
-    A push adds edge force; `render_force` limits that.  bounds: of the loop with the hand.
+    They apply to the sheet without a push.  A push adds edge force, which `render_force` limits.
+    bounds: bounds on the offset's slope for a stable loop with the hand.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -191,10 +196,11 @@ def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """Forces that a stretch renders at one position, with a row per depth (n,).
+    """Forces that the sheet renders at one position with one stretch, at n depths.
 
+    indentation_m: deflection of the sheet from its plane under the finger.
     edge_force_n: force on each clamp.
-    advance_per_depth: maximum advance of the sheet towards the finger.
+    advance_per_depth: largest advance of the sheet towards the finger per depth.
     force_limited: whether the limit of the edge force reduced the indentation.
     """
 
@@ -214,7 +220,7 @@ class RenderedForce:
 
     @property
     def error_ratio(self) -> Floats:
-        """Return rendered over object's force, minus one (n,); 0 if neither can be felt."""
+        """Return the relative error (n,) of the rendered force; 0 if neither force can be felt."""
         felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
         difference = (self.force_n - self.object_force_n) / np.maximum(
             self.object_force_n, FORCE_JND_FLOOR_N
@@ -225,15 +231,15 @@ class RenderedForce:
 
 _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
 DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
-"""Depths, over the maximum, at which the offset is computed: denser near the start of the contact.
+"""Depths at which the offset is computed, as fractions of the maximum; denser near the surface.
 
 They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, where its control points lie.
-The spline is C1, and its slope is bounded by those between its control points.  So bounds on the
-slope at these depths are valid everywhere; a spline through the points would not guarantee that.
+The spline has a continuous slope, which is bounded by the slopes between its control points.  So
+bounds that hold at these depths hold everywhere; an interpolating spline would not ensure that.
 """
 
 SATURATION_FRACTION = 0.1
-"""Fraction of the maximum indentation over which the curve bends smoothly towards the maximum."""
+"""Last fraction of the maximum indentation, in which the indentation saturates smoothly."""
 
 
 def render_force(
@@ -246,10 +252,10 @@ def render_force(
     position_m: SheetPosition = CENTRE,
     finger_radius_m: float,
 ) -> RenderedForce:
-    """Return the best approximation of the curve with this stretch at this position.
+    """Compute the best approximation of the object's force with one stretch at one position.
 
     The indentation never makes the edge force exceed its limit; beyond that the sheet moves with
-    the finger.  It grows by at most 1 + `limits.max_advance` per depth.
+    the finger.  The indentation grows by at most 1 + `limits.max_advance` per depth.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -306,11 +312,11 @@ def _indentation_for_edge_force(
     position_m: SheetPosition,
     finger_radius_m: float,
 ) -> float:
-    """Return the indentation (m) at which the clamps carry this force; 0 if the flat sheet does."""
+    """Return the indentation (m) with this force on each clamp; 0 if the flat sheet exceeds it."""
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, stretch_ratio)
     if flat >= edge_force_n:
-        # Equality is due to rounding: `make_stretch_limits` keeps the flat sheet within the limit.
+        # `make_stretch_limits` keeps the flat sheet within the limit, apart from rounding errors.
         return 0.0 if flat > edge_force_n * (1.0 + 1e-6) else float(grid[0])
     pushed = model.evaluate(
         stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
@@ -322,7 +328,7 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Remove the advance from indentations (n,) whose depth or force cannot be felt (C1)."""
+    """Remove the advance smoothly (C1) from indentations (n,) that are too small to be felt."""
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
     advance = np.maximum(indentation - depths, 0.0)
@@ -345,11 +351,12 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """Compliance of the sheet with one stretch: its offset for each depth in one object.
+    """Offset of the sheet for each depth in one object, at a constant stretch.
 
-    stretch_ratio: constant over the push.
     note: which forces the sheet cannot render, and the error; empty if none.
-    centre: the whole push at the sheet's centre.
+    centre: rendered forces of a push at the sheet's centre.
+    _nodes: |x| and |y| of the positions on the sheet at which the offset was computed, m.
+    _indentation, _growth: indentation at these positions over the depth, and its derivative.
     """
 
     stretch_ratio: float
@@ -364,11 +371,11 @@ class Compliance:
 
     @property
     def max_depth_m(self) -> float:
-        """Return the maximum depth of the fit (m), beyond which the sheet moves with the finger."""
+        """Return the largest fitted depth (m), beyond which the sheet moves with the finger."""
         return float(self.centre.depths_m[-1])
 
     def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the sheet's indentation (n,) with the finger at depths (n,)."""
+        """Return the sheet's indentation (n,), m, with the finger at depths (n,) in the object."""
         depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.max_depth_m)
         result: Floats = self._indentation(depths) @ self._weights(position_m)
         return result
@@ -376,16 +383,16 @@ class Compliance:
     def normal_offset_m(
         self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
     ) -> Floats:
-        """Return the sheet's distance (n,) behind the object's tangent plane; negative before it.
+        """Return the sheet's distance (n,), m, behind the object's tangent plane; < 0 in front.
 
-        It is smooth (C1) in the depth and continuous in the position, and 0 without contact.
+        It is 0 without contact, smooth (C1) over the depth and continuous over the position.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, position_m)
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the offset's slope: from -`limits.max_advance_per_depth` to 1."""
+        """Return the slope of the offset over depth: -`limits.max_advance_per_depth` to 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:
@@ -393,9 +400,10 @@ class Compliance:
         return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
 
     def choose_filter_s(self) -> tuple[float, bool]:
-        """Return the depth's filter that keeps every hand stable, and whether one suffices.
+        """Choose the time constant (s) of the depth's low-pass filter so that hands are stable.
 
-        It is the shortest that permits the slopes of a push at the centre, otherwise the longest.
+        It is the shortest that permits the offset's slopes for a push at the centre.  If none does,
+        it is the longest, and the second result is False.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -410,7 +418,7 @@ class Compliance:
         return float(bounds.filters_s[-1]), False
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the sheet's force (n,), N, at depths (n,), by its model."""
+        """Return the force (n,), N, that the sheet's model predicts at depths (n,)."""
         return self.model.evaluate(
             self.stretch_ratio,
             self.indentation_m(depths_m, position_m),
@@ -419,10 +427,10 @@ class Compliance:
         ).force_n
 
     def _weights(self, position_m: SheetPosition) -> Floats:
-        """Return the nodes' weights (9,): linear in x^2 and y^2, since the sheet is symmetric.
+        """Return weights (9,) for interpolation between the positions of `_nodes`.
 
-        No weight is negative.  So the bounds at the nodes (force, advance, monotony) are also valid
-        between them.
+        They are linear in x^2 and y^2, since the sheet is symmetric.  No weight is negative, so the
+        bounds at these positions (force, advance, monotonicity) also hold between them.
         """
         weights = [
             _interpolate_squares(nodes, abs(at))
@@ -432,7 +440,7 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) of nodes (n,): linear in the square, constant beyond the last node."""
+    """Return weights (n,) for interpolation, linear in the squared coordinate, between `nodes`."""
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -451,8 +459,9 @@ def fit_compliance(
     usable_half_height_m: float,
     position_error_m: float,
 ) -> Compliance:
-    """Return the stretch and the offset that best render the curve for pushes to `max_depth_m`.
+    """Find the stretch and the offset that best render the curve for pushes to `max_depth_m`.
 
+    usable_half_height_m: maximum |y| of a push on the sheet.
     position_error_m: the scene's tolerance of the sheet's position.  The note reports an object
         that is so soft that this error changes its force noticeably.
     """
@@ -499,7 +508,7 @@ def fit_at_stretch(
     usable_half_height_m: float,
     position_error_m: float,
 ) -> Compliance:
-    """Return the offset that renders the curve with a given stretch; see `fit_compliance`."""
+    """Find the offset that best renders the curve with a given stretch; see `fit_compliance`."""
     rubber = model.rubber
     xs = 0.5 * rubber.width_m * np.array([0.0, 0.3, 0.5])
     ys = min(usable_half_height_m, 0.4 * rubber.height_m) * np.array([0.0, 0.6, 1.0])
@@ -533,11 +542,11 @@ def fit_at_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return which forces of a push the sheet cannot render, and the error; empty if none."""
+    """Describe which forces of a push the sheet cannot render, and the error; empty if none."""
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
     if off.any():
-        # The largest difference in newtons is the first that a finger notices.
+        # Report the largest difference in newtons, which a finger notices first.
         at = int(np.argmax(np.where(off, np.abs(rendered.force_n - rendered.object_force_n), 0.0)))
         cause = (
             "the edge force is at its limit"
@@ -563,21 +572,21 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
 
 
 def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
-    """Return the relative change of the force at maximum depth by an error of the position."""
+    """Return the relative change of force at maximum depth that a position error causes."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class StretchChoice:
-    """Stretch that renders an object's stiffness; `note` reports an unreachable stiffness."""
+    """Stretch that renders an object's stiffness; `note` reports a stiffness out of range."""
 
     stretch_ratio: float
     note: str
 
 
 def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
-    """Return minimum and maximum stretch: the scene's, within the usable edge force."""
+    """Return the stretch limits of the scene, reduced to the usable edge force and strain."""
     at_max_force = stretch_for_edge_force(
         USABLE_FRACTION * sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
@@ -590,9 +599,9 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 
 
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
-    """Return the stretch for an object of that stiffness (N/m, small pushes), without an offset.
+    """Return the stretch that renders an object's stiffness (N/m, small pushes) without an offset.
 
-    It follows from the linear model, which ignores the object's curve and the fingertip.
+    The linear model of the sheet ignores the object's curved force and the size of the fingertip.
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(
@@ -613,7 +622,9 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     note = ""
     if desired < least:
-        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {rendered:.0f}"
+        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet, {rendered:.0f} N/m"
     elif desired > largest:
-        note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {rendered:.0f}"
+        note = (
+            f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet, {rendered:.0f} N/m"
+        )
     return StretchChoice(stretch, note)

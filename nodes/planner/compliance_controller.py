@@ -1,4 +1,4 @@
-"""Control how the sheet complies: fit its stretch and offset to the soft body under the finger."""
+"""Control the sheet's compliance: fit its stretch and offset to the soft body under the finger."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 Floats = NDArray[np.float64]
 
 EQUAL_RATIO = 0.02
-"""Relative difference below which two curves count as equal: a seventh of the noticeable one."""
+"""Relative difference below which two force curves count as equal; users notice seven times it."""
 
 FIRST_DELAY_S = 0.06
-"""Delay before it is measured."""
+"""Assumed delay from a measured depth until the sheet has moved, until the delay is measured."""
 
 DELAY_HYSTERESIS_S = 0.03
-"""Decrease of the delay below which the bounds stay."""
+"""Decrease of the measured delay up to which the bounds of the offset's slope are kept."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
-"""Depths at which curves are compared, over the maximum depth."""
+"""Depths at which force curves are compared, as fractions of the maximum depth."""
 
 
 class ComplianceController:
     """Controller of the sheet's stretch and normal offset for the object under the finger.
 
-    hysteresis_ratio: share of the loading's energy that the rubber loses in a cycle; None: the
-        scene's.
-    bounds: on the offset's slope in the loop with the hand; None without a hand.
-    delay_s: from a measured depth until the sheet has moved by it.
-    filter_s: time constant of the depth from which the offset follows; None without bounds.
+    hysteresis_ratio: fraction of the energy of loading that the rubber loses in a cycle; None: the
+        value in the scene.
+    bounds: bounds on the offset's slope for a stable loop with the hand; None without a hand.
+    delay_s: time from a measured depth until the sheet has moved accordingly.
+    filter_s: time constant of the low-pass filter on the depth; None without bounds.
     mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
-        small pushes by the stretch only, like the paper.  "constant_stretch" keeps the minimum.
+        small pushes by the stretch (Furukawa et al. 2007).  "constant_stretch" keeps the minimum.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class ComplianceController:
 
         In contact the stretch stays constant, because moving edges could be felt.
 
-        Raises UnfitCurveError for an invalid force curve; the last fit then stays in use.
+        Raises UnfitCurveError for an invalid force curve; the last fit is then kept.
         """
         if self._mode == "constant_stretch":
             return
@@ -99,11 +99,11 @@ class ComplianceController:
 
     @property
     def delay_s(self) -> float:
-        """Return the delay from a measured depth until the sheet has moved by it."""
+        """Return the delay from a measured depth until the sheet has moved accordingly, s."""
         return self._delay_s
 
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
-        """Update the measured delay; a new fit follows outside contact if the bounds change."""
+        """Update the measured delay.  Outside contact, fit again if this changes the bounds."""
         self._delay_s = delay_s
         if self._bounds is None or in_contact:
             return
@@ -149,7 +149,7 @@ class ComplianceController:
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return why the model is invalid for the deepest push at the centre; empty if valid."""
+        """Return why the force model is invalid for the deepest push at the centre; "" if valid."""
         max_depth_m = self._scene.working_range.push_depth_m
         reason = self._model.invalid_reason(
             fitted.stretch_ratio,
@@ -164,9 +164,9 @@ class ComplianceController:
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
         """Return the sheet's offset behind the tangent plane (m), and its slope over the depth.
 
-        With hysteresis, each call adds a depth to the history of the finger.
+        With hysteresis, the result depends on the depths in earlier calls.
 
-        depth_m: of the finger in the object.
+        depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
@@ -181,7 +181,7 @@ class ComplianceController:
         return depth_m - scale * indented_m, 1.0 - scale * (1.0 - per_depth)
 
     def _force_exponent(self, indentation_m: float, position_m: SheetPosition) -> float:
-        """Return the relative change of the sheet's force over that of its indentation."""
+        """Return the local exponent of the sheet's force as a power of its indentation."""
         if indentation_m <= 0.0:
             return 1.0
         below, above = self._model.evaluate(

@@ -1,4 +1,8 @@
-"""Track the contact between finger and object: approach (the paper's Fig. 7a) and rolling (7b)."""
+"""Track the contact between the finger and the virtual object, and place the sheet there.
+
+During the approach the sheet waits in the tangent plane nearest to the finger (Furukawa et al.
+2007, Fig. 7a).  In contact it rolls on the object without slip (Fig. 7b).
+"""
 
 from __future__ import annotations
 
@@ -27,35 +31,36 @@ from flexsheet.nodes.planner.rolling import (
 Floats = NDArray[np.float64]
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
-"""Depths over the radius of curvature.  Up to the first, the contact is the surface point nearest
-to the finger; from the second on it moves as far as the finger moves along the sheet."""
+"""Ratios of the finger's depth to the radius of curvature.  Up to the first, the contact is the
+surface point nearest to the finger.  From the second, it moves as far as the finger moves along the
+sheet."""
 
 MIN_RADIUS_FRACTION = 0.15
-"""Minimum distance of a finger from a centre of curvature, over the radius.  A finger that is
-nearer is on no definite side of the object."""
+"""Minimum distance of a finger from a centre of curvature, as a fraction of the radius.  It is not
+clear on which side of the object a nearer finger is."""
 
 MIN_CURVATURE_PER_M = 1e-3
 MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
-"""Limits of plausible fingers, in the object's frame."""
+"""Maximum plausible distance of a finger from the object's origin, and its maximum speed."""
 
 MAX_TILT_RAD = 1.4
-"""Maximum tilt of the sheet in any scene.  Two normals within it are never opposite, so
-that the shortest rotation between them is unique."""
+"""Maximum tilt of the sheet in any scene.  Two normals within this tilt are never opposite, so that
+the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
-"""Minimum rim height that is reported; the sheet's own compliance covers less."""
+"""Minimum reported height of the object's rim around the contact; the sheet yields to less."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactLimits:
     """Limits of the sheet's motion, and thresholds of contact.
 
-    front: unit normal (3,) of the side that faces the user.
-    max_tilt_rad: maximum angle between the front and a normal.
+    front: unit vector (3,) from the object towards the user.
+    max_tilt_rad: maximum angle between `front` and the surface normal at a contact.
     max_spin_rad: maximum rotation of the sheet about its normal by rolling.
     half_width_m, half_height_m: maximum |x| and |y| of a contact on the sheet.
     contact_on_m, contact_off_m: distances from the sheet at which contact begins and ends.
-    max_depth_m: a finger that is deeper has passed through the object.
+    max_depth_m: depth beyond which a finger has passed through the object.
     """
 
     front: Floats
@@ -70,9 +75,9 @@ class ContactLimits:
 
 @dataclass(frozen=True, slots=True)
 class ContactCommand:
-    """Contact for the sheet, and the sheet's motion there.
+    """Contact that the sheet must present, and the sheet's motion there.
 
-    twist: (6,) of the sheet's centre in the object's frame, m/s and rad/s.
+    twist: velocity (6,) of the sheet's centre in the object's frame, m/s and rad/s.
     """
 
     phase: Phase
@@ -83,19 +88,20 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """An object that the sheet cannot present; the text names what to change."""
+    """An object whose surface the sheet cannot present; the text states what to change."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
 
 
 class ContactStateMachine:
-    """State machine of the contact of one finger: approach, contact and hold."""
+    """State machine of one finger's contact with the object: approach, contact and hold."""
 
     def __init__(self, shape: Shape, home: Floats, limits: ContactLimits) -> None:
-        """Start at the object's front; raises UnpresentableError if its normal exceeds the tilt.
+        """Start at the front of the object.
 
         home: axes (3, 3) of the waiting sheet; the third is close to `limits.front`.
+        Raises UnpresentableError if the surface normal there is tilted more than the maximum.
         """
         max_tilt_rad = min(limits.max_tilt_rad, MAX_TILT_RAD)
         self._shape, self._home = shape, home
@@ -105,7 +111,8 @@ class ContactStateMachine:
             lean_deg = np.degrees(np.arccos(first.normal @ limits.front))
             raise UnpresentableError(
                 f"the object's front is tilted by {lean_deg:.0f} degrees from the user, the sheet "
-                f"by at most {np.degrees(max_tilt_rad):.0f}; rotate it by object.world_from_object"
+                f"can tilt by {np.degrees(max_tilt_rad):.0f} degrees; rotate the object by "
+                "object.world_from_object in the scene"
             )
         self.contact = make_tangent_contact(home, first, limits.half_width_m)
         self._in_contact = False
@@ -153,10 +160,9 @@ class ContactStateMachine:
         return ContactCommand("approach", reason, self.contact, twist, 0.0)
 
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
-        """Return the contact on the sheet at its current pose.
+        """Return the contact at which the finger touches the sheet in its current pose.
 
-        The finger touches a moving sheet at its current point and rotation; then the sheet
-        rolls without slip and spin.
+        From there the sheet rolls without slip and spin.
         """
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
@@ -164,7 +170,7 @@ class ContactStateMachine:
         return replace(contact, axes=axes, position_sheet_m=np.clip(point_sheet[:2], -limit, limit))
 
     def _roll(self, finger: Floats, velocity: Floats) -> ContactCommand:
-        """Roll the sheet to the finger, or stop it with the reason."""
+        """Roll the sheet to the finger, or hold it and return the reason in the command."""
         contact, limits = self.contact, self._limits
         depth = max(0.0, -contact.height_m(finger))
         moved, self._finger = finger - self._finger, finger
@@ -184,7 +190,7 @@ class ContactStateMachine:
         self.contact = self._lift(rolled)
         if past is not None or limited:
             return self._hold(past or "beyond_tilt", depth)
-        # Deep inside, where the nearest point is arbitrary, stay on the sheet's side.
+        # Deep inside the object the nearest point is arbitrary; start the next search here.
         self._nearest_point = self.contact.point
         twist = compute_rolling_twist(self.contact, rate)
         return ContactCommand("contact", self._concavity_reason(), self.contact, twist, depth)
@@ -192,12 +198,12 @@ class ContactStateMachine:
     def _blend_contact(
         self, found: Nearest, moved: Floats, velocity: Floats, depth: float
     ) -> tuple[Nearest, Floats]:
-        """Return the surface point to which a finger in contact moves it, and its rate (3,) m/s.
+        """Return the surface point to which the finger moves the contact, and its rate (3,) m/s.
 
-        On the surface that is the nearest point.  Deep inside, the nearest point is arbitrary (at
-        an axis all sides are equally near), and the finger feels the deformed sheet; there the
-        sheet rolls as far as the finger moves along it.  Between the two depths both are blended,
-        so that stroking while pushing is continuous.
+        At small depths, that is the surface point nearest to the finger.  Deep inside the object,
+        the nearest point is arbitrary (on an axis all sides are equally near).  There the contact
+        moves as far as the finger moves along the sheet.  In between, both are blended, so that the
+        contact moves continuously when the finger strokes and pushes.
         """
         normal = self.contact.normal
         tangential = np.eye(3) - np.outer(normal, normal)
@@ -216,7 +222,7 @@ class ContactStateMachine:
     def _roll_within_sheet(
         self, contact: SheetContact, found: Nearest
     ) -> tuple[SheetContact, SheetReason | None]:
-        """Roll to a point, or to the limit of the sheet, and return which limit was reached."""
+        """Roll to a surface point, or to the limit on the sheet; also return the reached limit."""
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         excess = np.abs(rolled.position_sheet_m) - limit
@@ -231,7 +237,7 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        """Return the contact lifted by the height to which the object rises around it."""
+        """Return the contact with the sheet lifted above the object's surface around it."""
         return replace(contact, lift_m=compute_rim_lift_m(self._shape, contact))
 
     def _concavity_reason(self) -> SheetReason:
@@ -242,16 +248,16 @@ class ContactStateMachine:
 
 
 def _is_too_deep(found: Nearest) -> bool:
-    """Return whether a new finger is so far inside that it is on no definite side."""
+    """Return whether a new finger is so deep that its side of the object is not clear."""
     curvature = tightest_curvature(found.shape_operator)
     return bool(1.0 + found.height_m * curvature < MIN_RADIUS_FRACTION)
 
 
 def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
-    """Return the rate (3,) m/s of the nearest point.
+    """Return the rate (3,) m/s of the surface point that is nearest to a moving finger.
 
-    Near a centre of curvature it would be unbounded; it is limited as at `MIN_RADIUS_FRACTION`, and
-    it is 0 at the centre.
+    Near a centre of curvature the rate is not bounded.  It is therefore limited to its value at
+    `MIN_RADIUS_FRACTION`, and is 0 at the centre itself.
     """
     try:
         rate = projection_jacobian(found) @ velocity
@@ -262,5 +268,5 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,); NaN and infinity are preserved."""
+    """Return the length of a vector (3,); NaN or infinity remain visible in the result."""
     return hypot(*vector.tolist())

@@ -1,4 +1,4 @@
-"""Cache the table of a sheet's force, whose computation needs one to two minutes."""
+"""Cache the force table of a scene's sheet, whose computation needs one to two minutes."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
 VERSION = 1
-"""Version of the computation; another version computes the table again."""
+"""Version of the computation; tables of another version are computed again."""
 
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
-"""Fields of `TabulatedSheetModel` that are in the file."""
+"""Fields of `TabulatedSheetModel` that the cache file contains."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
-"""Sample points, over the sheet's width and height."""
+"""Positions x and y in the table, as fractions of the sheet's width and height."""
 
 FORCE_MODELS: dict[str, Callable[[Rubber], SheetForceModel]] = {
     "linear": LinearSheetModel,
@@ -39,7 +39,7 @@ FORCE_MODELS: dict[str, Callable[[Rubber], SheetForceModel]] = {
 
 
 def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
-    """Describe the cache file of the scene's table."""
+    """Define key and format of the cache file for a scene's force table."""
     rubber = make_rubber(scene.sheet)
     depends_on = {
         "version": VERSION,
@@ -65,7 +65,7 @@ def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TabulatedSheetModel:
-    """Return the scene's cached table, or compute it by the membrane's finite elements."""
+    """Return the cached force table of a scene, or compute it by finite elements and store it."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
     return cached(
@@ -85,9 +85,9 @@ def load_or_compute(
 def load_force_model(
     scene: Scene, method: SheetForceMethod, cache_dir: Path | None
 ) -> tuple[SheetForceModel, str]:
-    """Return the force model of the scene's ideal sheet, and a note for the operator.
+    """Return the force model of the scene's sheet without calibration, and a note for the operator.
 
-    The scaled model replaces a table that is not cached.
+    If the method is "table" and the table is not cached, the scaled model is used instead.
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":

@@ -1,4 +1,4 @@
-"""Cache the bounds of the sheet's offset for a camera's rate, whose computation needs seconds."""
+"""Cache the bounds of `nodes.models.hand_loop` for a camera's rate; computing them is slow."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.nodes.models.hand_loop import OffsetBoundsTable, compute_offset_b
 from flexsheet.nodes.planner.compliance import MAX_ADVANCE_PER_DEPTH
 
 VERSION = 1
-"""Version of the computation; another version computes the table again."""
+"""Version of the computation; tables of another version are computed again."""
 
 
 def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:

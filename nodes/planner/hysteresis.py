@@ -1,23 +1,23 @@
 """Correct the sheet's indentation for the hysteresis of its rubber.
 
-Loading needs 1 + h of the elastic force and unloading gives 1 - h of it, with h = r / (2 - r) for
-rubber that loses the share r of the loading's energy. After a reversal of the finger the factor
-changes linearly with its travel.
+While the finger moves inwards (loading), the force is 1 + h times the elastic force, and 1 - h
+times while it moves outwards. Here h = r / (2 - r), and r is the fraction of the energy of loading
+that the rubber loses. After the finger reverses, the factor changes linearly with its travel.
 """
 
 from __future__ import annotations
 
 REVERSAL_RATIO = 0.2
-"""Travel over which the factor reverses completely, over the depth."""
+"""Travel over which the factor changes completely, as a fraction of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""Minimum travel of a reversal, so that tremor at small depths does not reverse it."""
+"""Minimum of this travel, so that tremor at small depths does not reverse the factor."""
 
 
 class HysteresisCorrection:
-    """Factor between the sheet's force and its elastic force, by the finger's depth so far.
+    """Ratio of the sheet's force to its elastic force, which follows from the finger's depths.
 
-    ratio: share of the loading's energy that a cycle loses.
+    ratio: fraction of the energy of loading that is lost in a cycle.
     """
 
     def __init__(self, ratio: float) -> None:
@@ -25,9 +25,9 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Add a depth of the finger and return the force over the elastic force there.
+        """Add a depth of the finger, and return the ratio of force to elastic force there.
 
-        The first contact is loading. The same depth again changes nothing.
+        A contact begins with loading. A repeated depth changes nothing.
         """
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0

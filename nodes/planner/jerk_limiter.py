@@ -1,9 +1,9 @@
 """Move the sheet towards a target with limited speed, acceleration and jerk.
 
-The state of a vector is its position, its mean velocity over the last step, and the acceleration at
-that time.  Each step first determines the desired velocity: towards the target, and slow enough to
-stop there.  Then it determines the acceleration that reaches this velocity without overshoot.  Then
-it moves the present acceleration towards that one as far as the jerk allows.
+Position, orientation and stretch are each limited in three stages per step.  The first determines
+the desired velocity towards the target, slow enough to stop there.  The second determines the
+acceleration that reaches this velocity without overshoot.  The third changes the present
+acceleration towards that one as far as the jerk allows.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector
 Floats = NDArray[np.float64]
 
 TAPER_FRACTION = 0.5
-"""Fraction of the jerk with which the acceleration decreases as the velocity is reached."""
+"""Fraction of the maximum jerk with which the acceleration falls to 0 at the desired velocity."""
 
 LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
 
@@ -42,9 +42,9 @@ class JerkBounds:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimitedState:
-    """Motion of a sheet, and the state from which the next step continues.
+    """Motion of the sheet, with the values from which the next step continues.
 
-    mean_velocity, acceleration: (7,) over the last step: linear, angular, stretch ratio.
+    mean_velocity, acceleration: means (7,) over the last step: linear, angular, stretch ratio.
     """
 
     sheet: SheetMotion
@@ -53,7 +53,7 @@ class JerkLimitedState:
 
     @staticmethod
     def at_rest(sheet: SheetMotion) -> JerkLimitedState:
-        """Return the state of a sheet that is at rest in its pose."""
+        """Return the state of the sheet at rest in this pose."""
         still = replace(sheet, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
         return JerkLimitedState(still, np.zeros(7), np.zeros(7))
 
@@ -69,7 +69,7 @@ def limit_jerk(
 ) -> tuple[Floats, Floats]:
     """Return mean velocity and acceleration (n,) of the next step towards a goal velocity (n,).
 
-    The acceleration never exceeds its limit, and never changes by more than max_jerk step_s.
+    The acceleration never exceeds its limit, and never changes by more than max_jerk * step_s.
     """
     change = goal_velocity - mean_velocity
     size = measure_length(change)
@@ -96,9 +96,9 @@ def step_sheet(
     edges: EdgeBound,
     step_s: float,
 ) -> JerkLimitedState:
-    """Return the sheet `step_s` (> 0) later, moved towards `target` at that time.
+    """Return the sheet `step_s` (> 0) later, moved towards its target at that time.
 
-    With the target None, the sheet is brought to rest.
+    target: None brings the sheet to rest.
     """
     goals = (
         np.zeros(7)
@@ -125,7 +125,7 @@ def step_sheet(
         rotation_from_vector(mean[ANGULAR] * step_s) @ before[:3, :3],
         before[:3, 3] + mean[LINEAR] * step_s,
     )
-    # The mean is the velocity in the middle of the step.
+    # The mean velocity is that at half of the step.
     final = mean + 0.5 * step_s * acceleration
     sheet = SheetMotion(
         pose,
@@ -176,13 +176,13 @@ def _desired_velocities(
 def share_edge_speed(
     edges: EdgeBound, speeds: tuple[float, float], distances: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the factors (0..1) on linear and angular speed that meet the edges' speed limit.
+    """Return the factors (0..1) on linear and angular speed that keep the edges' speed limit.
 
-    speeds, distances: linear (m/s, m) and angular (rad/s, rad), to the target.
+    speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
 
-    Each gets its part of the remaining path of the edges, so that both arrive together; what one
-    leaves unused the other gets. With one common factor, a short displacement took half of the
-    speed from a long rotation.
+    The limit is divided in proportion to the remaining distances, so that translation and rotation
+    end together.  A part that one does not need goes to the other.  A common factor would let a
+    short translation take half of the speed from a long rotation.
     """
     limit, reach = edges.speed_m_per_s, edges.reach_m
     linear, angular = speeds[0], reach * speeds[1]

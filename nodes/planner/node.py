@@ -1,4 +1,4 @@
-"""Wire the planner: fingertips and soft body in, sheet targets out."""
+"""Define the planner node, which computes sheet targets from fingertips and the soft body."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlann
 
 FIRST_HORIZON_S = 0.05
 MAX_FUTURE_S = 0.005
-"""A fingertip that is stamped further in the future is refused."""
+"""Maximum time by which the timestamp of a usable fingertip may lie in the future."""
 
 
 def _is_finite(fingertip: Fingertip) -> bool:
@@ -47,7 +47,7 @@ def _is_finite(fingertip: Fingertip) -> bool:
 
 
 class Planner(Node):
-    """Publish one sheet target per fingertip; equal inputs give equal bytes."""
+    """Publish one sheet target per fingertip; equal inputs give identical messages."""
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency"})
 

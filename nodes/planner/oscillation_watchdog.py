@@ -1,4 +1,4 @@
-"""Detect an oscillation of finger and sheet that the sheet drives, and fade its motion out."""
+"""Detect oscillations of finger and sheet that the sheet drives, and fade out its motion."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ from collections import deque
 import numpy as np
 
 WINDOW_S = 1.4
-"""Time over which amplitudes are compared: its halves contain a period of 1.4 Hz."""
+"""Time over which amplitudes are compared; each half contains a period of 1.4 Hz."""
 
 MIN_AMPLITUDE_M = 2e-4
-"""Root mean square of the depth below which an oscillation cannot be felt as such."""
+"""Amplitude of the depth (root mean square) below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""Growth of the amplitude from the first half of the window to the second."""
+"""Growth of the amplitude over the window, second half to first, that triggers the watchdog."""
 
 STEADY_RATIO = 0.95
 SUSTAINED_S = 1.5
-"""Time after which an oscillation is stopped that the sheet drives and that does not decay."""
+"""An oscillation that the sheet drives also triggers the watchdog if its amplitude stays above this
+ratio for this time."""
 
 FADE_S = 0.3
-"""Time in which the sheet's motion with the finger fades out."""
+"""Time in which the motion of the sheet's offset fades out."""
 
 SLOW_S = 0.35
-"""Time constant of the slow part of depth and offset, which is not an oscillation."""
+"""Time constant of the slow part of depth and offset, which does not count as oscillation."""
 
 
 class OscillationWatchdog:
-    """Watchdog of the sheet's offset: reduces the sheet to a passive one.
+    """Watchdog that stops the motion of the sheet's offset if it drives an oscillation.
 
-    The sheet delivers energy to the finger if its offset runs behind the depth: the integral of the
-    offset over the depth is positive in a cycle.  A person who moves back and forth against the
-    sheet loses energy to it, so that only an unstable loop triggers the watchdog.
+    The sheet delivers energy to the finger if the integral of the offset over the depth is positive
+    in a cycle.  A person who moves back and forth against the sheet loses energy to it, so that
+    only an unstable loop triggers the watchdog.
 
-    weight: factor of the offset's motion, from 1 (follows the finger) to 0 (passive).
+    weight: factor on the offset's motion, from 1 (follows the finger) to 0 (at rest).
     """
 
     def __init__(self) -> None:
@@ -46,7 +47,7 @@ class OscillationWatchdog:
         self._fading = False
 
     def reset(self) -> None:
-        """Start again with a sheet that follows; called without contact."""
+        """Start again with the weight 1; called when there is no contact."""
         triggers = self.triggers
         self.__init__()  # type: ignore[misc]
         self.triggers = triggers
@@ -54,7 +55,7 @@ class OscillationWatchdog:
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
         """Return the weight after a measurement.
 
-        depth_m: measured. offset_m: of the sheet at the time of the measurement.
+        depth_m: measured depth.  offset_m: offset of the sheet at the time of the measurement.
         """
         if self._slow is None:
             self._slow = (depth_m, offset_m)
@@ -65,7 +66,8 @@ class OscillationWatchdog:
             slow_offset + blend * (offset_m - slow_offset),
         )
         now = (depth_m - self._slow[0], offset_m - self._slow[1])
-        # The force on the finger falls with the offset, so the sheet's work is offset d(depth).
+        # The force on the finger falls with the offset.  The sheet's work on the finger is thus
+        # proportional to the integral of the offset over the depth.
         work = 0.5 * (now[1] + self._last[1]) * (now[0] - self._last[0])
         self._last = now
         self._samples.append((step_s, now[0], work))
@@ -94,5 +96,5 @@ class OscillationWatchdog:
 
 
 def _changes_sign(depths: np.ndarray) -> bool:
-    """Return whether the depths (n,) swing to both sides at least twice."""
+    """Return whether the depths (n,) change their sign at least twice."""
     return int(np.count_nonzero(np.diff(np.sign(depths)))) >= 2

@@ -21,66 +21,68 @@ class PlannerParameters(NodeParameters):
 
     prediction_horizon_s: NonNegative | None = Field(
         default=None,
-        description="time from the exposure for which the sheet is planned; null: the "
-        "fingertips' mean age plus the actuation delay",
+        description="time from the camera exposure to the time for which the sheet is planned, s; "
+        "null: mean age of fingertips plus actuation delay",
     )
     actuation_delay_s: NonNegative = Field(
         default=0.036,
-        description="time from a fingertip's publication until the sheet moves; with "
-        "measure_actuation_delay, until it is measured",
+        description="time from a fingertip's publication until the sheet has moved, s; with "
+        "measure_actuation_delay, the value until it is measured",
     )
     measure_actuation_delay: bool = Field(
-        default=True, description="use the delay that the arms measure"
+        default=True, description="use the actuation delay that the arms measure"
     )
     max_actuation_delay_s: Positive = Field(
-        default=0.15, description="maximum delay that is measured and used"
+        default=0.15, description="maximum actuation delay that is measured and used, s"
     )
     compliance_mode: ComplianceMode | Literal["auto"] = Field(
         default="auto",
-        description="force_curve: render the object's force over depth, by stretch and normal "
-        "offset; stiffness: render its stiffness by the stretch alone, as the paper does; "
-        "constant_stretch: render no force; auto: that of the scene's methods, else force_curve; a "
-        "rigid object always has a constant stretch",
+        description="force_curve: render the object's force over depth, by stretch and offset of "
+        "the sheet; stiffness: render its stiffness by the stretch alone (Furukawa et al. 2007); "
+        "constant_stretch: render no force; auto: the mode in the scene's methods, otherwise "
+        "force_curve; for a rigid object always constant_stretch",
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
-        """Return the mode for a scene; a rigid object needs a constant stretch."""
+        """Return the compliance mode for a scene; for a rigid object it is constant_stretch."""
         if scene.object.material is None:
             return "constant_stretch"
         return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
 
     sheet_calibration: SheetCalibrationFile | None = Field(
         default=None,
-        description="file of `calibrate sheet`; null: ideal rubber with the scene's modulus",
+        description="file from `flexsheet calibrate sheet`; null: ideal rubber with the modulus in "
+        "the scene",
     )
     sheet_force: SheetForceMethod | Literal["auto"] = Field(
         default="auto",
-        description="force model of ideal rubber; auto: that of the scene's methods, else scaled; "
-        "a calibration has its own model",
+        description="force model of the sheet without a calibration; auto: the model in the "
+        "scene's methods, otherwise scaled",
     )
     cache_dir: Path | None = Field(
-        default=None, description="folder of the sheet's force table; null: the user's cache"
+        default=None,
+        description="folder of cached tables of the sheet's force; null: the user's cache",
     )
     contact_on_m: float = Field(
-        default=0.0005, description="distance from the sheet at which contact starts"
+        default=0.0005, description="distance of finger and sheet at which contact starts, m"
     )
     contact_off_m: Positive = Field(
-        default=0.003, description="distance from the sheet at which contact ends"
+        default=0.003, description="distance of finger and sheet at which contact ends, m"
     )
-    max_age_s: Positive = Field(default=0.1, description="maximum age of a fingertip in use")
+    max_age_s: Positive = Field(default=0.1, description="maximum age of a usable fingertip, s")
     tilt_margin_rad: NonNegative = Field(
-        default=0.14, description="angle by which the sheet may exceed the scene's tilt"
+        default=0.14, description="angle by which the sheet may exceed the scene's tilt, rad"
     )
     max_spin_rad: Positive = Field(
-        default=0.35, description="maximum rotation of the sheet about its normal by rolling"
+        default=0.35, description="maximum rotation of the sheet about its normal by rolling, rad"
     )
     speed_m_per_s: Positive = Field(default=0.18, description="maximum speed of the sheet's centre")
     acceleration_m_per_s2: Positive = Field(
         default=2.0, description="maximum acceleration of the sheet's centre"
     )
-    turn_rad_per_s: Positive = Field(default=2.0, description="maximum angular speed")
+    turn_rad_per_s: Positive = Field(default=2.0, description="maximum angular speed of the sheet")
     turn_acceleration_rad_per_s2: Positive = Field(
-        default=12.0, description="maximum angular acceleration"
+        default=12.0, description="maximum angular acceleration of the sheet"
     )
     stretch_rate_per_s: Positive = Field(
         default=0.03, description="maximum rate of the stretch ratio"
@@ -89,7 +91,9 @@ class PlannerParameters(NodeParameters):
         default=0.3, description="maximum acceleration of the stretch ratio"
     )
     jerk_m_per_s3: Positive = Field(default=60.0, description="maximum jerk of the sheet's centre")
-    turn_jerk_rad_per_s3: Positive = Field(default=1000.0, description="maximum angular jerk")
+    turn_jerk_rad_per_s3: Positive = Field(
+        default=1000.0, description="maximum angular jerk of the sheet"
+    )
     stretch_jerk_per_s3: Positive = Field(
         default=9.0, description="maximum jerk of the stretch ratio"
     )

@@ -3,9 +3,8 @@
 All vectors are in the object's frame.  The sheet's frame has x from the left edge to the right, y
 along the edges and z out of the object; a point on the sheet is (x, y) in it.  Rolling without slip
 or spin moves the sheet's axes along the contact's path by parallel transport.  The contact's path
-on the sheet is the development of that on the object: the arc AB is as long as A'B on the sheet
-(the paper's Fig. 7b, for any smooth shape).  Source: do Carmo, Differential Geometry of Curves and
-Surfaces, section 4-4.
+on the sheet has the same length as its path on the object (Furukawa et al. 2007, Fig. 7b, for any
+smooth shape).  Source: do Carmo, Differential Geometry of Curves and Surfaces, section 4-4.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from flexsheet.nodes.models.shapes import Nearest, Shape
 Floats = NDArray[np.float64]
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""Resolution of the search for the last point within the tilt, over the distance searched."""
+"""Resolution of the search for the last point within the tilt, over the searched distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""Resolution where the search passes far inside the object: a step there is many degrees on the
-surface.  It applies until the tilt is within this angle of the limit."""
+"""Finer resolution for a search that passes deep inside the object, where a step changes the normal
+by many degrees.  It applies until the tilt is within this angle of the limit."""
 
 RIM_RADIUS_M = 0.03
 """Radius around the contact within which the object may rise above the tangent plane."""
@@ -36,11 +35,11 @@ RIM_RADIUS_M = 0.03
 class SheetContact:
     """Contact of the sheet with the object.
 
-    point, normal: (3,) of the surface.
-    shape_operator: (3, 3), 1/m.
-    axes: (3, 3), columns: axes of the sheet; the third is the normal.
+    point, normal: surface point (3,) and unit normal (3,).
+    shape_operator: derivative (3, 3) of the normal along the surface (its curvature), 1/m.
+    axes: (3, 3), whose columns are the axes of the sheet; the third is the normal.
     position_sheet_m: (x, y) of the contact on the sheet.
-    lift_m: distance of the sheet's plane from the point, where the object is concave.
+    lift_m: distance of the sheet's plane from the point where the object is concave, otherwise 0.
     """
 
     point: Floats
@@ -70,12 +69,12 @@ class SheetContact:
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
     """Rotate axes (3, 3) by the smallest rotation that maps the third one to `normal`.
 
-    That is parallel transport along the shorter arc between both normals; it is undefined for
-    opposite ones.  The result is exactly orthogonal.
+    This is parallel transport along the shorter arc between both normals.  It is undefined for
+    opposite normals.  The result is orthogonal without rounding drift.
     """
     both = axes[:, 2] + normal
-    # Two reflections (Householder): one maps the negated third axis to the normal; the one across
-    # the plane of the first two axes leaves those unchanged.  This is the smallest rotation.
+    # The rotation is the product of two Householder reflections.  The first one negates the third
+    # axis and leaves the others unchanged; the second one maps the negated axis to the normal.
     result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
     result[:, 2] = normal
     return result
@@ -84,8 +83,9 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
     """Return the contact after the sheet has rolled to another surface point, a short step away.
 
-    The displacement on the sheet is the chord in the plane half way between both tangent planes,
-    scaled from chord to arc.  It is exact on circles, and of third order in the angle elsewhere.
+    The chord between both points is projected onto the plane halfway between the tangent planes,
+    and scaled to the length of the arc.  This gives the displacement of the contact on the sheet.
+    It is exact on circles; elsewhere its error is of third order in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -104,10 +104,11 @@ def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
 
 
 def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> SheetContact:
-    """Return the contact of a sheet at a surface point, waiting for an approaching finger.
+    """Return the contact of a sheet that waits at a surface point for an approaching finger.
 
-    Its axes are those of `home` (3, 3), transported to the normal.  The contact is on the sheet's
-    horizontal centre line.  Along x the sheet's centre stays over the object's, within the sheet.
+    The sheet's axes are `home` (3, 3), rotated to the normal.  The contact is on the sheet's
+    horizontal centre line, and at most `half_width_m` from its centre.  Within this limit, the
+    sheet's centre stays in front of the object's origin along x.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -117,7 +118,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
-    Without spin the sheet rotates by n x dn; without slip its point in contact is at rest.
+    Without spin, the angular velocity is n x dn/dt, with the normal n.  Without slip, the sheet's
+    point in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -131,8 +133,8 @@ def compute_tangent_twist(
 ) -> Floats:
     """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
 
-    Its axes follow from `home` by the smallest rotation.  With h, the third axis of home, they
-    rotate by n x dn and, about the normal n, by -(h x n) dn / (1 + h n).
+    Its axes follow from `home` by the smallest rotation.  Their angular velocity is n x dn/dt, and
+    about the normal n it is -(h x n) . dn/dt / (1 + h . n).  Here h is the third axis of `home`.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -149,13 +151,13 @@ def compute_tangent_twist(
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross product (3,); np.cross is several times slower for one pair."""
+    """Return the cross product (3,) of two vectors, several times as fast as np.cross."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the rotation about the normal from the transported axes of `home` to `axes`."""
+    """Return the rotation of `axes` about the normal, relative to `home` rotated to the normal."""
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
 
@@ -163,14 +165,14 @@ def measure_spin_rad(axes: Floats, home: Floats) -> float:
 def limit_tilt(
     shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """Return the last point towards `found` whose normal is within the tilt.
+    """Return the last surface point towards `found` whose normal is within the maximum tilt.
 
-    Also return whether it is another point than `found`.
+    Also return whether it differs from `found`.
 
-    start: the surface point from which the search starts, itself within the tilt.  The search
-        follows the straight line to `found` in growing steps and projects each onto the surface,
-        which keeps it on the sheet's side.  The first step is the smallest one; it suffices for a
-        sheet that is at the limit already.
+    front: unit vector (3,) from which the tilt is measured.
+    start: surface point within the tilt, from which the search starts.  The search follows the
+        straight line to `found` in growing steps and projects each onto the surface, so that it
+        stays on the sheet's side.  It begins with a small step, which suffices at the limit.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:
@@ -188,9 +190,10 @@ def limit_tilt(
 
 
 def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
-    """Return the offset (m) of the tangent plane that clears the object around the contact.
+    """Return how far (m) to lift the tangent plane so that the object does not penetrate it.
 
-    It is 0 where the object is not concave.  A finger deforms the sheet within `RIM_RADIUS_M`.
+    It is 0 where the object is not concave.  Only the surface within `RIM_RADIUS_M` of the contact
+    counts, the region in which a finger deforms the sheet.
     """
     return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 

@@ -1,4 +1,4 @@
-"""Compare the sheet of the scene with its calibration."""
+"""Compare the stiffness of the sheet in the scene with its calibration."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ MAX_STIFFNESS_RATIO = 0.05
 def check_stiffness(
     sheet: SheetSpec, calibration: SheetCalibration | None
 ) -> tuple[SelfCheck, ...]:
-    """Return the check of modulus times thickness; none without a calibration.
+    """Return the check of Young's modulus times thickness, or () without a calibration.
 
-    The planner's forces are those of the calibration. The limits of the edges' force and the sag
-    follow from the scene.
+    A difference matters because rendered forces follow from the calibration, but the limits of the
+    edge force and the sag from the scene.
     """
     if calibration is None:
         return ()

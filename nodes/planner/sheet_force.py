@@ -32,16 +32,16 @@ ReferenceForce = Callable[[SheetSpec, float, float, SheetPosition, float], float
 
 
 def make_rubber(sheet: SheetSpec) -> Rubber:
-    """Return the scene's sheet as ideal (neo-Hookean) rubber."""
+    """Convert the sheet of a scene to ideal (neo-Hookean) rubber."""
     return Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
 
 
 def make_force_model(
     sheet: SheetSpec, calibration: SheetCalibration | None = None
 ) -> SheetForceModel:
-    """Return the calibrated force model; without a calibration, the scaled model of the sheet.
+    """Return the calibrated force model; without a calibration, `ScaledSheetModel` of the sheet.
 
-    Raises CalibrationMismatchError for a calibration of a sheet of other sizes.
+    Raises CalibrationMismatchError if the calibrated sheet has another size.
     """
     rubber = make_rubber(sheet)
     if calibration is None:
@@ -76,7 +76,7 @@ def compute_membrane_table(
     depths_m: Floats = TABLE_DEPTHS_M,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Compute the table with the membrane's finite elements: a push per stretch and position."""
+    """Compute the table by finite elements of the membrane: one push per stretch and position."""
 
     def measure(stretch_ratio: float, depths: Floats, position_m: SheetPosition) -> Floats:
         return push_path(
@@ -108,16 +108,16 @@ BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.25, 0.0),
     ("near the free edge", 0.0, 0.36),
 )
-"""Names, x over the width, and y over the height."""
+"""Benchmarked positions: name, x as a fraction of the width, and y as a fraction of the height."""
 
 
 MakeTable = Callable[[Scene], TabulatedSheetModel]
 
 
 def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) -> Family:
-    """Return the family: every model from slack to maximum stretch, over depths and positions.
+    """Make the family of force models, with trials over stretch, depth and position.
 
-    make_table: loads or computes the table; None: omit the models that need minutes.
+    make_table: function that loads or computes the table; None: omit models that need minutes.
     """
     return Family(
         name="sheet-force",

@@ -13,11 +13,11 @@ OffsetAtDepth = Callable[[float], float]
 
 
 class StabilizedOffset:
-    """Offset of the sheet behind the object's tangent plane, during one contact after another.
+    """Offset of the sheet behind the object's tangent plane, computed separately for each contact.
 
-    The depth is measured, not predicted, and passes a low-pass filter: a prediction in this path
-    moves the worst frequency up to that of a hand.  The offset never exceeds the depth, so that the
-    sheet stays with a finger that leaves.
+    It follows from the measured, low-pass filtered depth.  A predicted depth would shift the least
+    stable frequency of the loop into the range of hand oscillation.  The offset never exceeds the
+    depth, so that the sheet stays in contact with a finger that moves away.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,9 @@ class StabilizedOffset:
     ) -> tuple[float, float]:
         """Return the offset (m) and its rate (m/s) after a measurement.
 
-        step_s: since the last measurement. delay_s: from a measurement until the sheet has moved.
+        offset_at_depth: function from the depth to the offset, m.  step_s: time since the last
+        measurement.  filter_s: time constant of the low-pass filter.  delay_s: time from a
+        measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:
             self._restart()
@@ -58,7 +60,7 @@ class StabilizedOffset:
         return offset_m, rate_m_per_s
 
     def _offset_at(self, delay_s: float) -> float:
-        """Return the offset at which the sheet is, commanded `delay_s` ago; 0 before the first."""
+        """Return the present offset of the sheet, which was commanded `delay_s` ago; at first 0."""
         while len(self._commanded) > 1 and self._commanded[1][0] <= self._time_s - delay_s:
             self._commanded.popleft()
         if not self._commanded or self._commanded[0][0] > self._time_s - delay_s:

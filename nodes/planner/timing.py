@@ -1,24 +1,24 @@
-"""Order fingertips by their exposures, and adapt the prediction horizon."""
+"""Order measured fingertips by the times of their exposures, and adapt the prediction horizon."""
 
 from __future__ import annotations
 
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""Number of late fingertips in a row, with rising stamps, that indicate a clock step."""
+"""Number of late fingertips in a row, with rising timestamps, that indicate a step of the clock."""
 
 MIN_STEP_NS = 1_000_000
-"""Minimum interval between two exposures; no camera is faster."""
+"""Minimum plausible interval between two exposures; no camera is faster."""
 
 AGE_WEIGHT = 0.05
-"""Weight of the newest age in the mean; at 60 Hz the mean spans a third of a second."""
+"""Weight of the newest age in the running mean; at 60 Hz the mean spans a third of a second."""
 
 DELAY_WEIGHT = 0.11
-"""Weight of the newest report of an arm in the mean; at 5 Hz the mean spans 1.8 s."""
+"""Weight of an arm's newest report in the running mean; at 5 Hz the mean spans 1.8 s."""
 
 
 class MonotonicTimestampFilter:
-    """Filter that passes fingertips in the order of their exposures.
+    """Filter that passes measured fingertips only in the order of their exposures.
 
     A late fingertip is dropped, because the sheet is already planned for a later time.
     `RESTART_COUNT` late ones in a row mean that the clock has stepped back; the filter then
@@ -46,10 +46,10 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """Estimator of the time from a fingertip's publication until the arms have moved by it.
+    """Estimator of the delay from a fingertip's publication until the arms have moved accordingly.
 
-    It is the latency that the arms report, less the mean age of published fingertips.  delay_s: the
-    mean of both arms; before reports the initial value; always between 0 and the maximum.
+    It is the latency that the arms report, less the mean age of published fingertips.
+    delay_s: mean over both arms, from 0 to the maximum; before any report, the initial value.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:
@@ -59,12 +59,12 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add the age at its publication of a fingertip that leads to a target."""
+        """Add a fingertip that leads to a target; age_s: its age when it was published."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
     def on_latency(self, side: Side, latency_s: float) -> None:
-        """Add the reported time from exposures until an arm has moved; ignore implausible ones."""
+        """Add a reported latency from exposure until the arm has moved; ignore implausible ones."""
         if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return
         before_s = self._delays_s.get(side, self._initial_s)
@@ -75,10 +75,10 @@ class ActuationDelayEstimator:
 def update_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
     """Return the prediction horizon (s) of the next target.
 
-    The horizon follows slowly, so that one late fingertip does not make the sheet's time jump.
+    The horizon changes slowly, so that the sheet does not jump after one late fingertip.
 
-    horizon_s: of the last target.
-    needed_s: from the exposure until the sheet reaches the target.
-    max_s: end of the fingertip's predicted path.
+    horizon_s: prediction horizon of the last target.
+    needed_s: time from the exposure until the sheet reaches the target.
+    max_s: duration of the fingertip's predicted path.
     """
     return horizon_s + AGE_WEIGHT * (min(max(needed_s, 0.0), max_s) - horizon_s)

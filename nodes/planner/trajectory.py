@@ -1,6 +1,6 @@
-"""Plan the sheet's trajectory: the next motion of the sheet for each fingertip.
+"""Plan the sheet's trajectory: the next motion of the sheet for each measured fingertip.
 
-`SheetTrajectoryPlanner` is deterministic: it reads stamps and measurements, and no clock.
+`SheetTrajectoryPlanner` is deterministic: it uses timestamps and measurements, but no clock.
 """
 
 from __future__ import annotations
@@ -30,30 +30,31 @@ from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 Floats = NDArray[np.float64]
 
 EDGE_SPEED_FRACTION = 0.7
-"""Fraction of the tool speed that is planned with; the rest lets a late arm catch up."""
+"""Fraction of the maximum tool speed that the plan uses; the rest lets a late arm catch up."""
 
 EDGE_MARGIN_M = 0.03
-"""Minimum distance of a contact from a clamped edge; closer, the finger would push the clamp."""
+"""Minimum distance of a contact from a clamped edge, so that the finger does not push the clamp."""
 
 MAX_DEPTH_FRACTION = 1.4
-"""Depth, over the scene's push depth, beyond which a finger has passed through the object."""
+"""Ratio of depth to the scene's push depth above which a finger has passed through the object."""
 
 MAX_STEP_S = 0.1
-"""Gap after which the sheet restarts from rest at its last pose: the arms have stopped."""
+"""Gap between fingertips after which the sheet restarts from rest, since the arms have stopped."""
 
 
 KEEP_S = 0.15
-"""Time for which a trajectory keeps the twist: a lost packet is repeated within 0.1 to 0.15 s."""
+"""Time for which a trajectory keeps the velocity, so that arms continue until a lost packet is
+repeated (0.1 to 0.15 s)."""
 
 MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
-"""Shortest and longest deceleration at the end of a trajectory."""
+"""Minimum and maximum duration of the deceleration at the end of a trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
-    """Result of one step, in the world frame.
+    """Result of one planning step, in the world frame.
 
-    trajectory: motion after it, if no newer target arrives.
+    trajectory: motion after the step, if no newer target arrives.
     contact_sheet_m: (x, y) of the contact on the sheet.
     normal_offset_m: distance of the sheet's surface behind the object's tangent plane.
     """
@@ -85,10 +86,13 @@ class TrajectorySettings:
 
 
 class SheetTrajectoryPlanner:
-    """Planner of the sheet's motion on one object."""
+    """Planner of the sheet's motion on one virtual object."""
 
     def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
-        """Start at the object's front; raises UnpresentableError if its normal exceeds the tilt."""
+        """Start at the front of the object.
+
+        Raises UnpresentableError if the surface normal there exceeds the maximum tilt.
+        """
         pose, sheet = scene.object.world_from_object, scene.sheet
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._object_from_world = inverse(self._world_from_object)
@@ -129,9 +133,10 @@ class SheetTrajectoryPlanner:
         step_s: float,
         measured_world: Floats | None = None,
     ) -> PlannedStep:
-        """Return the sheet `step_s` later, moved towards the contact with a finger (m, m/s).
+        """Return the sheet `step_s` later, moved towards the contact with a finger.
 
-        measured_world: the finger when it was measured; position_world is predicted from it.
+        position_world, velocity_world: predicted motion (3,) of the finger, m and m/s.
+        measured_world: measured position (3,) from which it is predicted; None: position_world.
         """
         finger = apply(self._object_from_world, position_world)
         velocity = self._object_from_world[:3, :3] @ velocity_world
@@ -190,9 +195,9 @@ class SheetTrajectoryPlanner:
         return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:
-        """Return the deflection of the sheet by its weight along its normal, at (x_m, y_m).
+        """Return the sag (m) of the sheet by its weight at (x_m, y_m), along its normal.
 
-        The sheet's edges are placed behind its tangent plane by this, so that its surface is in it.
+        The edges are placed this far behind the tangent plane, so that the surface is in the plane.
         """
         distance_m = self._rubber.width_m * sheet.stretch_ratio
         return float(
@@ -212,7 +217,7 @@ class SheetTrajectoryPlanner:
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
-        """Return the sheet `step_s` later, decelerated because the finger is unknown."""
+        """Return the sheet `step_s` later, decelerated because the finger's position is unknown."""
         self._advance(None, step_s)
         phase: Phase = "wait" if self._command.phase == "wait" else "hold"
         return self._make_step(
@@ -251,7 +256,7 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return the trajectory after a target, within the bounds; None if it cannot stop in time."""
+    """Return how the sheet moves after a target until it stops; None if it cannot stop in time."""
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,
@@ -261,7 +266,7 @@ def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajecto
 
 
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
-    """Move the sheet back along its normal by an offset that changes at the given rate."""
+    """Return the sheet moved back along its normal by an offset that changes at the given rate."""
     normal = sheet.world_from_sheet[:3, 2]
     pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
     pose[:3, 3] -= offset_m * normal

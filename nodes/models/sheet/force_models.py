@@ -2,7 +2,7 @@
 
 Inputs of a model are the stretch ratio, depths of a fingertip below the flat sheet, the position on
 the stretched sheet (x, y from its centre, m) and the fingertip's radius. Outputs are the normal
-force, its derivative by the depth, and the force on the clamps.
+force, its derivative with respect to the depth, and the force on each clamp.
 
 By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
 `nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.
@@ -29,7 +29,7 @@ CENTRE: SheetPosition = (0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class SheetForce:
-    """Result of a force model at depths (n,): force, N, stiffness, N/m, and force per clamp, N."""
+    """Result of a force model at depths (n,): normal force, stiffness, and force on each clamp."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -67,12 +67,12 @@ class SheetForceModel(Protocol):
         position_m: SheetPosition,
         finger_radius_m: float,
     ) -> str:
-        """Return why the model is invalid for these inputs, or an empty text if it is valid."""
+        """Return why the model is inaccurate for these inputs, or "" if they are in its range."""
         ...
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the unpushed sheet."""
+    """Return the force (N) on each clamp of the sheet without a push."""
     return edge_force_n(
         stretch_ratio,
         young_modulus_pa=rubber.young_modulus_pa,
@@ -86,7 +86,7 @@ def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
 def _check_push(
     stretch_ratio: float, depths_m: Floats, position_m: SheetPosition, finger_radius_m: float
 ) -> Floats:
-    """Return the depths, limited to >= 0; raise ValueError for invalid inputs."""
+    """Return the depths with negative ones set to 0; raise ValueError for invalid inputs."""
     depths = np.asarray(depths_m, dtype=np.float64)
     numbers = (stretch_ratio, *position_m, finger_radius_m)
     if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
@@ -110,15 +110,16 @@ def relative_position(
 
 
 MAX_RELATIVE_X = 0.98
-"""Upper limit of relative x in the closed-form models, which are infinite at the clamp."""
+"""Upper limit of the relative x in closed-form models, whose force is infinite at the clamp."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinearSheetModel:
-    """Force proportional to tension and depth: F = 0.95 T0/W d / (1 - x^2).
+    """Model of a force proportional to tension and depth: F = 0.95 T0/W d / (1 - x^2).
 
-    The factor is valid for a disc of 10 mm. The contact area of a fingertip grows with the depth,
-    so the true curve is flatter at small depths and steeper at large ones.
+    T0 is the force on each clamp, W the slack width, d the depth and x the relative x. The factor
+    is valid for a disc of 10 mm. The contact area of a fingertip grows with the depth, so the true
+    curve is flatter at small depths and steeper at large ones.
     """
 
     rubber: Rubber
@@ -160,9 +161,9 @@ class LinearSheetModel:
 
 
 LINEAR_FROM, LINEAR_TO = 0.15, 0.33
-"""Range of scaled depths in which the linear model is within 25 % of the membrane."""
+"""Range of scaled depths in which the linear model differs by at most 25 % from the membrane."""
 MAX_STRETCH_RATIO = 1.13
-"""Maximum stretch ratio of the closed-form models."""
+"""Maximum stretch ratio at which the closed-form models are valid."""
 
 
 def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
@@ -174,11 +175,12 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 
 
 CUBIC_FACTOR = 2.43
-"""F = CUBIC_FACTOR E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm."""
+"""Factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm; E is
+Young's modulus, t the thickness, W the width and d the depth."""
 
 
 def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
-    """Return depth / width / sqrt(strain); pushes of equal scaled depth are similar."""
+    """Return depth / width / sqrt(strain), on which the shape of the force curve depends."""
     strain = strain_measure(stretch_ratio, rubber.mooney_ratio)
     return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
@@ -205,7 +207,7 @@ def _slack_position_factor(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the additional force on each clamp due to a push (n,), N, and E t W, N."""
+    """Return the additional force (n,) on each clamp due to a push, N, and E t W, N."""
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
     scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_ratio), 1e-12) ** 0.5
@@ -220,17 +222,17 @@ def _push_tension(
 
 @dataclass(frozen=True, slots=True)
 class ScaledSheetModel:
-    """Force as a power of the scaled depth, due to the tension, plus a cubic part.
+    """Model with a power of the scaled depth, due to the tension, plus a cubic part.
 
-    With the strain measure e, w = d/W and u = w/sqrt(e) (the scaling of a membrane at small
-    strains):
+    With the symbols of CUBIC_FACTOR, the stretch ratio s, e = `strain_measure`(s), w = d/W and
+    u = w/sqrt(e) (the scaling of a membrane at small strains):
 
-        F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3)
+        F = E t W (e^(3/2) s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3)
 
-    Each part depends on position, fingertip radius and height.
+    a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
 
-    cubic_ratio: cubic part over that of ideal rubber, from calibration.
-    stretch_scale: true over nominal stretch ratio, from calibration; corrects the slack width.
+    cubic_ratio: ratio of the calibrated cubic part to that of ideal rubber.
+    stretch_scale: ratio of the calibrated to the nominal stretch ratio; corrects the slack width.
     """
 
     rubber: Rubber
@@ -307,7 +309,7 @@ class ScaledSheetModel:
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """Finite-element solution of the membrane: the most accurate model, which takes seconds."""
+    """Model by finite elements of the membrane: the most accurate one, which takes seconds."""
 
     rubber: Rubber
     cells: int = CELLS
@@ -352,7 +354,7 @@ class MembraneSheetModel:
 
 
 _SLOPE_FRACTION = 0.96
-"""Fraction of the depth at which a second force is computed for the finite difference."""
+"""Fraction of the depth at which a second force is computed, for the stiffness."""
 
 
 def depth_for_force(
@@ -364,7 +366,7 @@ def depth_for_force(
     position_m: SheetPosition,
     finger_radius_m: float,
 ) -> Floats:
-    """Return the depths (n,) at which the model gives the forces (n,), at most `max_depth_m`.
+    """Return the depths (n,) at which the model gives these forces (n,), at most `max_depth_m`.
 
     The model is evaluated once on a geometric grid, and log force is interpolated linearly over log
     depth. The relative error is below 1e-3.
@@ -380,10 +382,11 @@ _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 
 
 def interpolate_inverse(grid: Floats, values: Floats, targets: Floats) -> Floats:
-    """Return the arguments at which an increasing function reaches `targets` (n,).
+    """Return the arguments (n,) at which an increasing function reaches the values `targets` (n,).
 
-    values: of the function at `grid`, both positive. Interpolation is linear in the logarithms.
-    Below the grid the first interval's power law is extrapolated; above it, the result is the end.
+    values: function values at the arguments `grid`; both are positive. The logarithms are
+    interpolated linearly. Below the grid, the power law of the first interval is extrapolated.
+    Above it, the result is the last grid point.
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
@@ -409,7 +412,10 @@ def make_model(
     cubic_ratio: float,
     mooney_ratio: float,
 ) -> ScaledSheetModel:
-    """Make the scaled model from calibrated parameters, for stretch ratios of the nominal width."""
+    """Make the scaled model from calibrated parameters.
+
+    Stretch ratios given to the model refer to the width of the nominal sheet.
+    """
     rubber = replace(
         nominal,
         width_m=slack_width_m,

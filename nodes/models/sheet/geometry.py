@@ -11,16 +11,16 @@ Floats = NDArray[np.float64]
 
 
 def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats, Floats]:
-    """Return world_from_edge of the left and right clamped edge, parallel to the sheet frame."""
+    """Return the poses world_from_edge of left and right clamped edge, parallel to the sheet."""
     offset = 0.5 * edge_distance_m * world_from_sheet[:3, 0]
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     return transform(rotation, centre - offset), transform(rotation, centre + offset)
 
 
 def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats) -> Floats:
-    """Return world_from_sheet for two edges, which may differ in tilt and twist.
+    """Return the sheet's pose world_from_sheet between two edges, which need not be parallel.
 
-    The origin is midway, x points from left to right, and y is the mean of the edges' y axes made
+    The origin is midway, x points from left to right, and y is the mean of the edges' y axes, made
     perpendicular to x. The result is not finite if the edges coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
@@ -34,7 +34,7 @@ def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats
 
 
 def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_m: float) -> Floats:
-    """Return the corners (4, 3), world: left bottom, right bottom, right top, left top."""
+    """Return the sheet's corners (4, 3) in the world: bottom left and right, top right and left."""
     half = 0.5 * height_m
     left, right = world_from_left_edge, world_from_right_edge
     return np.array(
@@ -48,5 +48,5 @@ def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_
 
 
 def flange_pose(world_from_edge: Floats, flange_from_edge: Floats) -> Floats:
-    """Return world_from_flange of the arm for a pose of its edge."""
+    """Return the flange's pose world_from_flange for a pose of the edge that the arm holds."""
     return world_from_edge @ inverse(flange_from_edge)

@@ -2,7 +2,7 @@
 
 Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
 orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
-points interpolate their coefficients. A shape then takes about 0.1 ms.
+points interpolate their coefficients. To compute a shape then takes about 0.1 ms.
 
 The grid moves with the finger and is finest there, so that the tip of the indentation is always at
 the same nodes. Only one quadrant of positions is solved; the others follow by symmetry.
@@ -26,21 +26,21 @@ HALF_CELLS = 14
 """Number of grid cells from the finger to each side of the sheet."""
 
 GRADING = 3.2
-"""Grading: distances from the finger are proportional to sinh(GRADING a), a in 0..1."""
+"""Grading of the grid: distances from the finger are proportional to sinh(GRADING a), a in 0..1."""
 
 MAX_TRUNCATION_RMS_M = 2e-5
 """Maximum truncation error of the modes (root mean square)."""
 
 MAX_FRACTION_X, MAX_FRACTION_Y = 0.36, 0.40
-"""Maximum solved positions from the centre, as fractions of width and height."""
+"""Maximum solved |x| and |y| of a push, as fractions of the sheet's width and height."""
 
 
 @dataclass(frozen=True, slots=True)
 class IndentationRange:
     """Range of the solved pushes: stretch ratios and maximum depth (m).
 
-    stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes, of positions per axis.
-    element_cells: number of finite elements along each side of the sheet.
+    stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes over stretch, over each
+    coordinate of the position, and over depth. element_cells: finite elements along each side.
     """
 
     min_stretch: float
@@ -57,7 +57,8 @@ class IndentationBasis:
     """Reduced-order model of the pushed sheet.
 
     stretches, xs_m, ys_m, roots: interpolation nodes; roots are sqrt(depth / maximum depth).
-    modes: (modes, rows, columns, 3), m. coefficients: (stretches, xs, ys, roots, modes).
+    modes: displacement modes (modes, rows, columns, 3), m. coefficients: coefficients of the modes
+    at the interpolation nodes, (stretches, xs, ys, roots, modes).
     """
 
     rubber: Rubber
@@ -96,7 +97,7 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the grid (rows, columns, 2), m, of `offsets` on the flat, stretched sheet."""
+        """Return the points (rows, columns, 2), m, of the flat sheet that `offsets` displaces."""
         sheet, most_x, most_y = self.rubber, self.xs_m[-1], self.ys_m[-1]
         focus_x = float(np.clip(position_m[0], -most_x, most_x)) / stretch_ratio
         x = _grade_coordinates(focus_x, 0.5 * sheet.width_m)
@@ -122,7 +123,7 @@ class IndentationBasis:
 
 @dataclass(frozen=True, slots=True)
 class IndentationCase:
-    """Input of a finite-element solution: one position and ascending depths (n,), m."""
+    """Input of one finite-element solution: a position and ascending depths (n,), m."""
 
     rubber: Rubber
     stretch_ratio: float
@@ -147,7 +148,8 @@ def solve_indentation_basis(
 ) -> IndentationBasis:
     """Solve the membrane at all interpolation nodes and reduce the shapes (45 s on one core).
 
-    solve_all: solves the cases, in this or in other processes. Raises NoEquilibriumError.
+    solve_all: function that solves the cases, in this or in other processes.
+    Raises NoEquilibriumError.
     """
     stretches = _chebyshev_points(within.min_stretch, within.max_stretch, within.stretch_nodes)
     xs = _chebyshev_points(0.0, MAX_FRACTION_X * rubber.width_m, within.place_nodes)
@@ -182,7 +184,7 @@ def solve_indentation_basis(
 
 
 def solve_indentation(push: IndentationCase) -> Floats:
-    """Return finite-element displacements (depths, rows, columns, 3), m, on the push's grid."""
+    """Return finite-element displacements (depths, rows, columns, 3), m, at the model's grid."""
     rubber, stretch = push.rubber, push.stretch_ratio
     pushed = push_path(
         rubber,
@@ -202,9 +204,9 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Return modes (m, size) and coefficients (n, m) of samples (n, size).
+    """Decompose samples (n, size) into modes (m, size) with coefficients (n, m).
 
-    The number of modes is the minimum for `MAX_TRUNCATION_RMS_M`.
+    The number of modes is the smallest at which the error is below `MAX_TRUNCATION_RMS_M`.
     """
     left, values, modes = np.linalg.svd(samples, full_matrices=False)
     lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / samples.size)

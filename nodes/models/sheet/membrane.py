@@ -1,14 +1,15 @@
 """Solve the pushed sheet as a finite-element membrane.
 
 The elements are bilinear cells with four integration points, of incompressible Mooney-Rivlin rubber
-in plane stress,
+in plane stress. Its energy W per volume has the constants C1, C2; E is Young's modulus:
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
 
-(neo-Hookean for C2 = 0). A membrane wrinkles under compression. Where the smaller principal stretch
-is below that of uniaxial tension, l2 < l1^-1/2, the energy is that of uniaxial tension; it is zero
-where both are slack (tension field theory: Pipkin, IMA J. Appl. Math. 36, 1986). Stress and tangent
-are computed in the principal frame of C = F'F.
+(neo-Hookean for C2 = 0). I1, I2 are the invariants of the Cauchy-Green tensor C = F'F, where F is
+the deformation gradient. A membrane wrinkles under compression (tension field theory: Pipkin, IMA
+J. Appl. Math. 36, 1986). If the smaller principal stretch l2 is below that of uniaxial tension,
+l1^-1/2, the energy is that of uniaxial tension. If l1 is below 1 too, the energy is zero. Stress
+and tangent (its derivative with respect to the strain) are computed in the principal frame of C.
 
 The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Nodes that it touches
 stick to it. Newton's method computes each equilibrium from the previous one, with
@@ -34,20 +35,21 @@ Indices = NDArray[np.intp]
 
 CELLS = 32
 MIN_CELL_RADII = 0.3
-"""Cell size under the finger, in finger radii."""
+"""Cell size under the finger, as a multiple of the finger's radius."""
 STEP_RADII = 0.4
-"""Maximum load step of the finger, in its radii."""
+"""Maximum step of the finger's depth, as a multiple of its radius."""
 PENALTY_PER_MODULUS = 2e5
-"""Contact penalty stiffness: pressure per depth of penetration, in E t / width^2."""
+"""Stiffness of the contact penalty, pressure per penetration, in units of E t / width^2, where E is
+Young's modulus and t the sheet's thickness."""
 MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
-"""Distance of the integration points from a cell's centre, over its side."""
+"""Distance of the integration points from a cell's centre, as a fraction of its side."""
 TOLERANCE = 1e-7
-"""Residual at equilibrium, in E t width."""
+"""Maximum residual force of a solution, in units of E t width."""
 
 
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
-    """Raised when the membrane's equilibrium does not converge."""
+    """The iteration for the membrane's equilibrium does not converge."""
 
     code = "no-equilibrium"
     remedy = "Reduce the push or the tilt: it is beyond the sheet's range."
@@ -55,11 +57,11 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class PushPath:
-    """Equilibria of one push at depths (n,).
+    """Equilibria of the sheet at depths (n,) of one push.
 
     forces_n (n,): normal force of the sheet on the finger. edge_forces_n (n,): mean force on the
-    clamps along the line between them. positions (n, rows, columns, 3): nodes in the sheet frame.
-    rest_m (rows, columns, 2): the same nodes in the slack sheet, relative to its centre.
+    clamps along the line between them. positions (n, rows, columns, 3): mesh nodes in the sheet's
+    frame. rest_m (rows, columns, 2): the same nodes in the slack sheet, relative to its centre.
     """
 
     depths_m: Floats
@@ -80,9 +82,9 @@ def push_path(
 ) -> PushPath:
     """Solve the equilibria of a push to ascending depths (n,), m.
 
-    stretch_ratio: distance of the edges over the slack width. position_m: (x, y) of the push on the
-    stretched sheet, from its centre. Raises NoEquilibriumError, and ValueError for a position off
-    the sheet or depths that are not ascending from 0.
+    stretch_ratio: ratio of the edges' distance to the slack width. position_m: (x, y) of the push
+    on the stretched sheet, from its centre. Raises NoEquilibriumError, and ValueError for a
+    position outside the sheet, or depths that are negative or not ascending.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if (
@@ -135,10 +137,10 @@ def push_path(
 
 
 def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
-    """Return coordinates (cells + 1,) from 0 to length_m, densest at a node at the focus.
+    """Return node coordinates (cells + 1,) from 0 to length_m; one is at the focus, densest there.
 
-    On each side x = sinh(k u) / sinh(k) with uniform u, and k such that the finest cell has
-    `finest_m`.
+    On each side, distances from the focus are proportional to sinh(k u) with uniform u from 0 to 1.
+    The finest cell has the size `finest_m`, which determines k.
     """
     left_cells = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
 
@@ -159,7 +161,7 @@ def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: i
 
 
 class _Grid:
-    """Finite-element grid of the sheet with the sparsity pattern of its stiffness matrix."""
+    """Finite-element mesh of the sheet, with the sparsity pattern of its stiffness matrix."""
 
     def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
         x = grade_coordinates(rubber.width_m, float(focus[0]), finest_m, cells)
@@ -202,7 +204,7 @@ class _Grid:
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return F (points, 3, 2) and C = F'F (points, 2, 2) at four points per cell."""
+        """Return F (points, 3, 2) and C (points, 2, 2) at the four integration points per cell."""
         at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
         deformed = at_corners @ self.shape_gradients
         return deformed, deformed.transpose(0, 2, 1) @ deformed
@@ -221,13 +223,13 @@ class _Grid:
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Sum the forces (points, 4, 3) of the integration points to nodal forces (3 nodes,)."""
+        """Sum the forces (points, 4, 3) from the integration points to nodal forces (3 nodes,)."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses (points, ...) of the integration points to matrix entries."""
+        """Sum the stiffnesses (points, ...) from the integration points to matrix entries."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -237,14 +239,15 @@ class _Grid:
     ) -> tuple[Floats, csc_array]:
         """Return the energy gradient (3 nodes,) and the stiffness matrix of the free coordinates.
 
-        added (nodes, 3, 3): stiffness of the contact. free (3 nodes,). damping: added diagonal.
+        added (nodes, 3, 3): stiffness of the contact. free (3 nodes,): which coordinates are not
+        fixed. damping: added to the diagonal.
         """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
         volume, hats = self.volume[:, None, None], self.shape_gradients
         local = volume * hats @ stress @ deformed.transpose(0, 2, 1)
         count = len(local)
-        # Derivative of E = (C - I)/2, as [E11, E22, 2 E12], by the nodes' coordinates.
+        # Derivative of the strain E = (C - I)/2, as [E11, E22, 2 E12], by the nodes' coordinates.
         by_node = np.empty((count, 3, 4, 3))
         by_node[:, 0] = hats[:, :, :1] * deformed[:, None, :, 0]
         by_node[:, 1] = hats[:, :, 1:] * deformed[:, None, :, 1]
@@ -271,7 +274,7 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the larger and smaller eigenvalue (n,) of C (n, 2, 2), and the first's direction."""
+    """Return larger and smaller eigenvalue (n,) of C (n, 2, 2), and the direction of the larger."""
     middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
     spread = np.hypot(half, c[:, 0, 1])
     angle = 0.5 * np.arctan2(c[:, 0, 1], half)
@@ -281,10 +284,10 @@ def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
 def relaxed_energy(
     large: Floats, small: Floats, c1: float, c2: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the tension-field energy per rest volume and its derivatives.
+    """Return the tension-field energy W per rest volume and its derivatives.
 
-    large, small (n,): squared principal stretches p >= q. Returns W (n,), [W_p, W_q] (2, n) and
-    [W_pp, W_qq, W_pq] (3, n).
+    large, small (n,): squared principal stretches p >= q. The results are W (n,), its first
+    derivatives [W_p, W_q] (2, n) and its second ones [W_pp, W_qq, W_pq] (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5
@@ -317,7 +320,8 @@ def relaxed_energy(
 def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
     """Return the second Piola-Kirchhoff stress (n, 2, 2) and its tangent (n, 3, 3).
 
-    The tangent's rows and columns are [E11, E22, 2 E12]. It is empty without `tangent`.
+    The tangent's rows and columns belong to the strains [E11, E22, 2 E12]. tangent: whether to
+    compute it; otherwise it is empty.
     """
     large, small, direction = principal(c)
     _, first, second = relaxed_energy(large, small, c1, c2)
@@ -344,7 +348,7 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """Penalty contact of nodes inside the fingertip; sticking nodes have no penalty."""
+    """Penalty contact of nodes inside the fingertip; nodes that stick to it have no penalty."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -363,7 +367,7 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (nodes, 3) and the definite part of its derivative (nodes, 3, 3)."""
+        """Return gradient (nodes, 3) and positive part of the Hessian (nodes, 3, 3) of `energy`."""
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
@@ -380,9 +384,9 @@ def _make_flat_state(grid: _Grid, stretch_ratio: float) -> Floats:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium: the indentation scaled with the depth, at first a cone.
+    """Predict the next equilibrium as the indentation scaled to the new depth, or first as a cone.
 
-    push: current depth and the depth of the step, m.
+    push: current depth and its increase in this step, m.
     """
     depth, advance = push
     grown = state.copy()
@@ -397,7 +401,7 @@ def _predict_state(
 
 
 def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
-    """Solve for the equilibrium near `start` with clamped and sticking nodes fixed."""
+    """Solve for the equilibrium near `start`, with clamped and sticking nodes fixed."""
     fixed = grid.clamped if finger is None else grid.clamped | finger.sticking
     free = np.repeat(~fixed, 3)
     positions, damping = start, 1e-7

@@ -1,6 +1,6 @@
-"""Correct the scaled force model by a table of measured or computed force ratios.
+"""Correct the scaled force model by a table of ratios of measured or computed to modelled force.
 
-The ratio varies slowly, so a coarse table suffices. The scaled model covers other fingertips.
+The ratio varies slowly, so a coarse table suffices. It is also used for fingertips of other radii.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Measure = Callable[[float, Floats, SheetPosition], Floats]
 
 @dataclass(frozen=True, slots=True)
 class TabulatedSheetModel:
-    """Scaled model multiplied by an interpolated table of ratios.
+    """Force of the scaled model, multiplied by ratios from a table.
 
-    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes; positions are in one
-        quadrant, because the sheet is symmetric.
-    ratios (a, b, c, d): interpolated linearly over stretches and positions and by monotone cubics
-        over depths; constant beyond the ends.
+    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table; positions are
+        in one quadrant, because the sheet is symmetric.
+    ratios (a, b, c, d): interpolated linearly over stretches and positions, and by monotone cubics
+        over depths; beyond the ends of an axis they are constant.
     """
 
     base: ScaledSheetModel
@@ -122,7 +122,7 @@ def make_tabulated_model(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Make the table by calls of `measure`; `progress` is called after each of them."""
+    """Make the table from forces that `measure` returns; call `progress` after each call of it."""
     ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
     total, done = len(stretches) * len(xs_m) * len(ys_m), 0
     for a, stretch in enumerate(stretches):

@@ -1,4 +1,4 @@
-"""Compute the edge force of the unpushed sheet and the resulting push stiffness."""
+"""Compute force and sag of the sheet without a push, and its stiffness for small pushes."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
-"""Edge force over that of uniaxial tension: the first plus the second times height over width.
+"""Ratio of the edge force to that of uniaxial tension: first value + second value * height / width.
 
-The clamps prevent the sheet from narrowing. The formula is within 0.3 % of membrane finite elements
-for height over width from 0.5 to 1.5 and stretch ratios up to 1.12.
+It is above 1 because the clamps prevent the sheet from narrowing. The formula is within 0.3 % of
+membrane finite elements for height / width from 0.5 to 1.5 and stretch ratios up to 1.12.
 """
 
 SAG_PROFILE = (0.9635, 0.23, 1.96)
-"""Sag over that of a sheet with uniform tension: a + b v^2 + c v^4 of v = y / height.
+"""Coefficients a, b, c of the sag's profile a + b v^2 + c v^4 over v = y / height.
 
-The free edges sag more than the middle. It is within 1 % of membrane finite elements for a square
-sheet with stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
+The profile is the ratio to the sag of a sheet with uniform tension; free edges sag more than the
+centre. It is within 1 % of membrane finite elements for a square sheet with stretch ratios from
+1.02 to 1.08 and |v| up to 0.25.
 """
 
 GRAVITY_M_PER_S2 = 9.81
 """Acceleration towards the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
-"""Stiffness of a small push over edge force per width: 0.9-1.0 for a fingertip radius of 10 mm."""
+"""Ratio of the stiffness of a small push to the edge force per width: 0.9 to 1.0 for a fingertip
+with a radius of 10 mm."""
 
 
 def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
-    """Return the nominal stress of uniaxial tension over E: (s - s^-2)/3 (1 - m + m/s).
+    """Return the ratio of nominal stress to Young's modulus: (s - s^-2)/3 (1 - m + m/s).
 
-    s is the stretch ratio and m the Mooney fraction. The result is 0 for a slack sheet.
+    It applies to uniaxial tension, with the stretch ratio s and the Mooney ratio m of `Rubber`.
+    The result is 0 for a slack sheet.
     """
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
@@ -48,9 +51,9 @@ def edge_force_n(
     thickness_m: float,
     mooney_ratio: float = 0.0,
 ) -> float:
-    """Return the force (N) on each clamped edge of the unpushed sheet; 0 for a slack sheet.
+    """Return the force (N) on each clamped edge of the sheet without a push; 0 for a slack sheet.
 
-    width_m: distance of the edges when slack. height_m: length of an edge.
+    width_m: distance of the edges of the slack sheet. height_m: length of an edge.
     """
     area_modulus = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m)
     return area_modulus * strain_measure(stretch_ratio, mooney_ratio)
@@ -94,15 +97,15 @@ def compute_sag_m(
     across: float | NDArray[np.float64],
     along: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the deflection of the unpushed sheet by its weight along its normal, m.
+    """Return the sag of the sheet by its weight along its normal, without a push, m.
 
-    normal: (3,) unit vector in the world.
+    normal: unit normal (3,) of the sheet in the world.
     across: positions between the clamps, from 0 to 1, any shape.
-    along: positions along the clamps over the height, from -0.5 to 0.5, of the same shape.
+    along: positions along the clamps as fractions of the height, -0.5 to 0.5, same shape.
 
-    The sheet is a parabola, z = 4 sag u (1 - u).  Balance of its curvature gives
-    8 N sag / L^2 = load.  The tension N per length grows with the longer arc, whose length is
-    L (1 + 8/3 (sag/L)^2), so that a slack sheet has a finite sag too.
+    The sheet is a parabola, z = 4 sag u (1 - u), with u = `across`.  Equilibrium over the edges'
+    distance L requires 8 N sag / L^2 = load.  The tension N per length grows with the length
+    L (1 + 8/3 (sag/L)^2) of the parabola, so that a slack sheet has a finite sag, too.
     """
     stretch = edge_distance_m / rubber.width_m
     load_pa = -GRAVITY_M_PER_S2 * density_kg_per_m3 * rubber.thickness_m / stretch * normal[1]
