@@ -46,7 +46,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """Output without a window; images are drawn, but only shown as pixels in messages."""
+    """Output without a window: images are drawn, but not shown. Frame messages can contain them."""
 
     is_seen = shows_both = False
     period_s = 0.0
