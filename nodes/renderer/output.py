@@ -40,7 +40,8 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"an eye is only {where} in front of the screen: using the scene's eyes",
+            f"a tracked eye is {where} from the screen, too close or behind it: using the scene's "
+            "eyes",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 
