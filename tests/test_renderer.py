@@ -478,7 +478,7 @@ async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> 
     bench.forward(500)
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
-    assert "arm poses 0.50 s old: keeping" in bench.node.note
+    assert "the arm poses are 0.50 s old: keeping" in bench.node.note
 
 
 async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:

@@ -233,10 +233,10 @@ async def test_images_of_another_camera_are_rejected_by_name(
             "webcam",
             full,
             (0, 0),
-            'images of device "webcam"; expected the scene\'s camera "twin-bumblebee"',
+            'the images are of device "webcam", but the scene has "twin-bumblebee"',
         ),
-        ("twin-bumblebee", wide, (0, 0), "left image of 752x480 px at column 0, row 0"),
-        ("twin-bumblebee", full, (0, 8), "left image of 640x480 px at column 0, row 8"),
+        ("twin-bumblebee", wide, (0, 0), "left image has 752x480 px from column 0, row 0"),
+        ("twin-bumblebee", full, (0, 8), "left image has 640x480 px from column 0, row 8"),
     ):
         pair = StereoPair(
             device=device,

@@ -1,4 +1,4 @@
-"""Open a source and read it in a separate thread, to its end or in a loop."""
+"""Open a source of images, and read it in a separate thread, to its end or in a loop."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ MAX_RETRY_S = 30.0
 def open_reader(
     source: AnySource, camera: StereoCamera, now: Now, requested: Regions | None = None
 ) -> Reader:
-    """Open a source for a scene's camera; raises DeviceError.
+    """Open a source of images for a scene's camera; raises DeviceError.
 
-    requested: sensor regions that a device should read; it can read more.
+    now: returns the current time, ns.
+    requested: sensor regions that a device should read at least.
     """
     if isinstance(source, OpenCvSource):
         return CameraReader(source, camera, now, requested)
@@ -42,13 +43,14 @@ def open_reader(
 
 
 class ReaderThread(threading.Thread):
-    """Thread that opens a source and reads it to its end; it reports failures and retries.
+    """Thread that reads a source to its end, reports failures and opens the source again.
 
-    deliver(images, lost): called for each pair, with the total number of lost frames. fail(error):
-    called for each DeviceError.  The retry period doubles from `retry_s` to MAX_RETRY_S, until
-    images arrive again. warn(text): called at each opening for settings that the device does not
-    accept. finish(pairs): called at the end of the source. regions: regions to deliver; None for
-    the full images.
+    deliver(images, lost): called for each pair, with the total number of lost frames.
+    fail(error): called for each DeviceError.  The source is then opened again after a delay, which
+        doubles from `retry_s` to MAX_RETRY_S until images arrive.
+    warn(text): called after each opening for every setting that the device did not accept.
+    finish(pairs): called at the end of the source, with the number of pairs.
+    regions: sensor regions to deliver; None for the full images.
 
     All functions are called in this thread.
     """
@@ -94,7 +96,7 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except Exception as error:  # drivers raise various types; report and retry
+            except Exception as error:  # Drivers raise errors of many types.  Report and retry.
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):

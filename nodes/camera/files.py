@@ -1,4 +1,4 @@
-"""Read video and image files as sources, with the times of the files."""
+"""Read stereo image pairs from video or image files, with the times that the files give."""
 
 from __future__ import annotations
 
@@ -36,9 +36,12 @@ class VideoFile:
     """Reader of one video file, frame by frame."""
 
     def __init__(self, path: Path, rate_hz: float | None) -> None:
-        """Open a file; raises DeviceError.  rate_hz: None for the frame times of the file."""
+        """Open a file.  Raises DeviceError.
+
+        rate_hz: frame rate; None: use the frame times in the file.
+        """
         if not path.is_file():
-            raise DeviceError(f"{path}: file not found")
+            raise DeviceError(f"{path}: file not found; correct the camera node's source")
         self.path, self._rate_hz = path, rate_hz
         self._capture = open_capture(str(path))
         self.stated_hz = self._capture.get(cv2.CAP_PROP_FPS)
@@ -47,7 +50,10 @@ class VideoFile:
         self._newest_ns = -1
 
     def advance(self) -> bool:
-        """Append the next frame to `frames`; return False at the end.  Raises DeviceError."""
+        """Append the next frame to `frames`; return False at the end of the file.
+
+        Raises DeviceError.
+        """
         image = self._capture.read()[1]
         if image is None:
             return False
@@ -71,7 +77,7 @@ class VideoFile:
 
 
 class VideoReader:
-    """Reader of one video file with both views, or of two with frames paired by time."""
+    """Reader of one video file with both views, or of two files whose frames are paired by time."""
 
     paced = True
     rate_hz: float | None = None
@@ -92,7 +98,7 @@ class VideoReader:
         except DeviceError:
             self.close()
             raise
-        # The stated rate of a file with variable rate is its time base (1000 Hz).
+        # A file with variable rate states its time base, such as 1000 Hz, as rate.
         rates = [file.stated_hz for file in self._files if file.stated_hz > 0.0]
         rate_hz = self._source.rate_hz or min([*rates, self._camera_rate_hz])
         self._pairing = Pairing(1.0 / rate_hz)
@@ -107,7 +113,7 @@ class VideoReader:
             self._clock.restart()
             frames = self._next()
             if frames is None:
-                raise DeviceError(f"{self._source.left}: contains no image")
+                raise DeviceError(f"{self._source.left}: the video contains no image pair")
         if frames is None:
             return None
         notes = ["frame times of the file" if self._source.rate_hz is None else "at the set rate"]
@@ -127,7 +133,10 @@ class VideoReader:
         )
 
     def _next(self) -> tuple[FileFrame, ...] | None:
-        """Return the next pair, or frame with both views; None at the end of the shorter file."""
+        """Return the next two frames of a pair, or the next frame with both views.
+
+        Return None at the end of the shorter file.
+        """
         if len(self._files) == 1:
             (file,) = self._files
             return (file.frames.popleft(),) if file.advance() else None
@@ -150,10 +159,10 @@ class VideoReader:
 
 
 class _LoopClock:
-    """Continuous time of a file that is repeated.
+    """Continuous time for a file that is read repeatedly.
 
-    The gap between two passes is the interval of the last two images.  rate_hz: for a file with one
-    image only.
+    The interval between two passes is that between the last two images of the file.  rate_hz: rate
+    that gives this interval for a file with one image only.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -162,7 +171,7 @@ class _LoopClock:
         self._newest_ns: int | None = None
 
     def continuous_ns(self, time_ns: int) -> int:
-        """Return an image's time since the start of the first pass."""
+        """Return an image's time since the start of the first pass; time_ns: time in this pass."""
         continuous_ns = self._start_ns + time_ns
         if self._newest_ns is not None:
             self._interval_ns = continuous_ns - self._newest_ns
@@ -176,9 +185,10 @@ class _LoopClock:
 
 
 def read_times(path: Path, pairs: int) -> list[int]:
-    """Read the times of pairs, ns from the first one, from a CSV file's column `t_s` (s).
+    """Read the times of image pairs, ns since the first one, from the column `t_s` of a CSV file.
 
-    Raises DeviceError, with file and line, unless these are `pairs` ascending numbers.
+    pairs: required number of rows.  The column contains times in s.  Raises DeviceError, with file
+    and line, unless these are ascending numbers.
     """
     if not path.is_file():
         raise DeviceError(f"{path}: file not found")
@@ -204,13 +214,16 @@ def read_times(path: Path, pairs: int) -> list[int]:
                 f"{path}, line {line}: t_s: expected a number of seconds, found {text!r}"
             )
         if times_s and time_s <= times_s[-1]:
-            raise DeviceError(f"{path}, line {line}: t_s {text} is not after the previous one")
+            raise DeviceError(
+                f"{path}, line {line}: t_s {text} is not after the previous one; sort the rows by "
+                "time"
+            )
         times_s.append(time_s)
     return [round(1e9 * (time_s - times_s[0])) for time_s in times_s]
 
 
 class ImagesReader:
-    """Reader of image files whose names match two patterns."""
+    """Reader of image files: one glob pattern for the left images, and one for the right images."""
 
     paced = True
     rate_hz: float | None = None
@@ -220,11 +233,11 @@ class ImagesReader:
         left, right = sorted(glob(str(source.left))), sorted(glob(str(source.right)))
         for pattern, paths in ((source.left, left), (source.right, right)):
             if not paths:
-                raise DeviceError(f"{pattern}: matches no file")
+                raise DeviceError(f"{pattern}: matches no file; correct the camera node's source")
         if len(left) != len(right):
             raise DeviceError(
-                f"{source.left} matches {len(left)} files, {source.right} {len(right)}: expected "
-                "equal numbers"
+                f"{source.left} matches {len(left)} files, but {source.right} matches {len(right)}:"
+                " expected equal numbers"
             )
         rate_hz = source.rate_hz or camera.rate_hz
         if source.times is None:
@@ -232,7 +245,9 @@ class ImagesReader:
         elif source.rate_hz is None:
             times_ns = read_times(source.times, len(left))
         else:
-            raise DeviceError(f"{source.times}: times and rate_hz are both set; remove one")
+            raise DeviceError(
+                f"camera source: times ({source.times}) and rate_hz are both set; remove one"
+            )
         self._note = f"at {rate_hz:g} Hz" if source.times is None else "times of the CSV file"
         self._pairs = list(zip(left, right, times_ns, strict=True))
         self._loop, self._next = source.loop, 0
@@ -250,7 +265,9 @@ class ImagesReader:
         for path in paths:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if image is None:
-                raise DeviceError(f"{path}: cannot be read as an image")
+                raise DeviceError(
+                    f"{path}: cannot be read as an image; replace the file, or change the pattern"
+                )
             images.append(convert_to_gray(image))
         self._next += 1
         left, right = images

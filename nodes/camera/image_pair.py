@@ -1,7 +1,7 @@
-"""Define the interface of readers of stereo images: grey pairs with their time, and errors.
+"""Define the interface of readers, which read pairs of grey images from cameras or files.
 
-A reader is opened, read in a thread that may block, and closed.  After a `DeviceError` it can be
-opened again; at the end of the source, `read` returns None.
+A reader is opened, read in a thread that may block, and closed.  After a `DeviceError` its source
+can be opened again.  At the end of the source, `read` returns None.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """A device or file cannot be read."""
+    """Error if a device or file cannot be read, or its images are not as expected."""
 
     code = "device"
     remedy = (
@@ -54,19 +54,19 @@ class Region(NamedTuple):
 
 
 Regions = tuple[Region, Region]
-"""Regions of the left and the right view."""
+"""Sensor regions of the left and the right camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImagePair:
-    """Pair of images.
+    """Left and right grey image (height, width) that were taken at about the same time.
 
-    exposure_ns: mean of the middles of both exposures, on the reader's clock; for a paced reader
-        (files), time from the start of the file.
-    exposure_s: reported by the device; None if unknown.
-    skew_s: time of the right exposure minus that of the left.
+    exposure_ns: mean of both mid-exposure times on the reader's clock.  For a paced reader (files),
+        time since the start of the file.
+    exposure_s: duration of the exposure as reported by the device; None if unknown.
+    skew_s: time of the right exposure minus that of the left one.
     regions: sensor regions of the images; None for full sensors.
-    notes: remarks for display.
+    notes: remarks for display to the user.
     """
 
     left: Image
@@ -81,9 +81,10 @@ class ImagePair:
 class Reader(Protocol):
     """Interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, so that the caller must wait for each pair's time.
-    rate_hz: rate of a device, for counting lost frames; None for files.
-    warnings: settings that the device does not accept.
+    paced: whether `read` returns immediately, as for files.  The caller must then wait until the
+        time of each pair.
+    rate_hz: frame rate of a device, to count lost frames; None for files.
+    warnings: texts about settings that the device did not accept.
     """
 
     paced: bool
@@ -95,7 +96,7 @@ class Reader(Protocol):
         ...
 
     def interrupt(self) -> None:
-        """Make the current `read`, and each that follows, return None soon; thread-safe."""
+        """Make the current `read`, and every later one, return None soon.  Thread-safe."""
         ...
 
     def close(self) -> None: ...
@@ -104,7 +105,10 @@ class Reader(Protocol):
 def make_stereo_message(
     images: ImagePair, device: str, exposure_s: float, dropped_frames: int
 ) -> StereoPair:
-    """Make the message of an image pair; exposure_s: used if the device does not report it."""
+    """Make the message that publishes an image pair.
+
+    device: name of the camera.  exposure_s: used if the device does not report its exposure.
+    """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
         device=device,
@@ -119,7 +123,7 @@ def make_stereo_message(
 
 
 def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
-    """Make the image pair of a published message."""
+    """Convert a published message to an image pair; exposure_ns: mean mid-exposure time."""
     origins = (pair.left_origin_px, pair.right_origin_px)
     left, right = (
         Region(*origin, image.shape[1], image.shape[0])
@@ -136,33 +140,39 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return the reason why a pair was rejected for its skew."""
+    """Return a text that explains why a pair was rejected for its skew."""
     return (
-        f"skew {1e3 * skew_s:.1f} ms, maximum {1e3 * limit_s:g} ms: restart the cameras, or "
-        "connect a common trigger"
+        f"skew {1e3 * skew_s:.1f} ms between right and left exposure, maximum {1e3 * limit_s:g} ms:"
+        " restart the cameras, or connect a common trigger"
     )
 
 
 def convert_to_gray(image: NDArray[Any]) -> Image:
-    """Convert a decoded image to grey (h, w): from grey, luma first (h, w, 1 or 2), or BGR."""
+    """Convert a decoded image to grey (h, w).
+
+    image: grey (h, w), brightness in the first of one or two channels (h, w, 1 or 2), or BGR.
+    """
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
 def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
-    """Split a side-by-side image (h, 2w) into both views; raises DeviceError for an odd width."""
+    """Split a side-by-side image (h, 2w) into left and right view.
+
+    name: source for the error text.  Raises DeviceError for an odd width.
+    """
     if image.shape[1] % 2:
         raise DeviceError(
-            f"{name}: side-by-side image of odd width {image.shape[1]} px; set `right` if "
-            "the views are separate"
+            f"{name}: side-by-side image of odd width {image.shape[1]} px cannot be split; set "
+            "`right` if the views are separate"
         )
     middle = image.shape[1] // 2
     return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
 
 
 def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
-    """Raise DeviceError unless each view has the size of its region, or of the scene's camera."""
+    """Raise DeviceError unless each image has the size of its region, or of the scene's camera."""
     whole = Region(0, 0, camera.width_px, camera.height_px)
     regions = images.regions or (whole, whole)
     views = (("left", images.left, regions[0]), ("right", images.right, regions[1]))
@@ -174,8 +184,8 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
                 else f"its region is {region}"
             )
             raise DeviceError(
-                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, {expected}: correct "
-                "the scene or the source"
+                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, but {expected}: "
+                "correct the scene's camera or the camera node's source"
             )
 
 
@@ -193,7 +203,8 @@ def crop(images: ImagePair, regions: Regions) -> ImagePair:
         if not available.contains(region):
             side = ("left", "right")[index]
             raise DeviceError(
-                f"region.{side}: {region} is outside the image, which has {available}: correct it"
+                f"region.{side}: {region} is outside the image, which has {available}; correct the "
+                "camera node's parameter region"
             )
         row, column = region.row - available.row, region.column - available.column
         part = image[row : row + region.height, column : column + region.width]

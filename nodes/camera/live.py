@@ -1,4 +1,4 @@
-"""Read live cameras, with one thread each to stamp frames on arrival."""
+"""Read live cameras. A thread for each camera records the arrival time of its frames."""
 
 from __future__ import annotations
 
@@ -24,15 +24,18 @@ from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import Pairing, StampCheck
 
 MAX_WAITING_FRAMES = 4
-"""Maximum number of frames that wait for their partner; further ones replace the oldest."""
+"""Maximum number of frames that wait for the other camera's frame; new ones replace the oldest."""
 FIRST_FRAME_S = 5.0
-"""Minimum timeout for the first frame, since the sensors then start."""
+"""Minimum timeout for the first frame, because the sensors need time to start."""
 RELEASE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """Image of one camera, and the middle of its exposure: by arrival and by the driver's stamp."""
+    """Image of one camera with two estimates of its mid-exposure time, ns.
+
+    by_arrival_ns: from the arrival. by_stamp_ns: from the driver's timestamp; None: not available.
+    """
 
     image: Image
     by_arrival_ns: int
@@ -40,12 +43,12 @@ class CapturedFrame:
 
 
 def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
-    """Open a device, file or stream; raises DeviceError if OpenCV cannot open it."""
+    """Open a device, file or stream with OpenCV; raises DeviceError if it cannot be opened."""
     capture = cv2.VideoCapture(device, api)
     if not capture.isOpened():
         capture.release()
         raise DeviceError(
-            f"{device!r}: cannot be opened: it is missing, in use, or no camera or video"
+            f"{device!r}: cannot be opened: it does not exist, is in use, or is no camera or video"
         )
     return capture
 
@@ -53,8 +56,8 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
 class Stream(threading.Thread):
     """Thread that reads one camera's frames, and notifies `changed` of each frame and of a failure.
 
-    The thread releases the capture, because OpenCV crashes on a release during a grab, and a grab
-    can hang.
+    The thread also releases the device. OpenCV would crash if another thread released it during a
+    grab, and a grab can hang.
     """
 
     def __init__(
@@ -70,8 +73,8 @@ class Stream(threading.Thread):
     ) -> None:
         """Open and configure the device.  Raises DeviceError.
 
-        views: 2 if one image contains both views.
-        requested: region of the sensor to read.
+        views: 2 if each image contains both views side by side, else 1.
+        requested: region of the sensor to read; None: the full sensor.
         """
         super().__init__(name=f"camera {device}", daemon=True)
         self.device = device
@@ -99,7 +102,7 @@ class Stream(threading.Thread):
 
     @property
     def trusts_stamps(self) -> bool:
-        """Return whether the driver's stamps are plausible."""
+        """Return whether the driver's timestamps are plausible."""
         return self._stamp_check is not None and self._stamp_check.trusted
 
     def stop(self) -> None:
@@ -125,7 +128,7 @@ class Stream(threading.Thread):
             self._capture.release()
 
     def _next(self) -> CapturedFrame | None:
-        """Return the next frame; None if its stamp is implausible.  Raises DeviceError."""
+        """Read the next frame; return None if its timestamp is implausible.  Raises DeviceError."""
         grabbed = self._capture.grab()
         arrival_ns = self._now()
         stamp_ns = None
@@ -137,7 +140,9 @@ class Stream(threading.Thread):
                 stamp_ns = None
         image = self._capture.retrieve()[1] if grabbed else None
         if image is None:
-            raise DeviceError(f"{self.device!r}: delivers no more images: unplugged, or at its end")
+            raise DeviceError(
+                f"{self.device!r}: delivers no more images: it was unplugged, or the stream ended"
+            )
         by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
         return CapturedFrame(convert_to_gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
 
@@ -145,8 +150,8 @@ class Stream(threading.Thread):
 class CameraReader:
     """Reader of two free-running cameras, or of one with both views side by side.
 
-    The middle of an exposure is the driver's stamp minus `exposure_to_stamp_s` if the stamps of all
-    drivers are plausible, else the arrival minus `exposure_to_grab_s`.
+    If the timestamps of all drivers are plausible, the mid-exposure time of a frame is its
+    timestamp minus `exposure_to_stamp_s`.  Otherwise it is the arrival minus `exposure_to_grab_s`.
     """
 
     paced = False
@@ -167,7 +172,7 @@ class CameraReader:
                     source,
                     camera,
                     views=2 if is_single else 1,
-                    # An image of both views cannot have two regions.
+                    # If one image contains both views, it cannot have a region for each.
                     requested=None if requested is None or is_single else requested[index],
                     now=now,
                     changed=self._changed,
@@ -212,7 +217,7 @@ class CameraReader:
         return self._make_pair(frames)
 
     def _by_stamp(self) -> bool:
-        """Return whether the drivers' stamps are used, for all cameras or none."""
+        """Return whether the drivers' timestamps are used; this is the same for all cameras."""
         return all(stream.trusts_stamps for stream in self._streams)
 
     def _exposure_ns(self, frame: CapturedFrame) -> int:
@@ -221,7 +226,10 @@ class CameraReader:
         return frame.by_arrival_ns
 
     def _pop_frames(self) -> tuple[CapturedFrame, ...] | None:
-        """Remove and return the next pair, or the next frame with both views; None if none."""
+        """Remove and return the next two frames of a pair, or the next frame with both views.
+
+        Return None if it has not arrived yet.
+        """
         if len(self._streams) == 1:
             frames = self._streams[0].frames
             return (frames.popleft(),) if frames else None
@@ -247,7 +255,10 @@ class CameraReader:
         )
 
     def _describe_silence(self, counts: list[int]) -> str:
-        """Return the reason why no pair arrived; counts: frames per camera at the start."""
+        """Return an error text that explains why no pair arrived.
+
+        counts: number of frames of each camera when the wait began.
+        """
         silent = [
             repr(stream.device)
             for stream, count in zip(self._streams, counts, strict=True)
@@ -270,7 +281,7 @@ class CameraReader:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Close the cameras; one that hangs in a grab is released by its thread after the grab."""
+        """Close the cameras.  If a grab hangs, the camera's thread releases it after the grab."""
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

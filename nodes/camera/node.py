@@ -1,4 +1,4 @@
-"""Publish images of the finger, from the simulator, from devices or from files."""
+"""Publish stereo images of the finger from the simulator, from cameras or from files."""
 
 from __future__ import annotations
 
@@ -31,22 +31,25 @@ JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """Parameters of the source of images, and of the images to publish."""
+    """Parameters of the camera node: source of images, and which images to publish."""
 
     source: AnySource = TwinSource()
     retry_s: Positive = Field(
-        default=1.0, description="first delay before a failed device is reopened"
+        default=1.0, description="first delay before a failed source is opened again, s"
     )
     max_skew_s: Positive | None = Field(
-        default=None, description="maximum skew of a pair; null: no limit"
+        default=None,
+        description="maximum time between the left and right exposure, s; null: no limit",
     )
     region: Literal["full", "finger"] | ExplicitRegions = Field(
-        default="full", description="part of each view to publish; finger: the finger's volume"
+        default="full",
+        description="part of each view to publish: full, finger (where the finger can appear), or "
+        "regions",
     )
 
 
 class Camera(Node):
-    """Node that publishes stereo pairs with the time of their exposure."""
+    """Node that publishes stereo image pairs with the time of their exposure."""
 
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
@@ -68,10 +71,10 @@ class Camera(Node):
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.source.kind == "twin":
-            return ""  # it forwards twin/stereo and opens no device
+            return ""  # It forwards the topic twin/stereo, so it opens no device.
         return (
-            "it reads a device, which is not in the bag; `bag verify triangulator` replays a "
-            "recorded topic stereo"
+            "it reads a device or files, which the bag does not contain; `bag verify triangulator` "
+            "replays a recorded topic stereo"
         )
 
     async def close(self) -> None:
@@ -114,7 +117,7 @@ class Camera(Node):
         self.note = f"no images: {error}"
 
     def _report_warning(self, text: str) -> None:
-        """Report a warning once per scene, even if the device is opened repeatedly."""
+        """Report a warning only once per scene, even if the device is opened several times."""
         if text not in self.warned:
             self.warned = (*self.warned, text)
             self.report_error("source", DeviceError(text))
@@ -135,10 +138,10 @@ class Camera(Node):
         self._publish(images, pair.device, pair.exposure_s, pair.dropped_frames)
 
     def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
-        """Publish a pair.
+        """Publish an image pair, unless its skew exceeds the limit.
 
-        exposure_s: used if the device does not report it.
-        lost: number of lost frames, without rejected ones.
+        exposure_s: used if the device does not report its exposure.
+        lost: number of lost frames, not including rejected ones.
         """
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(images.skew_s) > limit_s:

@@ -1,4 +1,7 @@
-"""Compute the region of each sensor that can show the finger, by projecting its volume."""
+"""Compute the region of each sensor in which the finger can appear.
+
+The finger's volume, the box that it can reach, is projected into both images.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +17,17 @@ from flexsheet.nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Number of points along each edge of the volume; distortion between two of them is negligible."""
+"""Number of points along each edge of the finger's volume.  They are close enough to neglect lens
+distortion between them."""
 MARGIN_PX = 16.0
-"""Margin for the marker's blur, and for differences between calibration and scene."""
+"""Margin of the region, for the marker's blur and for differences between calibration and scene."""
 ALIGN_PX = (16, 2)
-"""Multiples of columns and rows at which a region can start."""
+"""A region can start only at multiples of these numbers of columns and rows."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """Regions in a launch file: [column, row, width, height] for each view, px."""
+    """Sensor regions as given in a launch file: [column, row, width, height] of each view, px."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -40,11 +44,11 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the sensor region that shows points (n, 3) of the camera's frame, m; None if none.
+    """Return the sensor region that shows all visible points (n, 3) m in the camera's frame.
 
+    Return None if no point is visible, and the full sensor if some points are behind the camera.
     The distortion polynomial is invalid beyond the image's corners.  Points there are moved to the
-    circle through the farthest corner, which does not affect the image.  A volume that extends
-    behind the camera gives the full sensor.
+    circle through the farthest corner, which does not change the visible points.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:
@@ -71,10 +75,10 @@ def find_visible_region(
 
 
 def find_finger_regions(scene: Scene) -> Regions:
-    """Return the region of each view that can show a fingertip.
+    """Return the sensor region of each view in which a fingertip can appear.
 
-    The finger's volume is extended by the finger's radius and a margin.  Raises DeviceError if it
-    is outside a view.
+    The finger's volume is extended by the finger's radius and a margin.  Raises DeviceError if a
+    view does not show the volume.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -89,16 +93,17 @@ def find_finger_regions(scene: Scene) -> Regions:
         if region is None:
             raise DeviceError(
                 f"the {side} view does not show finger.volume_min_m to volume_max_m: correct "
-                f"them or camera.world_from_left in scene {scene.name}, or set region: full"
+                f"these or camera.world_from_left in scene {scene.name}, or set region: full"
             )
         found.append(region)
     return found[0], found[1]
 
 
 def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """Return the regions to publish; None for both full sensors.
+    """Return the sensor regions to publish; None for both full sensors.
 
-    setting: "full", "finger", or regions.  Raises DeviceError for a region outside its sensor.
+    setting: "full", "finger" (the finger's volume), or explicit regions.  Raises DeviceError if a
+    region is not inside its sensor.
     """
     if setting == "full":
         return None
@@ -108,6 +113,7 @@ def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | N
     for side, region in (("left", setting.left), ("right", setting.right)):
         if not whole.contains(region):
             raise DeviceError(
-                f"region.{side}: {region} is outside the sensor of {whole.width}x{whole.height} px"
+                f"region.{side}: {region} is outside the sensor, which has "
+                f"{whole.width}x{whole.height} px; correct the camera node's parameter region"
             )
     return setting.left, setting.right

@@ -1,8 +1,8 @@
 """Set a camera's exposure, gain, white balance, focus and region to fixed values.
 
-Each setting is read back.  A setting that the device does not accept gives a warning with property,
-requested and actual value.  Units differ between OpenCV's backends (see its sources
-modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp, cap_aravis.cpp).
+Each setting is read back.  If the device does not accept a setting, a warning gives its name, the
+requested value and the actual one.  Units differ between OpenCV's backends (see its source files
+modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp and cap_aravis.cpp).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_RATE_HZ = 10_000.0
 
 
 class Device(Protocol):
-    """Interface of cv2.VideoCapture that is used here."""
+    """Part of the interface of cv2.VideoCapture that this module uses."""
 
     def get(self, property_id: int, /) -> float: ...
 
@@ -32,12 +32,12 @@ class Device(Protocol):
 class Backend:
     """Properties and units of a camera's controls in one of OpenCV's backends.
 
-    exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether it is an integer.
-    auto_exposure: property and its value for manual exposure.
-    autos: further automatic functions to switch off (0).
-    offsets: properties of the region's first column and row; None if OpenCV has none.
-    buffers: number of frame buffers of the driver.
-    clock: whether CAP_PROP_POS_MSEC after a grab is the driver's stamp of that frame.
+    exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether its values are integers.
+    auto_exposure: OpenCV property, and the value that selects manual exposure.
+    autos: names and properties of further automatic functions, which the value 0 switches off.
+    offsets: properties for first column and row of the sensor region; None if OpenCV has none.
+    buffers: number of frame buffers to request from the driver.
+    clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
     """
 
     api: int
@@ -84,7 +84,10 @@ BACKENDS = {
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """Settings of a device; exposure_s: None if unknown; warnings: settings that it rejected."""
+    """Actual settings of a device.
+
+    exposure_s: None if unknown.  warnings: texts about settings that the device did not accept.
+    """
 
     exposure_s: float | None
     rate_hz: float
@@ -92,7 +95,11 @@ class DeviceSettings:
 
 
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
-    """Return the backend to open a device with; None for OpenCV's choice, with unknown controls."""
+    """Return the OpenCV backend with which to open a device.
+
+    api: name of a backend, or None to choose it by the device.  Return None if OpenCV shall choose;
+    the camera's controls are then unknown.
+    """
     if api is None:
         api = "v4l2" if isinstance(device, int) or device.startswith("/dev/") else "any"
     return BACKENDS.get(api)
@@ -101,17 +108,17 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
 def set_format(
     capture: Device, backend: Backend | None, camera: StereoCamera, views: int, pixel_format: str
 ) -> None:
-    """Request the scene's size and rate; the device can deliver others.
+    """Request the image size and frame rate of the scene; the device may deliver others.
 
-    views: 2 if one image contains both views side by side.
-    pixel_format: "" for OpenCV's choice.
+    views: 2 if each image contains both views side by side, else 1.
+    pixel_format: four characters such as MJPG; "" for OpenCV's choice.
     """
     if backend is not None and backend.buffers is not None:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, backend.buffers)
     if pixel_format:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*pixel_format))
     if backend is not None and backend.offsets is not None:
-        # A region from a previous use limits the size.
+        # A region that is still set from a previous use would limit the image size.
         for offset in backend.offsets:
             capture.set(offset, 0.0)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, views * camera.width_px)
@@ -122,7 +129,7 @@ def set_format(
 def fix_settings(
     capture: Device, backend: Backend | None, camera: StereoCamera, device: object
 ) -> DeviceSettings:
-    """Set the scene's exposure and gain, switch automatic functions off, and verify all."""
+    """Set the scene's exposure and gain, switch automatic functions off, and check all settings."""
     warnings: list[str] = []
 
     def warn(what: str, requested: str, actual: str) -> None:
@@ -138,7 +145,7 @@ def fix_settings(
         return DeviceSettings(None, rate_hz, tuple(warnings))
 
     if backend.api == cv2.CAP_V4L2:
-        # Prevents that an environment variable makes OpenCV scale all controls to 0..1.
+        # An environment variable can make OpenCV scale all controls to 0..1; this prevents it.
         capture.set(cv2.CAP_PROP_MODE, 0.0)
     automatic, manual_value = backend.auto_exposure
     capture.set(automatic, manual_value)
@@ -174,9 +181,10 @@ def fix_settings(
 def set_region(
     capture: Device, backend: Backend | None, requested: Region, camera: StereoCamera
 ) -> Region | None:
-    """Set the device to a region of its sensor; return the actual one, or None for the full sensor.
+    """Set the region of the sensor that the device reads.
 
-    If the device does not read all of the requested region, it is reset to the full sensor.
+    Return the actual region, or None for the full sensor.  If the actual region does not contain
+    the requested one, the device is reset to the full sensor.
     """
     if backend is None or backend.offsets is None:
         return None
@@ -184,7 +192,7 @@ def set_region(
     properties = (column, row, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 
     def set_and_read(region: Region) -> Region:
-        # Offset and size limit each other: start with offset 0.
+        # Offset and size limit each other, so set the offset to 0 before the size.
         capture.set(column, 0)
         capture.set(row, 0)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, region.width)

@@ -13,33 +13,33 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class CameraSource(LimitedModel):
-    """Base class of the values of the parameter `source`."""
+    """Base class for the values of the camera node's parameter `source`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class TwinSource(CameraSource):
-    """Images of the simulator, from the topic twin/stereo."""
+    """Simulated images, which the simulator publishes on the topic twin/stereo."""
 
     kind: Literal["twin"] = "twin"
 
 
 class OpenCvSource(CameraSource):
-    """Cameras that OpenCV opens by number, by path, or by a stream's address.
+    """Cameras that OpenCV opens by number, by device path, or by the address of a stream.
 
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
     kind: Literal["opencv"]
     left: int | DeviceFile = Field(
-        description="left camera, or the one with both views side by side"
+        description="left camera, or a camera with both views side by side: number, path or address"
     )
     right: int | DeviceFile | None = Field(
-        default=None, description="right camera; null: left has both views side by side"
+        default=None, description="right camera; null: `left` has both views side by side"
     )
     api: Literal["v4l2", "ximea", "aravis", "any"] | None = Field(
         default=None,
-        description="backend of OpenCV; null: v4l2 for numbers and paths under /dev, else any",
+        description="OpenCV backend; null: v4l2 for numbers and for paths under /dev, else any",
     )
     pixel_format: Annotated[str, Field(min_length=4, max_length=4)] | None = Field(
         default=None,
@@ -47,16 +47,16 @@ class OpenCvSource(CameraSource):
     )
     exposure_to_stamp_s: Finite | None = Field(
         default=None,
-        description="time from mid-exposure to the driver's stamp, negative if the driver stamps "
-        "the start of the exposure; null: half the exposure",
+        description="time from mid-exposure to the driver's timestamp, s; negative if that is the "
+        "start of the exposure; null: half the exposure time",
     )
     exposure_to_grab_s: NonNegative | None = Field(
         default=None,
-        description="time from mid-exposure to the image's arrival, for drivers without usable "
-        "stamps; null: half the exposure",
+        description="time from mid-exposure to the image's arrival, s, for drivers without usable "
+        "timestamps; null: half the exposure time",
     )
     silence_s: Positive = Field(
-        default=1.0, description="maximum time without a pair before the device is reopened"
+        default=1.0, description="maximum time without an image pair before reopening a device, s"
     )
 
 
@@ -66,32 +66,33 @@ class VideoSource(CameraSource):
     kind: Literal["video"]
     left: Path
     right: Path | None = Field(
-        default=None, description="right video; null: left has both views side by side"
+        default=None, description="right video file; null: `left` has both views side by side"
     )
     rate_hz: Positive | None = Field(
-        default=None, description="frame rate; null: the frame times of the files"
+        default=None, description="frame rate, Hz; null: the frame times in the files"
     )
-    loop: bool = Field(default=False, description="restart at the end")
+    loop: bool = Field(default=False, description="whether to start again at the end")
 
 
 class ImagesSource(CameraSource):
-    """Image files, in the order of their sorted names."""
+    """Image files, which are read in the order of their names."""
 
     kind: Literal["images"]
-    left: Path = Field(description="pattern of the left images: images/left*.png")
-    right: Path = Field(description="pattern of the right images")
+    left: Path = Field(description="glob pattern of the left images, such as images/left*.png")
+    right: Path = Field(description="glob pattern of the right images")
     times: Path | None = Field(
         default=None,
-        description="CSV file with a column t_s, one row per pair; null: constant rate",
+        description="CSV file with a column t_s (time, s), one row per pair; null: constant rate",
     )
     rate_hz: Positive | None = Field(
-        default=None, description="rate without a file of times; null: the scene's camera rate"
+        default=None,
+        description="image rate, Hz, if `times` is not given; null: the scene's camera rate",
     )
-    loop: bool = Field(default=False, description="restart at the end")
+    loop: bool = Field(default=False, description="whether to start again at the end")
 
 
 def _expand_kind(source: object) -> object:
-    """Expand the short form `source: twin` of a launch file to a mapping."""
+    """Expand the short form of a source in a launch file, `source: twin`, to a mapping."""
     return {"kind": source} if isinstance(source, str) else source
 
 

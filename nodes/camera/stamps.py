@@ -1,4 +1,4 @@
-"""Check the stamps of camera drivers, and pair the frames of two cameras."""
+"""Check the timestamps of camera drivers, and pair the frames of two cameras."""
 
 from __future__ import annotations
 
@@ -9,22 +9,24 @@ from typing import TypeVar
 T = TypeVar("T")
 
 MAX_FUTURE_NS = 1_000_000
-"""Maximum time of a stamp after the frame's arrival, by rounding."""
+"""Maximum time by which a timestamp may be later than the frame's arrival, due to rounding."""
 MAX_AGE_NS = 1_000_000_000
-"""Maximum age of a stamp on arrival, for a driver with a few buffers at 10 Hz or more."""
+"""Maximum age of a timestamp when the frame arrives.  It allows for a driver with a few frame
+buffers at 10 Hz or more."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
-"""Tolerance of the pairing as a fraction of the period.  Without it, jitter of two cameras half a
-period apart would change the pairing repeatedly, and drop a frame each time."""
+"""Tolerance of the pairing, as a fraction of the period.  It is needed for cameras that expose half
+a period apart.  Without it, jitter would change the pairs repeatedly, and drop a frame each time.
+"""
 
 
 class StampCheck:
-    """Check of a driver's stamps: whether they are readings of this host's monotonic clock.
+    """Check whether a driver's timestamps are readings of this host's monotonic clock.
 
-    A stamp is plausible if it is at most a second before the frame's arrival, not after it, and
-    after the previous stamp.  Stamps of another clock differ by hours or years.  The caller drops a
-    frame with an implausible stamp.  After MAX_IMPLAUSIBLE in a row, stamps are ignored until the
-    device is reopened.
+    A timestamp is plausible if it is later than the previous one, and at most MAX_AGE_NS before the
+    frame's arrival.  Timestamps of another clock differ by hours or years.  The caller drops a
+    frame with an implausible timestamp.  After MAX_IMPLAUSIBLE such frames in a row, `trusted` is
+    false, and timestamps are ignored until the device is reopened.
     """
 
     def __init__(self) -> None:
@@ -33,7 +35,7 @@ class StampCheck:
         self._newest_ns: int | None = None
 
     def is_plausible(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Return whether one frame's stamp is plausible; both in ns."""
+        """Return whether the timestamp of a frame that arrived at `arrival_ns` is plausible."""
         good = -MAX_FUTURE_NS <= arrival_ns - stamp_ns <= MAX_AGE_NS and (
             self._newest_ns is None or stamp_ns > self._newest_ns
         )
@@ -46,10 +48,10 @@ class StampCheck:
 
 
 class Pairing:
-    """Pairing of the frames of two free-running cameras with equal rates by their exposure times.
+    """Pairing of the frames of two cameras with equal rates by their exposure times.
 
-    Two frames are a pair if they are at most half a period (and `SLACK`) apart.  Otherwise the
-    older one is dropped and counted in `unpaired`.
+    The cameras have no common trigger.  Two frames are a pair if their exposures are at most half a
+    period (plus `SLACK`) apart.  Otherwise the older one is dropped and counted in `unpaired`.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -59,9 +61,9 @@ class Pairing:
     def pop_pair(
         self, left: deque[T], right: deque[T], exposure_ns: Callable[[T], int]
     ) -> tuple[T, T] | None:
-        """Remove the next pair from both queues (oldest first) and return it; None if none.
+        """Remove the next pair from both queues and return it; None if there is none.
 
-        exposure_ns: returns the time of a frame's exposure.
+        left, right: frames, oldest first.  exposure_ns: returns the exposure time of a frame.
         """
         while left and right:
             skew_ns = exposure_ns(right[0]) - exposure_ns(left[0])

@@ -1,9 +1,9 @@
 """Measure time and image error of the correction methods.
 
-The time is that of drawing a stereo frame, without reading it. The method `floor` is a lower bound:
-it clears the frame and draws the same triangles once for each eye, with the same number of samples.
-The error is measured at each point that the eye sees on the reference sheet. The caller provides
-the reference, which shares no code with the renderer.
+The time is that of drawing a stereo frame, without reading its pixels. The method `floor` gives a
+lower bound for it: it clears the frame and draws the same triangles once for each eye, with the
+same number of samples. The error is measured at each point that the eye sees on a reference sheet.
+The caller provides this reference, which shares no code with the renderer.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 Floats = NDArray[np.float64]
 
 ErrorMeasure = Callable[[Image, Image], Floats]
-"""Function from the projector images of `coordinate_ramp_x` and `coordinate_ramp_y` to the errors
-(n,), m, at all visible points of the object."""
+"""Function that computes the errors (n,), m, at all visible points of the object. Its arguments are
+the projector's images of the patterns `coordinate_ramp_x` and `coordinate_ramp_y`."""
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
-"""Function that returns an `ErrorMeasure` for a scene, the poses (4, 4) of the left and right edge,
-and the fingertip (3,) or None."""
+"""Function that returns an `ErrorMeasure` for a scene, the poses (4, 4) of the sheet's left and
+right edge, and the fingertip (3,) or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
-"""Two-pass methods with approximate sheet shapes."""
+"""Variants of two_pass that use an approximate shape of the sheet."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
@@ -50,7 +50,7 @@ CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
 )
-"""Tilts (degrees) and pushes (mm)."""
+"""Tilts of the sheet (degrees) and push depths (mm)."""
 LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
 SIZES_PX = ((800, 600), (1280, 720))
 STRETCH = 1.05
@@ -58,10 +58,10 @@ SPACING_M = 0.0025
 
 
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all corrections over the tilts and pushes of the paper's figures.
+    """Return the benchmark of all correction methods for tilted and pushed sheets.
 
-    The cases are those of figures 11 and 13 and the limits of the scene's working range. solved:
-    whether to include the methods that need precomputed deflection shapes.
+    The cases are those of figures 11 and 13 in Furukawa et al. 2007, and the limits of the scene's
+    working range. solved: whether to include methods that need precomputed deflection shapes.
     """
     return Family(
         name="correction",
@@ -74,15 +74,15 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
 
 
 MAX_TRIANGLES_DEPTH_MM = 3.5
-"""Push for which four triangles have an error of half a millimetre (rms)."""
+"""Push depth at which the shape of four triangles causes an rms error of half a millimetre."""
 
 
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
-    """Return whether a case is within a method's specified range.
+    """Return whether a method is specified for a tilt and push depth of the sheet.
 
-    `none` requires the sheet on the imaginary screen, `one_plane` an unpushed sheet, and
-    `four_triangles` a push of up to `MAX_TRIANGLES_DEPTH_MM`. All methods except `none` are for up
-    to 50 degrees of tilt.
+    `none` requires the sheet on the imaginary screen, `one_plane` a sheet without a push, and
+    `four_triangles` a push depth of at most `MAX_TRIANGLES_DEPTH_MM`. All methods except `none` are
+    specified for tilts of up to 50 degrees.
     """
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
@@ -98,10 +98,11 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
 def roll_sheet(
     scene: Scene, tilt_rad: float, contact_m: tuple[float, float] | None = None
 ) -> Floats:
-    """Return world_from_sheet of a sheet that touches the object at a tilt.
+    """Return the pose world_from_sheet (4, 4) of a tilted sheet that touches the object.
 
-    contact_m: (x, y) of the contact on the sheet; None: for a cylinder, after rolling without slip
-    from zero tilt; for other objects, the sheet's centre, at the point nearest to the user.
+    contact_m: (x, y) of the point of contact on the sheet. None: on a cylinder, the sheet has
+    rolled without slip from zero tilt. Other objects touch the sheet's centre with their point that
+    is nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
@@ -126,7 +127,7 @@ def _lay_sheet(scene: Scene, tilt_rad: float, contact_m: tuple[float, float]) ->
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the limits of the scene's working range as cases, see `CASES`."""
+    """Return the limits of the scene's working range: tilts (degrees) and push depths (mm)."""
     tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
@@ -185,7 +186,10 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet and a function that returns its error measure, cached."""
+    """Return the predicted sheet of a case, and a function that returns its error measure.
+
+    The function computes the measure in the first call only.
+    """
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -201,7 +205,7 @@ def _make_situation(
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a method or the lower bound `FLOOR`."""
+    """Draw one stereo frame by a correction method, or by the lower bound `FLOOR`."""
     display = Display(correction=_correction_name(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
@@ -216,7 +220,7 @@ def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) ->
 def draw_coordinate_ramps(
     scene_renderer: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
-    """Draw and return the projector's images of both coordinate ramps, in mono."""
+    """Draw the projector's images of both coordinate ramps for one eye, and return them."""
     images = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)

@@ -1,16 +1,18 @@
-"""Correct the projected image for a moved or pushed sheet: equations (1)-(6) of the paper.
+"""Correct the projected image for a moved or pushed sheet, by equations (1)-(6) of the paper.
 
-V is the eye, P the projector, A a point of the object. C is the intersection of the line V-A with
-the actual screen (the sheet), C' that of the line C-P with the imaginary screen, and A' the point
-of the line V-C' at A's depth. A point that is drawn at A' is seen at A.
+The paper is Furukawa et al. 2007.
+The image is drawn for the imaginary screen, a fixed plane z = 0, but projected onto the actual
+screen, the sheet. V is the eye, P the projector and A a point of the object. C is the intersection
+of the line V-A with the actual screen, and C' that of the line C-P with the imaginary screen. A' is
+the point of the line V-C' at the depth of A. If the point is drawn at A', the eye sees it at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners. All points are in the world frame, m. Points are masked (`valid` false) and not moved if
+corners. All points are in the world frame, m. Points are invalid and not moved if
 
 - the eye or the projector sees the screen edge-on, within `GRAZING_SINE`, or from the other side;
 - the point is not in front of the eye, or its C is behind the eye or the projector.
 
-A triangle without area is replaced by the plane of the sheet, and so is a push below `MIN_PUSH_M`.
+The plane of the sheet replaces triangles without area, and all four if the push is too shallow.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ GRAZING_SINE = 0.05
 stretched by a factor of 20."""
 
 NEAR_M = 0.02
-"""Minimum depth of drawn points from the eye."""
+"""Minimum depth of drawn points in front of the eye."""
 
 MIN_PUSH_M = 1e-4
 """Minimum push depth for the four triangles; below it, the screen is a plane."""
@@ -39,7 +41,7 @@ MIN_PUSH_M = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class ScreenPlane:
-    """Plane by a point (3,) and a unit normal (3,) towards the user."""
+    """Plane through a point (3,) with a unit normal (3,) that points towards the user."""
 
     point: Floats
     normal: Floats
@@ -49,9 +51,9 @@ class ScreenPlane:
 class ProjectionScreen:
     """Actual screen: four triangles with a common vertex, or one plane.
 
-    point: r_s (3,), common to all triangles. normals: n_si (4, 3), towards the user. corners: (4,
-    3), counter-clockwise for the user; triangle i is between corner i and the next. None if all
-    normals are equal.
+    point: (3,), common to all triangles (r_s in the equations). normals: (4, 3), towards the user
+    (n_si). corners: (4, 3), counter-clockwise as seen by the user; triangle i is between corner i
+    and the next one. None for one plane, which has four equal normals.
     """
 
     point: Floats
@@ -63,7 +65,7 @@ class ProjectionScreen:
 class CorrectedPoints:
     """Corrected points A' (n, 3), points C' on the imaginary screen (n, 3), and validity (n,).
 
-    Invalid points are equal to A.
+    Where a point is invalid, both are equal to the point A of the object.
     """
 
     points: Floats
@@ -72,7 +74,7 @@ class CorrectedPoints:
 
 
 IMAGINARY_SCREEN = ScreenPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-"""Imaginary screen (r_o, n_o), whose frame is the world frame."""
+"""Imaginary screen: the plane z = 0 of the world (point r_o and normal n_o in the equations)."""
 
 
 def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
@@ -83,10 +85,11 @@ def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
 def make_pushed_screen(
     pushed_point: Floats, corners: Floats, plane: ScreenPlane
 ) -> ProjectionScreen:
-    """Return the four triangles between the pushed point and the sheet's corners (section III-C 3).
+    """Return the screen of four triangles between the pushed point and the sheet's corners.
 
-    pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane: of
-    the unpushed sheet; it replaces triangles without area, and all four below `MIN_PUSH_M`.
+    pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane:
+    plane of the sheet without a push; it replaces triangles without area, and all four if the push
+    is below `MIN_PUSH_M`. Source: section III-C 3 of the paper.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -99,11 +102,11 @@ def make_pushed_screen(
 
 
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
-    """Return the unit normals (4, 3) of the planes through eye, pushed point and each corner.
+    """Return the unit normals (4, 3) of the planes through the eye, the pushed point and a corner.
 
-    Seen from the eye, the lines from the pushed point to the corners divide the image into sectors.
-    A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1). Normals are zero for a
-    screen of one plane, and for a line that points to the eye.
+    Seen from the eye, the lines from the pushed point to the corners divide the image into sectors,
+    one for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
+    Normals are zero for a screen of one plane, and for a line that points to the eye.
     """
     if screen.corners is None:
         return np.zeros((4, 3))
@@ -113,11 +116,11 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
 
 def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> NDArray[np.intp]:
-    """Return the number (n,) of the triangle that the line V-A of each point intersects.
+    """Return the index (n,) of the triangle that the line V-A intersects, for each point A.
 
-    It is the sector whose boundary is farthest from the line. Outside the sheet's outline the
-    sectors are extended, so that each point has exactly one. Where triangles overlap as seen from
-    the eye, depth is ignored.
+    The line is in the sector whose boundaries are farthest from it. Sectors extend beyond the
+    sheet's outline, so each point is in exactly one. If triangles overlap as seen from the eye,
+    their order in depth is ignored.
     """
     sides = (points - eye) @ sector_normals(screen, eye).T
     depths = np.minimum(sides, -np.roll(sides, -1, axis=1))
@@ -126,9 +129,10 @@ def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> N
 
 
 def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple[Floats, Bools]:
-    """Return C (n, 3) by equations (1) and (2), and its validity (n,).
+    """Return the points C (n, 3) on the actual screen by equations (1) and (2), and validity (n,).
 
-    r_s: (3,). n_s: (n, 3), one normal per point. C is invalid behind the eye or at grazing angles.
+    r_s: (3,), point of the screen. n_s: (n, 3), normal of the screen for each point. C is invalid
+    behind the eye, and if the eye sees the screen at less than the minimum angle.
     """
     denominator = np.sum((eye - points) * n_s, axis=1)
     length = np.linalg.norm(eye - points, axis=1)
@@ -141,7 +145,10 @@ def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple
 def imaginary_point(
     on_actual: Floats, projector: Floats, n_s: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """Return C' (n, 3) by equations (3) and (4), and whether the projector lights it (n,)."""
+    """Return the points C' (n, 3) on the imaginary screen by equations (3) and (4).
+
+    The second result is whether the projector illuminates the sheet there from behind, (n,).
+    """
     light = on_actual - projector
     denominator = light @ imaginary.normal
     length = np.linalg.norm(light, axis=1)
@@ -155,7 +162,10 @@ def imaginary_point(
 def shifted_point(
     points: Floats, on_imaginary: Floats, eye: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """Return A' (n, 3) by equations (5) and (6), and whether A is in front of the eye (n,)."""
+    """Return the corrected points A' (n, 3) by equations (5) and (6).
+
+    The second result is whether A is in front of the eye, (n,).
+    """
     normal = imaginary.normal
     valid = (eye - points) @ normal > NEAR_M
     denominator = (eye - on_imaginary) @ normal
@@ -171,10 +181,10 @@ def correct(
     screen: ProjectionScreen,
     imaginary: ScreenPlane = IMAGINARY_SCREEN,
 ) -> CorrectedPoints:
-    """Return A' of points A (n, 3) by equations (1)-(6), as `object.vert.glsl` computes it.
+    """Compute the corrected points A' of points A (n, 3) by equations (1)-(6).
 
-    Raises ValueError unless the eye is in front of the imaginary screen and the projector behind
-    it.
+    It is the reference for the shader `object.vert.glsl`. Raises ValueError unless the eye is in
+    front of the imaginary screen and the projector behind it.
     """
     if (eye - imaginary.point) @ imaginary.normal <= NEAR_M:
         raise ValueError(f"eye position {eye} m is not in front of the imaginary screen")
@@ -192,7 +202,7 @@ def correct(
 
 
 def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
-    """Return whether the eye sees the plane's front and the projector lights its back."""
+    """Return whether the eye sees the plane's front and the projector illuminates its back."""
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(
         to_eye @ plane.normal > GRAZING_SINE * np.linalg.norm(to_eye)
@@ -201,7 +211,7 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Return the intersections (n, 2) of lines from the eye to points (n, 3) with z = 0."""
+    """Return the points (n, 2) where lines from the eye to points (n, 3) intersect z = 0."""
     fraction = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings
@@ -217,7 +227,7 @@ def pixel_from_screen(
 ) -> Floats:
     """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, m, to projector pixels.
 
-    The projector is a pinhole; lens distortion is applied to the pixels later (`lens.py`).
+    The projector is modelled as a pinhole. Lens distortion is applied later (`lens.py`).
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
@@ -227,9 +237,9 @@ def pixel_from_screen(
 
 
 def clip_from_screen(pixel_from_screen: Floats, width_px: int, height_px: int) -> Floats:
-    """Return the map (3, 3) from (x, y, 1) on the imaginary screen to OpenGL's clip (x, y, w).
+    """Return the matrix (3, 3) from (x, y, 1) on the imaginary screen to OpenGL clip (x, y, w).
 
-    The origin of pixels is the centre of the top left pixel.
+    The origin of pixel coordinates is the centre of the top left pixel.
     """
     clip_from_pixel = np.array(
         [

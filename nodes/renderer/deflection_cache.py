@@ -1,4 +1,7 @@
-"""Compute and cache the sheet's deflection shapes (half a minute of computation)."""
+"""Compute and cache the deflection shapes of the pushed sheet.
+
+The computation takes half a minute. Its result depends only on the scene.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +32,19 @@ VERSION = 2
 """Version of the computation. Increase it when results for the same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""Margin of the solved stretch ratios beyond the scene's limits."""
+"""Margin by which the range of stretch ratios in the computation exceeds the scene's limits."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
-"""Fields of `IndentationBasis` in the cache file."""
+"""Fields of `IndentationBasis` that the cache file contains."""
 
 MAX_DEPTH_RATIO = 1.2
-"""Maximum solved depth over the scene's push depth."""
+"""Ratio of the maximum push depth in the computation to the scene's push depth."""
 
 Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the sheet of a scene and the range of pushes that must be solved for it."""
+    """Return the rubber sheet of a scene, and the range of pushes that must be computed for it."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -53,9 +56,9 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return the cache specification of the scene's deflection shapes.
+    """Return how the scene's deflection shapes are cached: key, computation inputs and format.
 
-    The shapes do not depend on the sheet's thickness and modulus.
+    The shapes do not depend on the sheet's thickness and Young's modulus.
     """
     rubber, within = required_shapes(scene)
     depends_on = {
@@ -85,7 +88,11 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> IndentationBasis:
-    """Load the scene's cached shapes, or solve them on all cores and store them."""
+    """Load the scene's deflection shapes from the cache; if absent, compute and store them.
+
+    The computation uses all cores. cache_dir: folder of the cache; None: the user's cache.
+    progress: called with the number of solved pushes and their total number.
+    """
     rubber, within = required_shapes(scene)
 
     def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:

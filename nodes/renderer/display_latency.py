@@ -6,28 +6,28 @@ from collections import deque
 from statistics import median
 
 HISTORY = 31
-"""Number of recent frames for the latency statistics: half a second at 60 Hz."""
+"""Number of recent frames from which latencies are computed: half a second at 60 Hz."""
 
 VSYNC_MARGIN_S = 0.0005
-"""Minimum time between the end of drawing and the swap."""
+"""Minimum time between the end of drawing and the swap that shows the frame."""
 
 ON_TIME_FRACTION = 0.85
-"""Fraction of frames that must be ready for their predicted swap."""
+"""Fraction of frames that must be ready in time for their predicted swap."""
 
 
 class DisplayLatencyEstimator:
-    """Estimator of the display time of a frame: the middle of its light.
+    """Estimator of a frame's display time: the middle of the interval in which it is projected.
 
-    All times are ns of one clock. Without a window, the light starts at the end of drawing; with a
-    window, at the swap. If swaps wait for the projector's refresh, the prediction is based on the
-    next swap that the frame can reach.
+    All times are ns of one clock. The display time is a constant latency after the swap that shows
+    the frame or, without a window, after the end of drawing. If swaps wait for the projector's
+    refresh, the prediction is based on the next swap for which the frame will be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
         """Set the latencies.
 
-        first_s: from the start of drawing to the display time, before the first measurement.
-        display_latency_s: from the swap, or the end of drawing, to the display time. period_s:
+        first_s: time from the start of drawing to the display time, used for the first frame.
+        display_latency_s: time from the swap, or the end of drawing, to the display time. period_s:
         refresh period of the projector; 0 if swaps do not wait for it.
         """
         self._first_ns, self._light_ns = round(first_s * 1e9), round(display_latency_s * 1e9)
@@ -50,18 +50,21 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record a frame without a window and return its display time."""
+        """Record the drawing time of a frame without a window, and return its display time."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(drawn_ns - begun_ns)
         return drawn_ns + self._light_ns
 
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
-        """Record a frame that was shown at `swapped_ns` and return its display time."""
+        """Record a frame that a window showed at `swapped_ns`, and return its display time."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)
         self._last_swap_ns = swapped_ns
         return swapped_ns + self._light_ns
 
     def is_late(self, light_ns: int, predicted_ns: int) -> bool:
-        """Return whether a display time was later than predicted by more than half a frame."""
+        """Return whether a frame was displayed later than predicted.
+
+        The tolerance is half a refresh period, and at least the display latency.
+        """
         return light_ns - predicted_ns > max(self._period_ns // 2, self._light_ns)

@@ -1,4 +1,4 @@
-"""Predict the tracked eyes at the display time of a frame."""
+"""Predict the positions of the tracked eyes at the display time of a frame."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from flexsheet.nodes.renderer.max_age import MaxAge
 Floats = NDArray[np.float64]
 
 WINDOW_S = 0.15
-"""Duration over which the velocity is measured: longer than a few frames of a head tracker."""
+"""Duration over which the velocity is measured; it covers a few frames of a head tracker."""
 
 MIN_MESSAGES = 3
-"""Minimum number of positions for a velocity; before, the newest position is used."""
+"""Minimum number of positions to measure a velocity. With fewer, the newest position is used."""
 
 MAX_SPEED_M_PER_S = 1.0
-"""Maximum speed of a head; a faster velocity is an error of the tracker, and is not used."""
+"""Maximum speed of a head. A faster one is an error of the tracker, and the velocity is ignored."""
 
 MAX_AHEAD_S = 0.1
-"""Maximum time of the extrapolation."""
+"""Maximum time over which a position is extrapolated."""
 
 MAX_SHIFT_M = 0.03
-"""Maximum displacement by the extrapolation."""
+"""Maximum distance by which a position is extrapolated."""
 
 
 class EyePredictor:
-    """Predictor of the eyes by their measured velocity, a line through the last positions.
+    """Predictor of the eyes' position, with the velocity of a line fitted to recent positions.
 
-    max_age: age beyond which the eyes count as not tracked.
+    max_age: maximum age of a message; with an older one, the eyes are considered as not tracked.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -42,7 +42,7 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message; an invalid one, a gap or another clock starts a new line."""
+        """Add a message. After an invalid one, a gap or a change of clock, the fit starts again."""
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
         if not eye.valid:
@@ -58,9 +58,9 @@ class EyePredictor:
             known.popleft()
 
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
-        """Return the eyes `horizon_s` from now; None without a message or if it is too old.
+        """Return the eyes predicted for `horizon_s` from now.
 
-        An invalid message is returned as it is.
+        Return None if there is no message or it is too old. An invalid message is not changed.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:
@@ -74,7 +74,7 @@ class EyePredictor:
         return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
 
     def _velocity(self) -> Floats:
-        """Return the velocity (3,), m/s; zero if it is unknown or implausible."""
+        """Return the velocity (3,) of the eyes, m/s; zero if it is unknown or implausible."""
         if len(self._positions) < MIN_MESSAGES:
             return np.zeros(3)
         newest_ns = self._positions[-1][0]

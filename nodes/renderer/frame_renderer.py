@@ -1,4 +1,4 @@
-"""Draw a frame from the newest messages and return its description."""
+"""Draw a frame for the projector from the newest messages, and describe it in a message."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, pr
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
 VISIBLE_CHANGE_M = 1e-4
-"""Minimum displacement that triggers a frame, about a fifth of a pixel."""
+"""Motion of the sheet that makes a new frame necessary: about a fifth of a pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
-"""Maximum distance of an edge's points from the flange of its arm."""
+"""Maximum distance between a point of a sheet's edge and the flange of the arm that holds it."""
 
 
 @dataclass(frozen=True, slots=True)
 class RendererInputs:
-    """Inputs of a frame."""
+    """Inputs of the renderer node whose newest messages define a frame."""
 
     skin: Input[Skin]
     soft_body: Input[SoftBody]
@@ -49,7 +49,7 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """Renderer of a scene's frames on an output; counts late and superseded frames."""
+    """Renderer that draws a scene's frames on an output, and counts late and superseded ones."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class FrameRenderer:
             self.on_soft_body(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a frame would equal the last one: no contact and no motion."""
+        """Return whether a new frame would equal the last one: without contact and motion."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -88,10 +88,10 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame on the output; return it and the exposure time of its data (ns).
+        """Draw a frame on the output; return its message, and the exposure time of its data, ns.
 
-        begun_ns: start of drawing. The display times of the frame are those without a window; see
-        `on_shown`.
+        begun_ns: start of drawing. with_pixels: whether the message contains the image. The message
+        has no display time yet if there is a window; see `on_shown`.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -152,9 +152,9 @@ class FrameRenderer:
         return frame, source_ns
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
-        """Return the frame with its measured display times.
+        """Return the message of a frame with its measured display times.
 
-        swapped_ns: time of the swap; 0 if a newer frame replaced it.
+        swapped_ns: time of the swap; 0 if a newer frame replaced this one.
         """
         if not swapped_ns:
             self.superseded += 1
@@ -167,17 +167,18 @@ class FrameRenderer:
         )
 
     def on_eye(self, eye: Eye, header: Header) -> None:
-        """Add a position of the eyes."""
+        """Add a measured position of the eyes, for their prediction."""
         self._eye_predictor.add(eye, header)
 
     def on_soft_body(self, body: SoftBody, header: Header) -> None:
-        """Add a response of the soft-body solver."""
+        """Add a response of the soft-body solver, for its extrapolation."""
         self._extrapolator.add(body, header)
 
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
-        """Deform the object as predicted; without new responses, as in the last one.
+        """Deform the object as predicted for the display time `light_ns`.
 
-        Returns the exposure time of the data and the time of the deformation, ns.
+        Without new responses of the solver, use the last one. Returns the exposure time of the data
+        and the time for which the deformation was predicted, ns.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds
@@ -195,7 +196,7 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether a finger is tracked or the object is still deformed."""
+    """Return whether the shape may change: a finger is tracked, or the object is deformed."""
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())

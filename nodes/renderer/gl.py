@@ -32,28 +32,28 @@ SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = ("grid", "checker", "white")
-"""Patterns on the imaginary screen."""
+"""Patterns that are drawn on the imaginary screen (see `correction`) instead of the object."""
 SOFT_LOOK, FLAT_LOOK = 0, 1
 LOOKS = {"coordinate_ramp_x": 2, "coordinate_ramp_y": 3, "grid": 4, "checker": 5, "white": 6}
-"""Numbers of the patterns in the shader."""
+"""Value of the macro LOOK in the shader `object.frag.glsl` for each pattern."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 MARK_RADIUS_M = 0.003
 
 
 class NoOpenGLError(FlexsheetError, RuntimeError):
-    """Raised when no OpenGL 3.3 context can be created."""
+    """Error if no OpenGL 3.3 context can be created."""
 
     code = "no-opengl"
-    remedy = "`flexsheet doctor` names the packages for EGL."
+    remedy = "Install the packages for EGL that `flexsheet doctor` names."
 
 
 @dataclass(frozen=True, slots=True)
 class EyeView:
     """Geometry of one eye's image.
 
-    eye, projector: (3,), world. screen: None for no correction. clip_from_screen: (3, 3), see
-    `correction.clip_from_screen`. lens: None for no distortion. grey: whether to draw without
-    colour.
+    eye, projector: positions (3,), world, m. screen: sheet for which the image is corrected; None:
+    no correction. clip_from_screen: (3, 3), result of `correction.clip_from_screen`. lens: lens of
+    the projector; None: no distortion. grey: whether to draw without colour.
     """
 
     eye: Floats
@@ -66,7 +66,11 @@ class EyeView:
 
 @dataclass(frozen=True, slots=True)
 class DrawStyle:
-    """Style in which the object is drawn; marks are points of the object at rest, or None."""
+    """Style in which the object is drawn.
+
+    flat: whether to draw without shading. pattern: as in the message `Display`. fingertip_mark,
+    target_mark: points (3,), world, of the undeformed object at which marks are drawn, or None.
+    """
 
     flat: bool
     pattern: str
@@ -82,7 +86,7 @@ class DrawStyle:
 class ImagePart:
     """Part of the projector's image that one eye sees.
 
-    viewport: left, bottom, width, height, px. channels: red, green and blue that are drawn.
+    viewport: left, bottom, width, height, px. channels: whether red, green and blue are drawn.
     """
 
     viewport: tuple[int, int, int, int]
@@ -94,11 +98,11 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Draw only in this part of a frame; other channels of it keep their values."""
+        """Restrict drawing to this part of a frame, and to its colour channels, in the context."""
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
-            frame.clear(0.0, 0.0, 0.0, 1.0)  # of the depth, too, that the other eye drew
+            frame.clear(0.0, 0.0, 0.0, 1.0)  # This also clears the other eye's depth values.
         try:
             yield
         finally:
@@ -109,9 +113,10 @@ class ImagePart:
 class SurfaceMaterial:
     """Colour and texture of the object.
 
-    colour: red, green, blue, 0 to 1. pitch_m: period of the procedural textures. image: (height,
-    width, 3), top row first, or None. image_from_world: (4, 4), maps points of the object at rest
-    to image coordinates 0..1 from the left and the bottom.
+    colour: red, green, blue, 0 to 1. texture: key of `TEXTURES`. pitch_m: period of the procedural
+    textures. image: (height, width, 3), top row first, or None. image_from_world: (4, 4), maps
+    points of the object at rest to image coordinates, which are 0 at the left and bottom edge, and
+    1 at the opposite edges. object_from_world: (4, 4).
     """
 
     colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
@@ -123,12 +128,15 @@ class SurfaceMaterial:
 
 
 class Canvas:
-    """Shaders, meshes and frame for the image of one projector."""
+    """OpenGL shaders, meshes and framebuffers with which the image of one projector is drawn."""
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
-        """Allocate the frame; samples: per pixel, limited by the driver's maximum."""
+        """Allocate the framebuffers.
+
+        samples: number of samples per pixel (multisampling), limited by the driver's maximum.
+        """
         self.width_px, self.height_px = width_px, height_px
         self.context = context
         self._programs = Programs(context, "object")
@@ -152,7 +160,7 @@ class Canvas:
         self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
-        """Release the frame and the meshes, but not the context."""
+        """Release the framebuffers, meshes and shaders, but not the context."""
         for mesh in (self._object, self._grid):
             if mesh is not None:
                 mesh.release()
@@ -189,46 +197,53 @@ class Canvas:
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
     ) -> None:
-        """Set the object's vertices at rest (vertices, 3), world, and its outward triangles.
+        """Set the mesh of the object at rest.
 
-        normals: (vertices, 3), unit normals at rest; None: along z.
+        rest: positions (vertices, 3), world. triangles: (triangles, 3), counter-clockwise as seen
+        from outside. normals: unit normals (vertices, 3) at rest; None: all along z.
         """
         if self._object is not None:
             self._object.release()
         self._object = _MeshBuffers(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
-        """Set the current vertex positions and unit normals, both (vertices, 3)."""
+        """Set the current positions and unit normals of the object's vertices, (vertices, 3)."""
         if self._object is None:
             raise RuntimeError("set_mesh must be called before set_shape")
         self._object.move(_interleaved(positions, normals))
 
     def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals, of any length, as one array (vertices, 6)."""
+        """Set positions and normals of the object's vertices as one array (vertices, 6).
+
+        The normals may have any length.
+        """
         if self._object is None:
             raise RuntimeError("set_mesh must be called before set_moved")
         self._object.move(moved)
 
     def draw(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw an image and wait for completion."""
+        """Draw an image and wait until it is complete."""
         self.begin(multisampled=True)
         self.draw_into(self.target, view, look)
         self.resolve()
         self.context.finish()
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw without resolving the samples, as a lower bound of the time of all methods."""
+        """Draw an image without averaging its samples.
+
+        Benchmarks use its time as a lower bound for all correction methods.
+        """
         self.begin(multisampled=True)
         self.draw_into(self.target, view, look)
         self.context.finish()
 
     def begin(self, *, multisampled: bool) -> None:
-        """Clear the image that is drawn into `target`."""
+        """Select the framebuffer `target` for the next image, and clear it."""
         self.target = self._frame if multisampled else self._single
         self.target.clear(0.0, 0.0, 0.0, 1.0)
 
     def draw_into(self, frame: moderngl.Framebuffer, view: EyeView, look: DrawStyle) -> None:
-        """Draw the object, or the pattern, into a cleared frame."""
+        """Draw the object, or a pattern on the imaginary screen, into a cleared framebuffer."""
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
         if look.pattern == "black" or mesh is None:
             return
@@ -250,7 +265,7 @@ class Canvas:
         mesh.array(program).render(moderngl.TRIANGLES)
 
     def _program(self, view: EyeView, look: DrawStyle) -> tuple[moderngl.Program, Uniforms]:
-        """Return the program for a view and a style."""
+        """Return the variant of the shader program for a view and a style, and its uniforms."""
         number = LOOKS.get(look.pattern, FLAT_LOOK if look.flat else SOFT_LOOK)
         return self._programs.get(
             LOOK=number,
@@ -262,7 +277,7 @@ class Canvas:
         )
 
     def resolve(self) -> None:
-        """Resolve the samples of a multisampled image into the one that is read."""
+        """Average the samples of a multisampled image into `resolved`, which `read` returns."""
         if self.target is self._frame:
             self.context.copy_framebuffer(self.resolved, self._frame)
 
@@ -273,13 +288,16 @@ class Canvas:
         return np.ascontiguousarray(rows[::-1])
 
     def shifted_points(self, view: EyeView) -> Floats:
-        """Return the shader's A' of each vertex and its validity, 0 or 1, (vertices, 4)."""
+        """Return the corrected vertices A' (see `correction`) as the shader computes them.
+
+        The result is (vertices, 4): position, and validity, which is 0 or 1. Tests use it.
+        """
         if self._object is None:
             raise RuntimeError("set_mesh must be called before shifted_points")
         text = shader_text("object.vert.glsl", CORRECTED=view.screen is not None, LENS=False)
         program = self.context.program(vertex_shader=text, varyings=("shifted",))
         set_view(Uniforms(program), view)
-        self._frame.use()  # transform feedback without a window requires a bound frame
+        self._frame.use()  # Transform feedback without a window requires a bound framebuffer.
         captured = self.context.buffer(reserve=self._object.count * 16)
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
@@ -290,14 +308,14 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """Uniforms of a shader program; unchanged values are not written again."""
+    """Uniforms of a shader program, of which only changed values are written to OpenGL."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
         self._last: dict[str, object] = dict.fromkeys(program)
 
     def set(self, **values: object) -> None:
-        """Set uniforms; those that the compiler removed as unused are ignored."""
+        """Set uniforms by name; those that the compiler has removed as unused are ignored."""
         last = self._last
         for name, value in values.items():
             if name in last and last[name] != value:
@@ -305,14 +323,17 @@ class Uniforms:
 
 
 class Programs:
-    """Variants of a shader program by the macros of their texts, compiled when first used."""
+    """Variants of a shader program with different values of its macros, compiled on first use."""
 
     def __init__(self, context: moderngl.Context, name: str) -> None:
         self._context, self._name = context, name
         self._variants: dict[tuple[int, ...], tuple[moderngl.Program, Uniforms]] = {}
 
     def get(self, **macros: int) -> tuple[moderngl.Program, Uniforms]:
-        """Return the program with macros, always the same ones in the same order."""
+        """Return the variant with these values of the macros, and its uniforms.
+
+        Every call must give the same macros in the same order.
+        """
         key = tuple(macros.values())
         if key not in self._variants:
             program = self._context.program(
@@ -353,7 +374,7 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
 
 
 class _MeshBuffers:
-    """Static and per-frame vertex buffers of one mesh."""
+    """OpenGL buffers of one mesh: constant ones, and one that is written for each frame."""
 
     def __init__(
         self,
@@ -372,12 +393,12 @@ class _MeshBuffers:
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals (vertices, 6); raise ValueError for another shape."""
+        """Set positions and normals (vertices, 6); raises ValueError for another shape."""
         if moved.shape != (self.count, 6):
             raise ValueError(
                 f"positions and normals: expected shape ({self.count}, 6), found {moved.shape}"
             )
-        # New memory for each frame, so that the driver need not wait for the last frame.
+        # Use new memory for each frame, so that the driver need not wait for the previous frame.
         self._moving.orphan()
         self._moving.write(moved)
 
@@ -410,7 +431,10 @@ def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
 
 
 def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
-    """Return a fine mesh on the imaginary screen, 300 mm square, for the screen patterns."""
+    """Return a fine mesh of a square on the imaginary screen, with sides of 300 mm.
+
+    The patterns in SCREEN_PATTERNS are drawn on it.
+    """
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
@@ -419,7 +443,7 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def shader_text(name: str, **macros: int) -> str:
-    """Return the text of a shader file with macros and its lines `#include "name"` expanded."""
+    """Return the text of a shader file, with macros defined and `#include "name"` expanded."""
     text = files("flexsheet.nodes.renderer").joinpath(name).read_text()
     text = re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
     defined = "".join(f"\n#define {macro} {int(value)}" for macro, value in macros.items())
@@ -427,17 +451,18 @@ def shader_text(name: str, **macros: int) -> str:
 
 
 def limit_driver_threads() -> None:
-    """Leave half of the cores, or both of two, to other nodes, if a software driver draws.
+    """Limit the threads of a software OpenGL driver to half of the cores; use none on two cores.
 
-    A driver that waits for threads on busy cores needs more time, and half as much again of a
-    processor. The environment variable LP_NUM_THREADS takes precedence.
+    The other cores remain free for other nodes. On busy cores the driver would wait for its
+    threads, which takes longer and uses 50 % more processor time. A given environment variable
+    LP_NUM_THREADS takes precedence.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window; raise NoOpenGLError."""
+    """Return an OpenGL 3.3 context without a window; raises NoOpenGLError if there is none."""
     limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}

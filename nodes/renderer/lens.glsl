@@ -1,6 +1,6 @@
-// The projector's lens: Brown's distortion in OpenCV's convention (k1, k2, p1, p2, k3). It maps an
-// image without distortion, in homogeneous clip coordinates, to the one that enters the lens.
-// `lens_reach`, the maximum squared slope, prevents folding beyond it.  LENS: 1: with distortion.
+// Distort an image for the projector's lens: Brown's distortion in OpenCV's convention (k1, k2, p1,
+// p2, k3), in homogeneous clip coordinates.  Rays with a larger squared slope than `lens_reach` are
+// limited to it, since the polynomial is invalid there.  LENS: 1: apply distortion.
 uniform vec4 lens;  // focal lengths and principal point, in clip coordinates
 uniform float lens_distortion[5];
 uniform float lens_reach;

@@ -1,4 +1,4 @@
-"""Convert the projector's lens distortion for the shaders."""
+"""Convert the projector's lens distortion to OpenGL clip coordinates for the shaders."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""Slope up to which the distortion must be invertible, over that of the image's corners."""
+"""The distortion must be invertible up to this multiple of the slope at the image's corners. The
+slope of a ray is the tangent of its angle to the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
-    """Lens in OpenGL clip coordinates.
+    """Projector lens in OpenGL clip coordinates.
 
-    focal_centre: (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3. reach: squared slope at which rays
-    are clamped, because the polynomial would fold steeper rays back into the image.
+    focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3, as
+    in OpenCV. reach: maximum squared slope of a ray. Steeper rays are limited to it, because the
+    polynomial would map them back into the image.
     """
 
     focal_centre: tuple[float, float, float, float]
@@ -46,9 +48,9 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
     needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)
     if largest < needed:
         raise ValueError(
-            f"projector.lens.distortion: {lens.distortion} folds the image: its maximum slope is "
-            f"{largest:.3f}, the corners need {needed:.3f}; calibrate again with points in the "
-            "whole image"
+            f"projector.lens.distortion: {lens.distortion} maps several rays to one pixel: its "
+            f"maximum slope is {largest:.3f}, but the image's corners need {needed:.3f}; calibrate "
+            "the projector again with points in the whole image"
         )
     reach = min(fold, 4.0 * needed)
     return ClipLens(

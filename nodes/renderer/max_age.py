@@ -9,25 +9,29 @@ from flexsheet.messages.base import Header
 
 HISTORY = 15
 PERIODS = 4.0
-"""Number of camera periods for which a message is used: three may be lost."""
+"""Maximum age in camera periods, so that three messages may be lost."""
 MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 
 
 class MaxAge:
-    """Maximum age of poses, fingertips, eyes and soft bodies: `PERIODS` periods of the camera.
+    """Maximum age at which poses, fingertips, eyes and soft bodies are used.
 
-    seconds: between `MIN_AGE_S` and `MAX_AGE_S`, or the given value.
+    seconds: current value. It is the given one, or `PERIODS` measured periods of the camera, at
+    least `MIN_AGE_S` and at most `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed value; None: measure it."""
+        """Set a fixed maximum age; None: derive it from the camera's period."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None
         self._periods_s: deque[float] = deque(maxlen=HISTORY)
 
     def add(self, header: Header) -> None:
-        """Add a fingertip, which is stamped with its exposure; lost ones count as periods."""
+        """Measure the camera's period from the header of a fingertip message.
+
+        The header contains the exposure time. Sequence numbers show how many messages were lost.
+        """
         last, self._last = self._last, header
         if (
             self._is_given

@@ -26,15 +26,15 @@ ON_A_PROJECTOR = {
 
 
 class WindowError(FlexsheetError, RuntimeError):
-    """Raised when the requested window cannot be opened."""
+    """Error if the requested window cannot be opened, or was lost."""
 
     code = "window"
-    remedy = "Set the monitor to one that the text lists, or run headless."
+    remedy = "Set the renderer's `monitor` to one that the text lists, or `output: headless`."
 
 
 @contextmanager
 def glfw_errors() -> Iterator[None]:
-    """Convert GLFW's errors, which are raised after `start_glfw`, to WindowError."""
+    """Convert errors of the window library GLFW to WindowError; requires `start_glfw` before."""
     try:
         yield
     except glfw.GLFWError as error:
@@ -42,7 +42,7 @@ def glfw_errors() -> Iterator[None]:
 
 
 def start_glfw() -> None:
-    """Connect to the display; raise WindowError if there is none."""
+    """Connect to the display; raises WindowError if there is none."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -50,7 +50,7 @@ def start_glfw() -> None:
     except WindowError as error:
         raise _no_display(str(error)) from error
     if not connected:
-        raise _no_display("GLFW does not start")
+        raise _no_display("the window library GLFW does not start")
 
 
 def _no_display(why: str) -> WindowError:
@@ -61,12 +61,12 @@ def _no_display(why: str) -> WindowError:
 
 
 def monitor_names() -> list[str]:
-    """Return the names of the monitors in the order of their numbers, the primary one first."""
+    """Return the names of the monitors by their numbers; number 0 is the primary monitor."""
     return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
 
 
 def find_monitor(monitor: str | int) -> Any:
-    """Return GLFW's monitor by number or name; raise WindowError with a list if there is none."""
+    """Return the GLFW monitor with a number or name; raises WindowError if it is not unique."""
     monitors, names = glfw.get_monitors(), monitor_names()
     key = monitor
     if isinstance(monitor, str) and monitor not in names and monitor.isdigit():
@@ -99,18 +99,18 @@ def refresh_period_s(monitor: Any) -> float:
 
 
 def hidden_window() -> Any:
-    """Return an invisible window whose context is for drawing."""
+    """Return an invisible window, whose OpenGL context is used for drawing."""
     return _create((1, 1), {glfw.VISIBLE: False})
 
 
 def open_window(
     size: tuple[int, int], monitor: Any | None, share: Any, *, stereo: bool
 ) -> tuple[Any, bool]:
-    """Return a window that shares graphics objects with `share`, and whether it is quad-buffered.
+    """Open a window that shares graphics objects with the window `share`.
 
-    monitor: of a full-screen window; None: an ordinary window. stereo: quad-buffered (one buffer
-    per eye) if the driver supports it. Raises WindowError for a monitor without a mode of this
-    size.
+    size: width, height, px. monitor: monitor of a full-screen window; None: an ordinary window.
+    stereo: request quad buffering (separate buffers for each eye). Return the window, and whether
+    it is quad-buffered. Raises WindowError if the monitor has no mode of this size.
     """
     width, height = size
     if monitor is not None:
@@ -118,16 +118,16 @@ def open_window(
         if size not in modes:
             have = ", ".join(f"{w}x{h}" for w, h in sorted(modes))
             raise WindowError(
-                f"scene.projector is {width}x{height}; the monitor "
+                f"scene.projector has {width}x{height} px, but the monitor "
                 f'"{_text(glfw.get_monitor_name(monitor))}" supports {have}; '
-                "set one of these in the scene and calibrate again"
+                "set one of these sizes in the scene and calibrate the projector again"
             )
     hints = {**ON_A_PROJECTOR, glfw.VISIBLE: True}
     if stereo:
         try:
             window = _create(size, {**hints, glfw.STEREO: True}, monitor, share)
         except WindowError:
-            pass  # quad buffering is not supported, so the eyes alternate
+            pass  # Quad buffering is not supported, so the images of the eyes alternate.
         else:
             return window, True
     return _create(size, hints, monitor, share), False
@@ -145,7 +145,7 @@ def _create(
             glfw.window_hint(hint, value)
         window = glfw.create_window(*size, "flexsheet", monitor, share)
     if not window:
-        raise WindowError(f"no window of {size[0]}x{size[1]} with OpenGL 3.3 could be opened")
+        raise WindowError(f"cannot open a window of {size[0]}x{size[1]} px with OpenGL 3.3")
     if glfw.get_window_attrib(window, glfw.VISIBLE):
         glfw.set_input_mode(window, glfw.CURSOR, glfw.CURSOR_HIDDEN)
     return window

@@ -1,4 +1,4 @@
-"""Node that draws the virtual object for the projector, corrected for the sheet's pose."""
+"""Draw the virtual object for the projector, corrected for the sheet's pose and shape."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 class Renderer(Node):
     """Node that draws a frame for each soft-body message, at most at `rate_hz`.
 
-    Without a solver, fingertip messages trigger frames; without a fingertip, the timer does. A
-    frame is published after it was drawn, or, with a window, after it was shown.
+    Without messages of the solver, fingertip messages trigger frames; without these, a timer does.
+    A frame is published after it was drawn or, with a window, after it was shown.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
@@ -58,7 +58,7 @@ class Renderer(Node):
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         if parameters.output == "window":
-            return "its frames are shown in a window; record a run with output: headless instead"
+            return "it shows its frames in a window; record a run with output: headless instead"
         return ""
 
     async def setup(self) -> None:
@@ -129,7 +129,7 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """Handle window events, and draw a frame if no message triggered one."""
+        """Handle the window's events, and draw a frame if no message has triggered one."""
         if not self._output.poll():
             self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:
@@ -139,7 +139,7 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Publish a shown frame; may be called from the window's thread."""
+        """Publish a frame after the window showed it; this may be called from any thread."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
@@ -152,7 +152,8 @@ class Renderer(Node):
             self.on_scene(self.scene.message, self.scene.header)
 
     def _draw_if_due(self) -> None:
-        # Drawing up to a quarter of a period early avoids a beat between camera and frame rate.
+        # Allow drawing up to a quarter of a period early. Otherwise frames would be dropped
+        # periodically if the rates of camera and frames are almost equal.
         now_ns = self.clock.now_ns()
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
@@ -161,7 +162,7 @@ class Renderer(Node):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)
-        # If drawing is slower than the rate, leave time to read messages between frames.
+        # If drawing takes longer than a period, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
         self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
@@ -179,7 +180,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window showed or replaced by a newer one."""
+        """Publish a frame that the window has shown, or replaced by a newer one."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -1,14 +1,13 @@
 #version 330
 
-// Patterns on the imaginary screen, the object colour-coded with its expected position, or the
-// object with soft shading; docs/renderer.md has the formulas.  A program has one LOOK and TEXTURE,
-// because a software driver computes all branches of a shader for each pixel.
+// Colour a pixel of the object or of a pattern on the imaginary screen; docs/renderer.md has the
+// formulas.  LOOK and TEXTURE are macros, because a software driver computes all branches of a
+// shader for each pixel.
 
-// LOOK: 0: soft shading, 1: flat, 2 or 3: each point coloured by the x or y at which the eye should
-// see it, 4: grid, 5: checker, 6: white
-// TEXTURE: 0: none, 1: speckle, 2: grid, 3: image
-// MARKS: 1: with the marks of fingertip and target
-// GREY: 1: without colour
+// LOOK: 0: object with soft shading, 1: object without shading, 2 or 3: object coloured by the x or
+// y of the point on the imaginary screen at which the eye should see it, 4: grid, 5: checker,
+// 6: white.  TEXTURE of the object: 0: none, 1: speckle, 2: grid, 3: image.
+// MARKS: 1: draw the marks of fingertip and target.  GREY: 1: draw without colour.
 uniform float grid_pitch_m;
 uniform vec3 eye;
 uniform vec3 object_colour;
@@ -16,7 +15,7 @@ uniform float texture_pitch_m;
 uniform mat4 object_from_world;
 uniform mat4 image_from_world;
 uniform sampler2D image;
-uniform vec4 fingertip_mark;  // point of the object at rest, radius; radius 0: none
+uniform vec4 fingertip_mark;  // centre on the object at rest, and radius; radius 0: no mark
 uniform vec4 target_mark;
 
 in vec3 rest_point;
@@ -30,9 +29,9 @@ out vec4 colour;
 const float RAMP_PERIOD_M = 0.02;
 const float RAMP_RANGE_M = 0.24;
 
-const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // aligned with no face
+const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // oblique rotation
 
-// Lines a pitch apart, at zero and its multiples: the share of a pixel that they cover.
+// Return which fraction of a pixel is covered by lines at all multiples of the pitch.
 vec2 lines(vec2 place, float pitch, float half_width) {
     vec2 from_line = abs(fract(place / pitch + 0.5) - 0.5) * pitch;
     vec2 half_px = max(0.5 * fwidth(place), 1e-9);
@@ -45,7 +44,7 @@ vec3 on_screen(vec2 place) {
     vec2 line = lines(place, grid_pitch_m, 0.0005);
     return vec3(max(line.x, line.y));
 #elif LOOK == 5
-    // A steep triangle wave: +1 on even squares, -1 on odd ones, antialiased over a pixel.
+    // Use a steep triangle wave: +1 on even squares, -1 on odd ones, antialiased over a pixel.
     vec2 wave = 1.0 - 2.0 * abs(2.0 * fract(place / (2.0 * grid_pitch_m) + 0.25) - 1.0);
     vec2 steep = 0.5 * grid_pitch_m / max(fwidth(place), vec2(1e-9));
     vec2 side = clamp(wave * steep, -1.0, 1.0);
@@ -55,7 +54,7 @@ vec3 on_screen(vec2 place) {
 #endif
 }
 
-// One pseudo-random number from 0 to 1 for each cell of a lattice.
+// Return a pseudo-random number from 0 to 1 for each cell of a lattice.
 float scattered(ivec3 cell, uint which) {
     uint h = uint(cell.x) * 0x8da6b343u + uint(cell.y) * 0xd8163841u + uint(cell.z) * 0xcb1ab31fu;
     h = (h ^ (h >> 15) ^ (which * 0x9e3779b9u)) * 0x2c1b3c6du;
@@ -74,8 +73,8 @@ vec3 albedo() {
     vec2 line = lines(place.xy, texture_pitch_m, 0.0004);
     return mix(object_colour, 0.45 * object_colour, max(line.x, line.y));
 #else
-    // A ball at a random position in each cell of half a pitch; where the surface cuts one, there
-    // is a spot.
+    // Place a ball at a random position in each cell of half a pitch.  Where the surface cuts a
+    // ball, there is a spot.
     vec3 in_cells = ASLANT * place / (0.5 * texture_pitch_m);
     ivec3 cell = ivec3(floor(in_cells));
     float radius = 0.25 + 0.2 * scattered(cell, 4u);
@@ -89,7 +88,8 @@ vec3 albedo() {
 #endif
 }
 
-// Coverage of this point by a ring between two radii, antialiased over a pixel.
+// Return how much a ring-shaped mark covers this point, antialiased over a pixel.  inner: ratio of
+// the inner radius to the outer one.
 float ring(vec4 mark, float inner) {
     float away = distance(rest_point, mark.xyz) / max(mark.w, 1e-6);
     float softness = max(0.5 * fwidth(away), 1e-6);
@@ -99,12 +99,12 @@ float ring(vec4 mark, float inner) {
 }
 
 void main() {
-    if (valid < 0.9999) discard;  // a triangle with a vertex that could not be corrected
+    if (valid < 0.9999) discard;  // A vertex of the triangle could not be corrected.
 #if LOOK >= 4
     colour = vec4(on_screen(rest_point.xy), 1.0);
 #elif LOOK >= 2
-    // The position on the imaginary screen, coded: fine by a phase in red and green, coarse in
-    // blue.
+    // Code the position on the imaginary screen: red and green show the phase of a short period,
+    // blue the coarse position.
     vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
     float place = LOOK == 2 ? seen.x : seen.y;
     float phase = 6.283185307 * place / RAMP_PERIOD_M;

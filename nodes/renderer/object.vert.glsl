@@ -1,7 +1,7 @@
 #version 330
 
-// Equations (1)-(6) of the paper per vertex, as in nodes/renderer/correction.py, and soft shading;
-// docs/renderer.md has the formulas.  CORRECTED: 1: with the equations.
+// Correct a vertex by equations (1)-(6) of Furukawa et al. 2007, as nodes/renderer/correction.py
+// does, and compute soft shading; docs/renderer.md has the formulas.  CORRECTED: 1: correct.
 
 uniform vec3 eye;
 uniform vec3 projector;
@@ -22,17 +22,17 @@ in vec3 position;
 in vec3 normal;
 
 out vec3 rest_point;
-out vec3 true_point;  // A
-out vec3 light;  // factor of the surface's own colour
+out vec3 true_point;  // point A of the object, without correction
+out vec3 light;  // factor on the surface's own colour
 out vec3 sheen;
 out float valid;
-out vec4 shifted;  // A', and 1 where it is valid
+out vec4 shifted;  // corrected point A', and validity: 0 or 1
 
-const float WRAP = 0.35;  // light extends past the edge of the lit side: cosine down to -0.35
+const float WRAP = 0.35;  // light extends beyond the lit side, to an incidence cosine of -0.35
 const float AMBIENT = 0.25;
 const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // subsurface red light near the terminator
 const float HALF_DARK_M = 0.025;  // depth at which half of the light is lost
-const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // light there is redder
+const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // red is darkened less with depth than blue
 const float SHEEN = 0.10;
 const float SHEEN_EXPONENT = 20.0;
 
@@ -94,11 +94,11 @@ void main() {
     true_point = position;
     shade();
 
-    // From A' through the eye's pinhole onto z = 0, homogeneous: w is the depth before the eye.
+    // Project A' from the eye onto z = 0, homogeneous: w is the depth in front of the eye.
     float w = eye.z - shifted.z;
     vec2 on_screen = eye.xy * w + (shifted.xy - eye.xy) * eye.z;
     vec3 clip = through_lens(clip_from_screen * vec3(on_screen, w));
-    // At one pixel clip.z grows with the depth before the eye, so the depth test orders by it.
+    // In a pixel, clip.z increases with the depth in front of the eye, as the depth test requires.
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);
 }

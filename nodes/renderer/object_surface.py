@@ -1,8 +1,9 @@
-"""Build the drawn mesh of the scene's object and deform it with the solver's skin.
+"""Build the drawn mesh of the scene's object, and deform it with the solver's skin.
 
-The drawn mesh is finer than the solver's and is on the true shape, because the paper's equations
-correct at vertices only and coarse facets are visible in a silhouette. The skin's displacement and
-the rotation of its normals are interpolated between its vertices.
+The skin is the surface mesh of the soft-body solver. The drawn mesh is finer, and its vertices are
+on the true shape. A coarse mesh would have a visibly angular outline, and the image is corrected
+only at vertices (module `correction`). Displacement and change of the normals are interpolated
+between the vertices of the skin.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ Real = TypeVar("Real", np.float32, np.float64)
 MIN_AROUND = 128
 """Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
-"""Number of skin samples near a drawn vertex whose triangles are searched for the nearest point."""
+"""Number of skin samples near a drawn vertex in whose triangles its nearest point is searched."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectSurface:
-    """Surface of the object at rest.
+    """Surface mesh of the object at rest.
 
     rest_world_m, normals_world: (vertices, 3); vertices on sharp edges are duplicated. triangles:
-    (triangles, 3), outward.
+    (triangles, 3), counter-clockwise as seen from outside.
     """
 
     rest_world_m: Floats
@@ -52,7 +53,7 @@ class ObjectSurface:
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
     ) -> ObjectSurface:
-        """Return the surface in the world from points and normals in the object's frame."""
+        """Transform points and normals (n, 3) of a surface from the object's to the world frame."""
         return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
@@ -63,10 +64,11 @@ class ObjectSurface:
 def make_surface(
     geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
 ) -> ObjectSurface:
-    """Return the surface of a geometry and its shape with vertices about `spacing_m` apart.
+    """Return the surface mesh of a geometry with vertices about `spacing_m` apart.
 
-    A plane is drawn as its touchable rectangle, a mesh as its smooth surface. Raises ValueError for
-    a spacing that needs too many triangles.
+    shape: shape of the geometry, for its true points and normals. A plane is drawn as a rectangle,
+    and a mesh as the smooth surface that its shape defines. Raises ValueError for a spacing that
+    needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -91,7 +93,10 @@ def make_surface(
         case _:
             cuboid_map = GEOMETRIES[geometry.shape].cuboid_map
             if cuboid_map is None:
-                raise ValueError(f'geometry "{geometry.shape}": drawing it requires a cuboid_map')
+                raise ValueError(
+                    f'geometry "{geometry.shape}" cannot be drawn: its entry in GEOMETRIES needs a '
+                    "cuboid_map"
+                )
             points, triangles = _inflate_cuboid(cuboid_map(geometry, shape), spacing_m)
             normals = shape.closest(points).normal
     return ObjectSurface.placed(points, normals, triangles, world_from_object)
@@ -102,7 +107,7 @@ def cylinder_surface(
 ) -> ObjectSurface:
     """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
-    The vertices are the side's rings, then each end cap with its rim and centre.
+    The vertices are the rings of the curved side, then rim and centre of each end.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
     around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
@@ -137,7 +142,10 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points (n, 2) of a grid of cells over -0.5..0.5, and counter-clockwise triangles."""
+    """Return a triangulated grid of the square from -0.5 to 0.5: points (n, 2), triangles (t, 3).
+
+    columns, rows: number of cells. Triangles are counter-clockwise.
+    """
     u, v = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
     )
@@ -146,7 +154,10 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Return a cuboid's surface grid mapped onto a solid: points (n, 3), triangles (t, 3)."""
+    """Return the surface mesh of a solid, which the template maps from a grid on a cuboid.
+
+    The result is points (n, 3), object frame, and triangles (t, 3).
+    """
     if template.is_round:
         quarter_m = 0.5 * np.pi * float(template.half_m.max())
         cells = [max(_cells(quarter_m, spacing_m), MIN_AROUND // 4)] * 3
@@ -179,7 +190,7 @@ class VertexNormals:
 
     def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
         """Return the unit normals (vertices, 3) for vertex positions (vertices, 3)."""
-        # Arrays of one coordinate each are contiguous; np.cross is several times slower.
+        # One contiguous array for each coordinate is several times faster than np.cross.
         coordinates = np.ascontiguousarray(positions.T)
         a, b, c = (coordinates.take(corner, axis=1) for corner in self._corners)
         b -= a
@@ -194,10 +205,10 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """Deformation of a drawn surface by the displacement of a skin.
+    """Transfer of a skin's displacement to a drawn surface.
 
-    A drawn vertex moves with the nearest point of the skin. Its normal changes by the interpolated
-    change of the skin's smooth normals there.
+    A drawn vertex moves with the nearest point of the skin. Its normal changes as the skin's normal
+    does there, which is interpolated between the skin's vertices.
     """
 
     def __init__(
@@ -205,8 +216,8 @@ class DeformationTransfer:
     ) -> None:
         """Compute the interpolation weights.
 
-        skin_vertices: (s, 3), world, at rest. skin_triangles: (t, 3), outward. Raises ValueError
-        for a skin without triangles, or with coordinates that are not finite.
+        skin_vertices: (s, 3), world, at rest. skin_triangles: (t, 3), counter-clockwise as seen
+        from outside. Raises ValueError if no triangle has an area, or a coordinate is not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -219,22 +230,23 @@ class DeformationTransfer:
         self._moves = np.empty((self.vertices, 6), np.float32)
 
     def apply(self, displacement: Singles | None) -> Singles:
-        """Return positions and normals (vertices, 6); the normals are not of unit length.
+        """Return positions and normals (vertices, 6) of the deformed drawn surface.
 
-        displacement: (s, 3) of the skin; None: at rest. Raises ValueError for a wrong shape or
-        values that are not finite.
+        displacement: (s, 3) of the skin's vertices; None: at rest. The normals have no unit length.
+        Raises ValueError for a wrong shape, or for values that are not finite.
         """
         if displacement is None:
             return self._rest
         if displacement.shape != self._skin.shape:
             raise ValueError(
-                f"displacement: expected {len(self._skin)} skin vertices, found {len(displacement)}"
+                f"soft_body.displacement_world_m: expected {len(self._skin)} vertices as in the "
+                f"skin, found {len(displacement)}"
             )
         moves = self._moves
         moves[:, :3] = displacement
         # The sum is not finite if one of its terms is not.
         if not np.isfinite(moves[:, :3].sum()):
-            raise ValueError("displacement of the skin contains NaN or infinity")
+            raise ValueError("soft_body.displacement_world_m is not finite")
         np.subtract(self._normals(self._skin + displacement), self._rest_normals, out=moves[:, 3:])
         result: Singles = self._weights @ moves
         result += self._rest
@@ -244,17 +256,16 @@ class DeformationTransfer:
 def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
     """Return the matrix (points, skin vertices), float32, that interpolates skin values at points.
 
-    The weights are barycentric at the nearest point of the skin; triangles without area are
-    ignored. Raises ValueError for a skin without other triangles, or with vertices that are not
-    finite.
+    Each row has the barycentric weights of the nearest point of the skin. Triangles without area
+    are ignored. Raises ValueError if all are without area, or if a vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():
-        raise ValueError("the skin has vertices that are not finite")
+        raise ValueError("skin.vertices_world_m is not finite")
     skin_triangles = skin_triangles[
         ~find_degenerate(skin_vertices, skin_triangles.astype(np.int64))
     ]
     if len(skin_triangles) == 0:
-        raise ValueError("the skin has no triangles with an area")
+        raise ValueError("skin.triangles: there are no triangles with an area")
     corners = skin_vertices[skin_triangles]
     samples, owners = _samples(corners)
     candidates = min(CANDIDATES, len(samples))
@@ -279,10 +290,10 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return sample points (n, 3) on triangles (t, 3, 3), and their triangle (n,).
+    """Return sample points (n, 3) on triangles (t, 3, 3), and the index (n,) of their triangle.
 
-    Larger triangles have more samples, so that the nearest samples identify the nearest triangle on
-    a graded skin.
+    Larger triangles have more samples. The nearest samples of a point then belong to the nearest
+    triangles, even if triangle sizes differ.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

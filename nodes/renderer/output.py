@@ -1,4 +1,4 @@
-"""Select the eyes of a frame and the part of the projector's image for each."""
+"""Select the eyes for which a frame is drawn, and the part of the projector's image for each."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ MIN_EYE_DISTANCE_M = 0.05
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """Return the eyes to draw for, the unit direction (3,) from left to right, and a note.
+    """Return the eyes to draw for, the unit vector (3,) from the left to the right eye, and a note.
 
-    tracked: newest `eye` message; None if there is none or it is too old. The note contains the
-    reason why a tracked message is not used, or is empty.
+    eyes: eyes of the scene, for use without tracked ones. tracked: newest message of the topic eye;
+    None if there is none or it is too old. The note is the reason why `tracked` is not used, or
+    empty.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
@@ -31,7 +32,7 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return eyes, across, "the eyes are not tracked: using the scene's eyes"
     length = float(np.linalg.norm(tracked.right_world))
     if length < 1e-6:
-        return eyes, across, "eye.right_world is zero: using the scene's eyes"
+        return eyes, across, "topic eye: right_world is zero: using the scene's eyes"
     across = np.asarray(tracked.right_world / length, dtype=np.float64)
     reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
     if tracked.centre_world_m[2] - reach < MIN_EYE_DISTANCE_M:
@@ -39,15 +40,16 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"an eye is {where} from the screen: using the scene's eyes",
+            f"a tracked eye is {where} from the screen, too close or behind it: using the scene's "
+            "eyes",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """Return the world positions (2, 3) of the left and right eye, equal in mono mode.
+    """Return the world positions (2, 3) of the left and right eye; in mono mode they are equal.
 
-    across: (3,), unit direction from left to right; None: along x.
+    across: unit vector (3,) from the left to the right eye; None: along x.
     """
     direction = np.array([1.0, 0.0, 0.0]) if across is None else across
     half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
@@ -57,9 +59,10 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 
 
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
-    """Return the eyes of frame `number`; in frame_sequential, odd frames are for the left eye.
+    """Return the eyes for which frame `number` is drawn.
 
-    shows_both: whether the output alternates the eyes and needs both images of each frame.
+    shows_both: whether the output alternates between the eyes itself, so that each frame needs both
+    images. If not, the renderer alternates in frame_sequential: odd frames are for the left eye.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
@@ -69,10 +72,10 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
 def select_drawn_eyes(
     pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
 ) -> Floats:
-    """Return the eyes (1 or 2, 3) of a pair (2, 3) for which a frame's images are drawn.
+    """Select from both eyes (2, 3) the positions (1 or 2, 3) for which a frame is drawn.
 
-    With swap_eyes, a frame for one eye contains the other eye's image, for glasses of the opposite
-    phase. Images of both eyes are swapped by `image_parts`.
+    With swap_eyes, a frame for one eye contains the other eye's image, for shutter glasses that
+    open in the opposite order. If a frame has both images, `image_parts` swaps them.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)
@@ -81,11 +84,11 @@ def select_drawn_eyes(
 
 
 def image_parts(mode: StereoMode, size: tuple[int, int], *, swap_eyes: bool) -> list[ImagePart]:
-    """Return the parts of the projector's image for the eyes that share it: one or two.
+    """Return the parts (one or two) of the projector's image for the eyes that share it.
 
-    side_by_side, top_bottom: half the width or height each, left eye first or above. anaglyph: the
-    whole, red for the left eye and green and blue for the right one, without colour. swap_eyes:
-    exchange the parts.
+    size: width, height, px. side_by_side: each eye has half the width, the left eye on the left.
+    top_bottom: each eye has half the height, the left eye above. anaglyph: each eye has the whole
+    image, the left eye in red, the right eye in green and blue. swap_eyes: exchange the parts.
     """
     width, height = size
     across, up = width // 2, height // 2

@@ -1,4 +1,4 @@
-"""Outputs of the renderer: offscreen, or a window on the projector's monitor."""
+"""Provide the renderer's outputs: offscreen, or a window on the projector's monitor."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ CLOSED = "the window was closed; frames are not shown until the node is restarte
 
 
 class OutputWindow(Protocol):
-    """Interface of an output for the eyes' images.
+    """Interface of an output that shows the images for the eyes.
 
-    context: for drawing, current in the caller's thread.
+    context: OpenGL context for drawing, current in the caller's thread.
     """
 
     context: moderngl.Context
     is_seen: bool
     """Whether images are shown and their swap times are reported."""
     shows_both: bool
-    """Whether the output alternates the eyes in the mode frame_sequential."""
+    """Whether the output itself alternates between the eyes in the mode frame_sequential."""
     period_s: float
-    """Refresh period of the monitor, s; 0 if swaps do not wait for it."""
+    """Time between swaps that wait for the monitor's refresh, s; 0 if they do not wait."""
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
@@ -46,7 +46,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """Output without a window: frames are only drawn and read."""
+    """Output without a window: images are drawn, but not shown. Frame messages can contain them."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -74,7 +74,10 @@ class OffscreenOutput:
 def open_output(
     parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
 ) -> OutputWindow:
-    """Return the output that the parameters select. Raises WindowError or NoOpenGLError."""
+    """Open the output that the parameters select. Raises WindowError or NoOpenGLError.
+
+    now_ns: returns the current time. shown: callback for each shown image, see `presenter.Shown`.
+    """
     if parameters.output == "headless":
         return OffscreenOutput()
     return ProjectorWindow(
@@ -86,7 +89,7 @@ def open_output(
 
 
 class ProjectorWindow:
-    """Full-screen window on the projector's monitor that swaps in a separate thread.
+    """Full-screen window on the projector's monitor, which shows images from a separate thread.
 
     The window system requires that all methods are called on the main thread.
     """
@@ -101,9 +104,9 @@ class ProjectorWindow:
     ) -> None:
         """Create the drawing context.
 
-        monitor: name or number; None: an ordinary window, for tests. swap_interval: refreshes per
-        swap; 0: no wait, with tearing. Raises WindowError if there is no display or no such
-        monitor.
+        monitor: name or number; None: an ordinary window, for tests. swap_interval: number of
+        monitor refreshes per shown image; 0: do not wait for the refresh, so images may tear.
+        Raises WindowError if there is no display or no such monitor.
         """
         limit_driver_threads()
         start_glfw()
@@ -121,7 +124,7 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for images of a size (px), unless it is open with that size."""
+        """Open the window for images of a size (width, height), px, if it is not yet open."""
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return
         self._shut()
@@ -147,7 +150,7 @@ class ProjectorWindow:
         self._note_size(size, self._presenter.framebuffer_px)
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Store image `number` for the next `show`."""
+        """Store an image for the next `show`; number: index of the image in the frame, 0 or 1."""
         if self._presenter is None:
             return
         if self._filling is None:
@@ -155,7 +158,7 @@ class ProjectorWindow:
         self.context.copy_framebuffer(self._filling.frames[number], image)
 
     def show(self, tag: Any, display: Display) -> None:
-        """Show the stored images at the next refresh, which `shown` reports with the tag."""
+        """Show the stored images at the next refresh; the callback `shown` then gets the tag."""
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
@@ -167,8 +170,8 @@ class ProjectorWindow:
     def poll(self) -> bool:
         """Handle the window's events; return False if the graphics context was lost.
 
-        A lost output must be created again; `note` contains the reason. A window that the user
-        closed is not opened again; `note` reports that.
+        If it was lost, `note` contains the reason, and the caller must create the output again. If
+        the user has closed the window, `note` reports it, and the window is not opened again.
         """
         glfw.poll_events()
         if self._presenter is not None and self._presenter.problem is not None:
@@ -194,12 +197,12 @@ class ProjectorWindow:
         self.note = (
             ""
             if fits
-            else f"the window is {width}x{height}, the images {size[0]}x{size[1]}: they are shown "
-            "unscaled in the centre"
+            else f"the window has {width}x{height} px, but the images have {size[0]}x{size[1]} px: "
+            "they are shown unscaled in the centre; set this size on the monitor or in the scene"
         )
 
     def _shut(self) -> None:
-        """Close the window but not the drawing context."""
+        """Close the window, but keep the drawing context."""
         if self._presenter is not None:
             self._presenter.stop()
             self._presenter = None

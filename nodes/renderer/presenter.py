@@ -1,8 +1,8 @@
 """Show the newest image in a window from a separate thread.
 
-A swap that waits for the projector's refresh blocks only this thread. The event loop continues to
-draw into textures that both contexts share. There are three pairs of textures (triple buffering):
-one is shown, one is ready, and one is drawn into.
+A swap that waits for the projector's refresh blocks only this thread. Meanwhile the event loop
+draws the next image. Both threads have their own OpenGL context, but share textures. There are
+three pairs of textures (triple buffering): one is shown, one is ready, and one is drawn into.
 """
 
 from __future__ import annotations
@@ -24,20 +24,23 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""Number of swaps after a resize, because drivers may resize their buffers two swaps later."""
+"""Number of times an image is shown again after the window was resized, because drivers may resize
+their buffers up to two swaps later."""
 
 _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
-"""Callback, in the presenter's thread, with an image's tag and swap time, ns. The time is 0 for an
-image that a newer one replaced."""
+"""Function that the presenter's thread calls with the tag and the swap time, ns, of each image. The
+time is 0 for an image that was replaced by a newer one before it was shown."""
 
 
 @dataclass(slots=True)
 class Slot:
-    """Textures of an image, or in frame_sequential of the left and right eye's, and how to show
-    them.
+    """Textures of one frame, and how to show them.
+
+    In the mode frame_sequential, both textures are used: the images for the left and right eye.
+    Other modes use the first one only. tag: object of the caller that identifies the frame.
     """
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
@@ -54,7 +57,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """Thread that owns a window's context and shows the images passed to `put`."""
+    """Thread that owns a window's OpenGL context and shows the images passed to `put`."""
 
     def __init__(
         self,
@@ -80,7 +83,7 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return the slot to draw into, which is neither shown nor ready."""
+        """Return a slot to draw into, which is neither shown nor waits to be shown."""
         with self._changed:
             return next(
                 slot
@@ -89,7 +92,7 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Show a completely drawn slot from the next refresh on, without waiting for it."""
+        """Show a completely drawn slot at the next refresh; return without waiting for it."""
         with self._changed:
             superseded, self._ready = self._ready, slot
             self._changed.notify()
@@ -103,7 +106,7 @@ class Presenter:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Stop the thread, which releases its context."""
+        """Stop the thread and wait for its end; it releases its context."""
         with self._changed:
             self._stop = True
             self._changed.notify()
@@ -123,7 +126,7 @@ class Presenter:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """Wait for and return the slot to show and whether it is new; None after `stop`."""
+        """Wait for the next slot to show; return it and whether it is new. None after `stop`."""
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
@@ -155,15 +158,15 @@ class Presenter:
         quad.wait_until_done()
         swapped_ns = self._now_ns()
         if quad.is_lost():
-            raise WindowError("the graphics card was reset")
+            raise WindowError("the graphics driver reports that the graphics card was reset")
         if is_new:
             self._shown(slot.tag, swapped_ns)
 
 
 class _WindowQuad:
-    """Drawing of a slot's texture over the whole window.
+    """Shader program and textures with which a slot's image is drawn in the window.
 
-    Blocking GL functions are called through ctypes, which releases the interpreter lock.
+    Blocking OpenGL functions are called through ctypes, which releases the interpreter lock.
     """
 
     def __init__(self, slots: list[Slot]) -> None:

@@ -1,8 +1,9 @@
 """Correct the image in two passes (projective texture mapping).
 
 The first pass draws the object as the eye should see it, through a rectangle on the imaginary
-screen. The second pass draws the sheet's mesh as the projector sees it, textured with the first
-image. The method supports any sheet shape and exact depth, and has no seams between triangles.
+screen (the plane z = 0). The second pass draws the sheet's mesh as the projector sees it, textured
+with the first image. The method is exact for any shape of the sheet and any depth of the object,
+and has no seams between triangles.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 Floats = NDArray[np.float64]
 
 CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
-"""OpenGL constant of the first clip plane, and number of clip planes in `sheet.vert.glsl`."""
+"""OpenGL's constant GL_CLIP_DISTANCE0, and the number of clip planes in `sheet.vert.glsl`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +42,9 @@ class ScreenRectangle:
 
     @property
     def clip_from_screen(self) -> Floats:
-        """Return the map (3, 3) from (x, y, 1) on the screen to OpenGL clip coordinates.
+        """Return the matrix (3, 3) from (x, y, 1) on the screen to OpenGL clip (x, y, w).
 
-        The rectangle fills the clip space.
+        It maps the rectangle to the whole image.
         """
         return np.array(
             [
@@ -56,7 +57,7 @@ class ScreenRectangle:
 
 @dataclass(frozen=True, slots=True)
 class EyePicture:
-    """Frames of the first pass: multisampled, and resolved into a texture."""
+    """Framebuffers of the first pass: a multisampled one, and one with the averaged image."""
 
     samples: moderngl.Framebuffer
     resolved: moderngl.Framebuffer
@@ -64,7 +65,7 @@ class EyePicture:
 
     @staticmethod
     def make(context: moderngl.Context, size: tuple[int, int], samples: int) -> EyePicture:
-        """Allocate the frames of an image (width, height), px."""
+        """Allocate framebuffers for an image of a size (width, height), px."""
         image = context.texture(size, 4)
         image.repeat_x = image.repeat_y = False
         multisampled = context.framebuffer(
@@ -74,7 +75,7 @@ class EyePicture:
         return EyePicture(multisampled, context.framebuffer([image]), image)
 
     def release(self) -> None:
-        """Release the frames."""
+        """Release the framebuffers."""
         for frame in (self.samples, self.resolved):
             for attachment in (*frame.color_attachments, frame.depth_attachment):
                 if attachment is not None:
@@ -83,10 +84,10 @@ class EyePicture:
 
 
 class TwoPassProjector:
-    """Two-pass renderer with the frames of the first pass and the sheet's buffers."""
+    """Renderer of the two-pass method, with framebuffers of the first pass and sheet buffers."""
 
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
-        """Compile the shaders; samples: as in `Canvas`."""
+        """Prepare the shaders; samples: samples per pixel, limited by the driver's maximum."""
         self._context, self._samples = context, min(samples, context.max_samples)
         self._pictures: dict[tuple[int, int], EyePicture] = {}
         self._programs = Programs(context, "sheet")
@@ -105,9 +106,9 @@ class TwoPassProjector:
         part: ImagePart,
         size: tuple[int, int],
     ) -> None:
-        """Draw one eye's image onto the sheet, into a part of the canvas's target.
+        """Draw the projector's image for one eye into a part of the canvas's target framebuffer.
 
-        size: width and height of the eye's image, px.
+        window: rectangle that the eye's image shows. size: its width and height, px.
         """
         if size not in self._pictures:
             self._pictures[size] = EyePicture.make(self._context, size, self._samples)
@@ -135,7 +136,7 @@ class TwoPassProjector:
         self._context.enable(moderngl.CULL_FACE)
 
     def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
-        """Return the sheet's vertex array; its buffers are reused for the same triangles."""
+        """Return the sheet's vertex array; update its buffers if the sheet has changed."""
         if self._buffers is None or sheet is not self._drawn:
             vertices = np.ascontiguousarray(sheet.vertices, np.float32)
             if self._buffers is None or not self._has_triangles(sheet.triangles):
@@ -154,7 +155,10 @@ class TwoPassProjector:
         return self._arrays[program.glo]
 
     def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
-        """Return whether the buffers have these triangles; equal grids share one array."""
+        """Return whether the buffers contain these triangles.
+
+        Equal grids usually share one array, so comparing contents is rarely needed.
+        """
         drawn = None if self._drawn is None else self._drawn.triangles
         return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))
 

@@ -52,15 +52,15 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 OVERSAMPLING = 1.5
-"""Resolution of the eye's image over that of the projector."""
+"""Ratio of the resolution of the eye's image (first pass of two_pass) to that of the projector."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""Margin of the rectangle around the object, and quantization of its edges, which avoids flicker of
-the outline when the object moves."""
+"""Margin of the rectangle around the object in the eye's image, and step to which its edges are
+rounded. Rounding avoids that the outline flickers when the object moves."""
 MAX_WINDOW_M = 0.3
-"""Maximum extent of the rectangle from the screen's centre, beyond the sheet's edges."""
+"""Maximum distance of the rectangle's edges from the screen's centre; the sheet is smaller."""
 MIN_REPORTED_FRACTION = 0.005
-"""Minimum occluded fraction that is reported."""
+"""Minimum occluded fraction of the sheet (see `occluded_fraction`) that is reported."""
 NO_SHAPES_NOTE = (
     "no deflection shapes in the cache: a pushed sheet is drawn as four triangles "
     "(flexsheet precompute)"
@@ -86,7 +86,7 @@ def projector_homography(scene: Scene) -> Floats:
 
 
 class SceneRenderer:
-    """Renderer of one scene."""
+    """Renderer of the projector's images for one scene."""
 
     def __init__(
         self,
@@ -100,8 +100,9 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        basis: deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles.
-        Raises ValueError for a lens that folds the projector's image.
+        spacing_m: distance between the vertices of the object. samples: per pixel. basis:
+        deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles. Raises
+        ValueError if the projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -118,7 +119,7 @@ class SceneRenderer:
             spacing_m=spacing_m,
         )
         self._object_from_world = inverse(self._world_from_object)
-        # A start at the nearest vertex makes nearest-point queries of a mesh ten times as fast.
+        # Nearest-point queries of a mesh are ten times as fast if they start at the nearest vertex.
         meshed = isinstance(geometry, Mesh)
         self._near = cKDTree(self._surface.rest_world_m) if meshed else None
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
@@ -138,7 +139,7 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        """Return the object's material; a texture image is scaled to the object's front."""
+        """Return the object's material, with a texture image scaled to the object's front view."""
         appearance, object_from_world = (
             self.scene.object.appearance,
             inverse(self._world_from_object),
@@ -157,15 +158,15 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the skin whose displacements deform the drawn surface."""
+        """Set the skin, the surface mesh of the solver whose displacements deform the drawn one."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
-        """Deform the surface by a soft-body response; None: at rest.
+        """Deform the drawn surface by the solver's response; None draws it at rest.
 
-        Raises ValueError, without a change of the surface, if the displacement does not fit the
+        Raises ValueError, and leaves the surface unchanged, if the displacement does not fit the
         current skin or is not finite.
         """
         if body is self._drawn_body:
@@ -174,7 +175,7 @@ class SceneRenderer:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
             self._box_world = _box_around(self._surface.rest_world_m)
         elif self._deformation is None:
-            raise ValueError("a soft_body message was received before its skin")
+            raise ValueError("topic soft_body: a message was received before the skin it refers to")
         else:
             moved = self._deformation.apply(body.displacement_world_m)
             self.canvas.set_moved(moved)
@@ -184,9 +185,10 @@ class SceneRenderer:
     def draw_style(
         self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None
     ) -> DrawStyle:
-        """Return the style of a display message, with marks at the finger and the contact point.
+        """Return the drawing style for a display message.
 
-        finger_tip: (3,) at the display time, or None if it is unknown.
+        If the message asks for marks, they are at the finger and at the target's contact point.
+        finger_tip: (3,), world, at the display time, or None if it is unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return DrawStyle(
@@ -208,21 +210,21 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return the slack sheet on the imaginary screen, used before the first arm poses."""
+        """Return an unstretched sheet on the imaginary screen, used before the first arm poses."""
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
 
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
-        """Return whether the eyes see the sheet's front and the projector lights its back.
+        """Return whether the eyes see the sheet's front and the projector illuminates its back.
 
-        centre: (3,), midpoint of the eyes; None: the scene's.
+        centre: (3,), world, midpoint of the eyes; None: midpoint of the scene's eyes.
         """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """Return the positions (2, 3) of the scene's eyes, equal in mono mode."""
+        """Return the positions (2, 3), world, of the scene's eyes; in mono mode they are equal."""
         return both_eyes(self.scene.eyes, display.stereo)
 
     def draw(
@@ -235,15 +237,15 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image and return it, (height, width, 3), if `read`.
+        """Draw the projector's image; return it, (height, width, 3), if `read` is true.
 
-        eyes: (1 or 2, 3); None: the scene's. Two eyes share the image, except in frame_sequential,
-        where the left eye's is returned. drawn: called with the number of each image when it is in
-        `canvas.resolved`, before the next image overwrites it. Raises ValueError for a sheet pose
-        that is not finite.
+        eyes: positions (1 or 2, 3), world; None: the scene's eyes. Two eyes share the image, except
+        in the mode frame_sequential. It has two images, of which the left eye's is returned.
+        drawn: called with the index of each image when it is in `canvas.resolved`, before the next
+        one overwrites it. Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
-            raise ValueError("the sheet's pose is not finite")
+            raise ValueError("the sheet's pose is not finite; check the poses of the arms")
         if display.correction == "two_pass":
             mesh = self.sheet_mesh(sheet)
             self._report_folds(mesh, self.eyes(display)[0] if eyes is None else eyes[0])
@@ -269,13 +271,13 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw as `draw`, with the two-pass method and a mesh of the sheet."""
+        """Draw the projector's image as `draw` does, by two_pass with a given mesh of the sheet."""
 
         whole = self.canvas.width_px, self.canvas.height_px
 
         def draw_eye(eye: Floats, part: ImagePart) -> None:
             window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
-            # An eye with half the pixels of the image needs a picture of half the size.
+            # If an eye has only half of the projector's pixels, half the resolution is enough.
             size = (
                 round(self._eye_size_px[0] * part.viewport[2] / whole[0]),
                 round(self._eye_size_px[1] * part.viewport[3] / whole[1]),
@@ -290,7 +292,10 @@ class SceneRenderer:
     def view(
         self, eye: Floats, screen: ProjectionScreen | None = None, *, grey: bool = False
     ) -> EyeView:
-        """Return the view of an eye's image; screen: to correct for, or None."""
+        """Return the geometry of one eye's image.
+
+        screen: actual screen for which the image is corrected, or None.
+        """
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens, grey)
 
@@ -313,8 +318,7 @@ class SceneRenderer:
         shown, image = int(len(eyes) > len(parts) and display.swap_eyes), None
         for number, first in enumerate(range(0, len(eyes), len(parts))):
             canvas.begin(multisampled=multisampled)
-            # Without a wait between the eyes, a software driver computes one while the other is
-            # filled.
+            # Do not wait between the eyes: a software driver then works on both at the same time.
             for eye, part in zip(eyes[first:], parts, strict=False):
                 draw_eye(eye, part)
             canvas.resolve()
@@ -325,9 +329,9 @@ class SceneRenderer:
         return image
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """Return the sheet's mesh by the method `sheet_shape`.
+        """Return the sheet's mesh, computed by the method `sheet_shape`.
 
-        Four triangles replace reduced_order without deflection shapes. `note` reports inaccuracies.
+        Without deflection shapes, four triangles replace reduced_order. `note` reports limits.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
@@ -341,19 +345,19 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a note about a push beyond the range of four triangles, or an empty text."""
+        """Return a note if the push is too deep for four triangles, else an empty text."""
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
         if depth_m <= MAX_TRIANGLES_DEPTH_M:
             return ""
         return (
-            f"push of {1e3 * depth_m:.0f} mm exceeds the range of four triangles, "
+            f"the push depth of {1e3 * depth_m:.0f} mm exceeds the maximum for four triangles, "
             f"{1e3 * MAX_TRIANGLES_DEPTH_M:g} mm; use sheet_shape: reduced_order"
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Compute the fraction of the sheet that folds shadow, and add it to `note`."""
+        """Compute the fraction of the sheet that gets no light due to folds; add it to `note`."""
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (
@@ -362,10 +366,9 @@ class SceneRenderer:
             self.note = "; ".join(filter(None, (self.note, folds)))
 
     def _window(self, eye: Floats) -> ScreenRectangle:
-        """Return the rectangle of the imaginary screen that the object covers for an eye.
+        """Return the rectangle of the imaginary screen that the object covers, seen from an eye.
 
-        Points that are not in front of the eye are excluded; the extent is limited by
-        `MAX_WINDOW_M`.
+        Points that are not in front of the eye are excluded. `MAX_WINDOW_M` limits the rectangle.
         """
         box = np.minimum(self._box_world, [np.inf, np.inf, eye[2] - NEAR_M])
         crossings = on_imaginary_screen(box, eye)

@@ -1,11 +1,11 @@
 #version 330
 
-// Colour a point of the sheet with what the eye should see there.  GREY: 1: without colour.
+// Colour a point of the sheet with the image that the eye should see.  GREY: 1: without colour.
 
 uniform vec3 eye;
 uniform vec3 projector;
 uniform sampler2D picture;
-uniform vec4 window;  // of the image on the imaginary screen: left, bottom, width, height
+uniform vec4 window;  // rectangle of the eye's image on z = 0: left, bottom, width, height
 uniform float grazing_sine;
 
 in vec3 point;
@@ -20,10 +20,10 @@ void main() {
     vec2 place = (seen - window.xy) / window.zw;
     vec2 right = dFdx(place), up = dFdy(place);
     if (dot(normal, to_eye) < 0.0) normal = -normal;
-    // Discard points edge-on to the eye or the projector, or with both on one side of the sheet.
+    // Discard points that eye or projector see edge-on, or that have both on one side of the sheet.
     if (dot(normal, to_eye) < grazing_sine * length(to_eye)) discard;
     if (dot(normal, light) < grazing_sine * length(light)) discard;
-    // Four samples of the pixel, no two in one row or column, so that an edge keeps its light.
+    // Average four samples in the pixel, no two in one row or column, which makes edges smooth.
     vec3 light_of = texture(picture, place + 0.125 * right + 0.375 * up).rgb
         + texture(picture, place - 0.125 * right - 0.375 * up).rgb
         + texture(picture, place + 0.375 * right - 0.125 * up).rgb

@@ -1,4 +1,4 @@
-"""Estimate the sheet's pose and its projection screen for the paper's equations."""
+"""Estimate the sheet's pose, and the projection screen for the correction of the image."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ MIN_EDGE_DISTANCE_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class SheetPose:
-    """Predicted sheet at the display time of a frame.
+    """Sheet as predicted for the display time of a frame.
 
-    world_from_sheet: (4, 4). corners: (4, 3), world. pushed_point: (3,), world, or None.
+    world_from_sheet: (4, 4). corners: (4, 3), world: left bottom, right bottom, right top, left
+    top. pushed_point: (3,), world, fingertip that pushes the sheet, or None.
     """
 
     world_from_sheet: Floats
@@ -46,7 +47,7 @@ class SheetPose:
 
     @property
     def contact_point(self) -> Floats:
-        """Return the pushed point, or the sheet's centre without a push."""
+        """Return the pushed point (3,), world; without a push, the sheet's centre."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
@@ -59,11 +60,12 @@ def estimate_sheet(
     ahead_s: float,
     finger_tip: Floats | None,
 ) -> SheetPose | None:
-    """Return the sheet between two edges after `ahead_s` of the motion `twist_world` (6,).
+    """Predict the sheet from the measured poses (4, 4) of its edges.
 
-    finger_tip: (3,) at that time, or None; it pushes the sheet if it is below the plane and within
-    the sheet's outline. Returns None if the edges are too close for a sheet, or a value is not
-    finite.
+    twist_world: (6,), linear and angular velocity of the sheet. ahead_s: time of the prediction
+    after the measurement. finger_tip: (3,), world, at that time, or None; it pushes the sheet if it
+    is below the sheet's plane and within its outline. Return None if the edges are closer than
+    `MIN_EDGE_DISTANCE_M`, or a value is not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
@@ -84,7 +86,10 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the screen for the paper's equations; None for methods that do not use them."""
+    """Return the screen for the equations of the module `correction`.
+
+    Return None for correction methods that do not use these equations.
+    """
     if method in ("none", "two_pass"):
         return None
     if method == "four_triangles" and sheet.pushed_point is not None:

@@ -7,7 +7,7 @@ uniform mat3 clip_from_screen;
 uniform float near_m;
 uniform float far_m;
 uniform vec3 eye;
-uniform vec4 window;  // of the image on the imaginary screen: left, bottom, width, height
+uniform vec4 window;  // rectangle of the eye's image on z = 0: left, bottom, width, height
 
 #include "lens.glsl"
 
@@ -17,16 +17,16 @@ out vec3 point;
 
 void main() {
     point = position;
-    // From the projector through the point onto the imaginary screen z = 0, homogeneous: w is the
-    // distance from the projector's plane.
+    // Project the point from the projector onto the imaginary screen z = 0, homogeneous: w is the
+    // distance from the projector, along z.
     float w = position.z - projector.z;
     vec2 on_screen = projector.xy * position.z - position.xy * projector.z;
     vec3 clip = through_lens(clip_from_screen * vec3(on_screen, w));
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);
 
-    // Light only what the eye sees through the rectangle: four planes through the eye, and its
-    // depth.
+    // Draw only what the eye sees through the rectangle: clip by four planes through the eye, and
+    // by depth.
     float before_eye = eye.z - position.z;
     vec2 seen = eye.xy * before_eye + (position.xy - eye.xy) * eye.z;
     vec2 low = seen - window.xy * before_eye;

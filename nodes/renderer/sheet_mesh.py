@@ -1,4 +1,4 @@
-"""Build the mesh of the sheet for projection: flat, four triangles, or deflected."""
+"""Build the mesh of the sheet for the two-pass correction: flat, four triangles, or deflected."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 MAX_TRIANGLES_DEPTH_M = 0.0035
-"""Maximum push for which four triangles are as accurate as required."""
+"""Maximum push depth for which four triangles are as accurate as required."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
-"""Triangles between neighbouring corners and the pushed point."""
+"""Vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetMesh:
     """Mesh of the sheet.
 
-    vertices: (n, 3), world. triangles: (m, 3), counter-clockwise for the user. note: why the shape
-    is inaccurate, or empty.
+    vertices: (n, 3), world. triangles: (m, 3), counter-clockwise as seen by the user. note: reason
+    why the shape is inaccurate; empty if it is accurate.
     """
 
     vertices: Floats
@@ -39,20 +39,23 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of an unpushed sheet: its corners and their mean."""
+    """Return the mesh of a sheet without a push: four triangles between corners and centre."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
 def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the paper's four triangles between the corners and the pushed point."""
+    """Return four triangles between corners and pushed point, as in Furukawa et al. 2007."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
 def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Return the same surface with smaller triangles, for lens distortion at the vertices."""
+    """Return the same surface with smaller triangles, since lens distortion acts on vertices only.
+
+    halvings: number of times that each edge is halved.
+    """
     vertices, triangles = mesh.vertices, mesh.triangles
     for _ in range(halvings):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -68,17 +71,17 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""Cached `triangulate_grid`: equal grids share one array, which avoids comparing contents."""
+"""Cached `triangulate_grid`. Equal grids share one array, so that they are recognised quickly."""
 
 
 def deflected_mesh(
     sheet: SheetPose, basis: IndentationBasis, *, density_kg_per_m3: float = 0.0
 ) -> SheetMesh:
-    """Return the sheet narrowed by its stretch, sagging by its weight and pushed by its fingertip.
+    """Return the mesh of a sheet that is stretched, sags by its weight and is pushed by a finger.
 
-    The unpushed sheet is the ruled surface between its edges. The deflection of a flat sheet is
-    added to it. Sag and indentation are superposed: the finger
-    indents the sheet by its depth below the sagging sheet.
+    Without deflection, the sheet is the ruled surface between its edges. The deflection of a flat
+    sheet is added to it. Sag and indentation are superposed: the indentation is the depth of the
+    finger below the sagging sheet.
     """
     rubber = basis.rubber
     stretch = sheet.edge_distance_m / rubber.width_m
@@ -120,12 +123,12 @@ def deflected_mesh(
 
 
 def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """Estimate the fraction (0..1) of the sheet's visible area that folds shadow.
+    """Estimate the fraction (0..1) of the sheet's visible area that is dark because of folds.
 
-    A triangle gets no light if it faces away from the projector or is seen edge-on, within
-    `GRAZING_SINE`. Its area is counted twice, because it casts a shadow of about the same area.
+    A triangle gets no light if it faces away from the projector, or if the projector sees it
+    edge-on (`GRAZING_SINE`). Its area counts twice, since its shadow has about the same area.
     """
-    # Arrays of one coordinate each are several times faster than arrays of points.
+    # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)
     a, b, c = (coordinates.take(mesh.triangles[:, i], axis=1) for i in range(3))
     b -= a

@@ -17,10 +17,10 @@ Floats = NDArray[np.float64]
 
 
 class SheetPosePredictor:
-    """Predictor of the sheet's pose from the measured flange poses.
+    """Predictor of the sheet's pose from the measured flange poses of the arms.
 
-    Without valid poses newer than `max_age`, the last valid sheet is returned and `note` contains
-    the reason; otherwise `note` is empty.
+    If there are no valid poses newer than `max_age`, it returns the last valid sheet, and `note`
+    contains the reason. Otherwise `note` is empty.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -39,9 +39,10 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the sheet `horizon_s` from now; before the first valid pose, the sheet at rest.
+        """Return the sheet predicted for `horizon_s` from now.
 
-        finger_tip: (3,) at that time, or None. eye: (3,), the point of view.
+        Before the first valid pose, return the sheet at rest. finger_tip: (3,), world, at the
+        predicted time, or None. eye: (3,), world, midpoint of the eyes.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if (
@@ -64,10 +65,10 @@ class SheetPosePredictor:
         if sheet is not None and scene_renderer.usable(sheet, eye):
             self._sheet, self.note = sheet, ""
             return sheet
-        why = "sheet edge-on or facing away"
+        why = "the sheet is edge-on to the eyes or the projector, or faces away"
         if sheet is None:
             fresh = age_s <= self._max_age.seconds
-            why = "implausible flange poses" if fresh else f"arm poses {age_s:.2f} s old"
+            why = "implausible flange poses" if fresh else f"the arm poses are {age_s:.2f} s old"
         self.note = f"{why}: {NodeNote.LAST_SHEET_PLANE.phrase}"
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
@@ -77,7 +78,10 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """Return the fingertip (3,), world, `horizon_s` from now; None if invalid or too old."""
+    """Return the fingertip (3,), world, predicted for `horizon_s` from now.
+
+    Return None if the fingertip message is invalid, or older than `max_age_s`.
+    """
     age_s = finger.age_s()
     if finger.message is None or not finger.message.valid or age_s > max_age_s:
         return None

@@ -1,7 +1,7 @@
-"""Measure time and error of the sheet-shape methods.
+"""Measure time and error of the methods that compute the shape of a pushed sheet.
 
-The error is the height difference between a method's mesh and the reference sheet at the
-reference's points. The caller provides the reference.
+The error is the difference in height between a method's mesh and a reference sheet, at the points
+of the reference. The caller provides the reference.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""Function that returns points (n, 3), world, of the reference sheet, for the scene, the left and
-right edge's pose (4, 4) and the fingertip (3,)."""
+"""Function that returns points (n, 3), world, of the reference sheet. Its arguments are the scene,
+the poses (4, 4) of the sheet's left and right edge, and the fingertip (3,)."""
 
 WITHOUT_SHAPES = ("four_triangles",)
 METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
@@ -43,13 +43,13 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""Names and relative positions: x over the width, y over the height."""
+"""Positions of the push: name, and x and y from the centre, as fractions of width and height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all sheet shapes over stretch ratios, depths and positions.
+    """Return the benchmark of all methods over stretch ratios, push depths and positions.
 
-    solved: whether to include the shapes that need precomputed deflection shapes.
+    solved: whether to include the methods that need precomputed deflection shapes.
     """
     return Family(
         name="sheet-shape",
@@ -121,7 +121,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 
 
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
-    """Return the root mean square error of the height (world z) at points `truth` (n, 3), mm."""
+    """Return the rms error of a mesh's height (world z) at true points of the sheet (n, 3), mm."""
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
     errors = (heights - truth[:, 2])[np.isfinite(heights)]
     return 1e3 * float(np.sqrt(np.mean(errors**2)))

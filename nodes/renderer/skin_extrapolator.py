@@ -1,8 +1,8 @@
-"""Extrapolate the solver's responses to the display time of a frame.
+"""Extrapolate the responses of the soft-body solver to the display time of a frame.
 
-A response is for the time of the exposure plus `prediction_horizon_s`; the frame is displayed some
-tens of milliseconds later. Each vertex is extrapolated linearly from an older and the newest
-response.
+A response is the displacement of the object's surface at the time of the camera's exposure plus
+`prediction_horizon_s`. The frame is displayed some tens of milliseconds later. Each vertex is
+extrapolated linearly from an older and the newest response.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""Time between the two responses. A shorter time amplifies noise, a longer one causes lag."""
+"""Limits of the time between the older and the newest response. A shorter time amplifies noise, and
+a longer one causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""Maximum time between successive responses of a slower solver, whose last two are used."""
+"""Maximum time between the last two responses, which are used if the solver is slower."""
 
 MAX_EXTRAPOLATION_S = 0.06
 """Maximum extrapolation time."""
@@ -31,7 +32,7 @@ class SkinExtrapolator:
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response; a change of skin, method or clock clears the history."""
+        """Add a response. A change of skin, method or clock deletes all earlier responses."""
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -41,10 +42,10 @@ class SkinExtrapolator:
         self._history.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """Return the response extrapolated to `at_ns` of a clock, and its time (ns).
+        """Return the response extrapolated to the time `at_ns` of a clock, and its time, ns.
 
-        The newest response is returned unchanged if it has another clock, is later than `at_ns`, or
-        has no suitable predecessor. Returns None and 0 before the first response.
+        Return the newest response unchanged if it has another clock, is later than `at_ns`, or no
+        earlier one is suitable. Return None and 0 before the first response.
         """
         if not self._history:
             return None, 0
@@ -62,7 +63,7 @@ class SkinExtrapolator:
         return body, newest_ns + round(ahead_s * 1e9)
 
     def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
-        """Return the older response and the time (s) from it to the newest."""
+        """Return an older response that is suitable, and the time from it to the newest, s."""
         older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
         for base_s, body in older:
             if MIN_BASE_S <= base_s <= MAX_BASE_S:

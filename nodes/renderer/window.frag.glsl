@@ -3,7 +3,7 @@
 // Show an image pixel for pixel.
 
 uniform sampler2D image;
-uniform ivec2 origin;  // of the image in the window
+uniform ivec2 origin;  // position of the image's lower left pixel in the window
 
 out vec4 colour;
 

@@ -1,9 +1,10 @@
 """Predict a hand's motion by combining the predictions of a bank of steady-state Kalman filters.
 
 Each filter assumes one motion model: white noise in the acceleration or in the jerk, alone or with
-an oscillator.  The weights minimise the mean square of the combined error at the horizon of use, by
-the covariance of the filters' errors at that horizon over the last seconds.  They may be negative,
-so that the combination learns a spectrum that no single model has.
+an oscillator.  The prediction is the weighted sum of the filters' predictions.  The weights
+minimise its mean square error at the prediction horizon.  They are computed from the covariance of
+the filters' errors at that horizon in the last seconds.  Negative weights are allowed, because then
+the sum can represent a motion spectrum that no single model has.
 
 Sources: Bates and Granger, Operational Research Quarterly 20, 1969 (combination by the covariance
 of the errors); Singer, IEEE Trans. Aerospace and Electronic Systems 6, 1970 (decaying
@@ -25,69 +26,77 @@ from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuro, Unfi
 
 Floats = NDArray[np.float64]
 Model = tuple[float, float, float, float]
-"""Spectral density of the noise in the acceleration, m^2/s^3, and in the jerk, m^2/s^5; frequency
-in Hz and standard deviation in m of an oscillator."""
+"""Parameters of a motion model: spectral density of the acceleration noise, m^2/s^3, and of the
+jerk noise, m^2/s^5; frequency, Hz, and standard deviation, m, of the oscillator."""
 
 STATES = 5
-"""States of a model, per axis: position, velocity, acceleration; displacement and velocity of the
-oscillator."""
+"""Number of states of a model per axis: position, velocity and acceleration of the finger without
+the oscillator, then displacement and velocity of the oscillator."""
 
 OBSERVED = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
-"""Row that gives the position of the finger from a state."""
+"""Observation matrix: its product with a state is the measured position of the finger."""
 
 ACCELERATION_DECAY_PER_S = 6.0
-"""Rate at which an acceleration decays (Singer 1970), since no hand keeps one for long."""
+"""Exponential decay rate of the acceleration (Singer 1970), since a hand cannot keep an
+acceleration for long."""
 
 MAX_OSCILLATOR_WIDTH_HZ = 2.0
-"""Half-power width of an oscillator: a tremor's peak and the wander of its frequency.  Slow
-oscillators, which stand for voluntary motion around one point, are damped by half."""
+"""Maximum half-power bandwidth of an oscillator.  It covers the width of a tremor's spectral peak
+and the drift of its frequency.  Slow oscillators, which model voluntary motion around one point,
+have a damping ratio of one half."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
-"""Horizons at which errors are measured, over whole frames and no less: one frame for the first.
-Predictions in between use weights in between."""
+"""Horizons for which prediction errors are measured and weights computed.  Each is rounded up to
+whole frames, and the first one is one frame.  Weights for other horizons are interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
-"""Maximum age of stored earlier states."""
+"""Age after which earlier filter states are no longer stored."""
 
 STAMP_JITTER_NS = 2_000_000
-"""Time by which a scored age may fall short of its horizon."""
+"""Time by which a state may be younger than the horizon for which its error is measured.  It allows
+for jitter of the camera's timestamps."""
 
 MEMORY_S, MEMORY_POINTS = 1.0, 60
-"""Time constant of the covariance of the filters' errors, and the points that it has at least."""
+"""Time constant for averaging the covariance of the filters' errors, and the minimum number of
+points in that average."""
 
 RECENT_S, RECENT_POINTS = 0.2, 10
 OUTDATED_RATIO = 1.5
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
-"""Time constant of recent mean-square errors; ratio of the combination's to the best model's above
-which the covariance is outdated; and the shorter memory that it then has."""
+"""Detection of an outdated error covariance, which was learnt from another kind of motion.  RECENT:
+time constant and minimum number of points for averaging recent mean square errors.  OUTDATED_RATIO:
+the covariance is outdated if the mean square error of the combination exceeds that of the best
+model by this factor.  OUTDATED_MEMORY: shorter averaging time and points that it then has."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""Error of every filter at first, and its weight in points."""
+"""Assumed initial error of every filter, and the number of points that this assumption counts as.
+The error has the unit m, since errors are divided by the square root of their size."""
 
 MIN_ERROR_M = 1e-9
-"""Size of errors below which they are not scaled up."""
+"""Constant added to the size of errors before they are divided by its square root."""
 
 SHRINKAGE = 0.02
-"""Weight of equal shares against the covariance of the errors, which is one of a few seconds, as a
-fraction of the mean square of the differences between the filters' predictions."""
+"""Regularisation of the weights towards equal weights, because the covariance of the errors covers
+only a few seconds.  It is a fraction of the mean square difference between the predictions."""
 
 COMBINE_EVERY_POINTS = 4
 """Number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""Minimum gain of the filtered position: the innovation's mean square is known to about a tenth."""
+"""Minimum gain of the filtered position.  The gain follows from the mean square innovation, which
+is known only to about a tenth."""
 
 START_POINTS = 32
-"""Number of points at the start of a track for which gains are those of a Kalman filter that knows
-little yet; after them, gains are those of the steady state."""
+"""Number of points at the start of a track for which the gains are those of a Kalman filter with
+a large initial covariance.  Later points use the steady-state gains."""
 
 INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
 """Standard deviations of speed and acceleration (m/s^2) at the start of a track."""
 
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.004, 0.15
 INTERVAL_RATIO, NOISE_RATIO = 1.08, 1.5
-"""Range and spacing of the frame intervals, and spacing of the noise variances, for which gains are
-computed."""
+"""Gains are computed and cached on a logarithmic grid: the range of the frame interval, and the
+ratios between adjacent intervals and between adjacent noise variances."""
 
 TIME_STEP_S = 1e-5
 """Resolution of the times for which transitions are cached: a finger at 0.1 m/s moves 1 um."""
@@ -107,15 +116,15 @@ MODELS: tuple[Model, ...] = (
     *((0.0, 1e-2, frequency_hz, 1e-4) for frequency_hz in (5.0, 6.5, 8.0, 9.5, 11.5)),
     *((0.0, 1e1, frequency_hz, 1e-4) for frequency_hz in (6.0, 9.0)),
 )
-"""Steady and lively motion, voluntary motion around one point, tremor, and tremor of a lively hand.
-Few models are enough, since their combinations stand for the spectra between them."""
+"""Motion models: slow and fast motion, voluntary motion around one point, tremor, and tremor during
+fast motion.  Few models are enough, since weighted sums cover the spectra between them."""
 
 ACCELERATION_NOISE, JERK_NOISE, FREQUENCY_HZ, DEVIATION_M = np.array(MODELS).T
 FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
 
 
 def _integrate_slow(dt: float) -> Floats:
-    """Return the transition (3, 3) of position, velocity and decaying acceleration over dt."""
+    """Return the matrix (3, 3) that advances position, velocity, decaying acceleration by dt, s."""
     rate = ACCELERATION_DECAY_PER_S
     remaining, gone = math.exp(-rate * dt), -math.expm1(-rate * dt)
     if rate * dt < 1e-4:
@@ -126,7 +135,7 @@ def _integrate_slow(dt: float) -> Floats:
 
 
 def compute_transition(dt: float) -> Floats:
-    """Compute the transition (models, 5, 5) over dt."""
+    """Compute the matrix (models, 5, 5) that advances the state of each model by dt, s."""
     natural = FREQUENCY_RAD_PER_S
     decay = np.minimum(np.pi * MAX_OSCILLATOR_WIDTH_HZ, 0.5 * natural)
     swing = np.sqrt(natural**2 - decay**2)
@@ -143,7 +152,7 @@ def compute_transition(dt: float) -> Floats:
 
 
 def compute_process_noise(dt: float) -> Floats:
-    """Compute the covariance (models, 5, 5) that the models' noise adds over dt."""
+    """Compute the covariance (models, 5, 5) that process noise adds to each state in dt, s."""
     acceleration, jerk = np.zeros((3, 3)), np.zeros((3, 3))
     for node, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         slow = _integrate_slow(0.5 * dt * (1.0 + node))
@@ -168,9 +177,11 @@ def _stationary_oscillators() -> Floats:
 
 
 def solve_riccati(transition: Floats, process_noise: Floats, variance: float) -> Floats:
-    """Return the steady-state covariance (models, 5, 5) before a measurement of that variance.
+    """Return the steady-state error covariance (models, 5, 5) just before each measurement.
 
-    Each iteration of the doubling algorithm doubles the number of frames.
+    variance: of the measurement noise, m^2.
+    Solves the Riccati equation by the doubling algorithm (Chu et al. 2004): each iteration doubles
+    the number of frames.
     """
     rows, identity = transition.transpose(0, 2, 1), np.eye(STATES)
     information = np.broadcast_to(np.outer(OBSERVED, OBSERVED) / variance, rows.shape)
@@ -186,9 +197,10 @@ def solve_riccati(transition: Floats, process_noise: Floats, variance: float) ->
 
 @lru_cache(maxsize=256)
 def _solve_gains(interval: int, noise: int) -> Floats:
-    """Return gains (points, models, 5) for one axis, by the logarithms of interval and variance.
+    """Return the Kalman gains (START_POINTS, models, 5) of one axis for the points of a track.
 
-    They are those for the points 2 to START_POINTS of a track, and last those of the steady state.
+    interval, noise: indices on the grid of frame intervals and noise variances.
+    The gains are those for the points 2 to START_POINTS, followed by the steady-state gain.
     """
     dt, variance = INTERVAL_RATIO**interval, NOISE_RATIO**noise
     transition, process_noise = compute_transition(dt), compute_process_noise(dt)
@@ -205,7 +217,10 @@ def _solve_gains(interval: int, noise: int) -> Floats:
 
 
 def _compute_gain(covariance: Floats, variance: float) -> Floats:
-    """Return the gain (models, 5) from the covariance (models, 5, 5) before a measurement."""
+    """Return the Kalman gain (models, 5) from the predicted covariance (models, 5, 5).
+
+    variance: of the measurement noise, m^2.
+    """
     observed = covariance @ OBSERVED
     return np.asarray(observed / (observed @ OBSERVED + variance)[:, None])
 
@@ -216,12 +231,13 @@ def _stack_gains(interval: int, noises: tuple[int, int, int], index: int) -> Flo
 
 
 def find_gains(dt: float, variances: list[float], points: int) -> Floats:
-    """Return the gains (models, 5, 3) for a frame interval and the noise of three axes, m^2.
+    """Return the Kalman gains (models, 5, 3) for a frame interval and the noise of three axes.
 
-    points: number of the track's points, two or more; after START_POINTS the state is steady.
+    dt: frame interval, s.  variances: of the measurement noise, m^2, one value for each axis.
+    points: number of points in the track, at least two.
 
-    The first call for an interval or a noise solves its Riccati equations, which takes some
-    milliseconds; later calls for values near them take microseconds.
+    The first call for an interval or a variance solves its Riccati equations, which takes some
+    milliseconds.  Later calls with similar values take microseconds.
     """
     interval = round(
         math.log(min(max(dt, MIN_INTERVAL_S), MAX_INTERVAL_S)) / math.log(INTERVAL_RATIO)
@@ -237,15 +253,18 @@ def _find_transition(steps: int) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_observation(steps: int) -> Floats:
-    """Return the rows (models, 1, 5) that give the finger's position some time steps later."""
+    """Return the rows (models, 1, 5) that predict the position from a state, `steps` steps ahead.
+
+    A step is TIME_STEP_S.
+    """
     return (OBSERVED @ _find_transition(steps))[:, None, :]
 
 
 @lru_cache(maxsize=64)
 def _find_rows(horizons: bytes) -> Floats:
-    """Return the rows (n, models * 5) that give positions at horizons (n,) s from weighted states.
+    """Return the rows (n, models * 5) that predict positions at n horizons from weighted states.
 
-    horizons: the bytes of the array.
+    horizons: bytes of a float64 array (n,) s, because keys of the cache must be hashable.
     """
     rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
     return np.array(rows).reshape(len(rows), -1)
@@ -253,10 +272,13 @@ def _find_rows(horizons: bytes) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_shares(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
-    """Return the shares (scored horizons + 1, n, 1) in the predictions at horizons (n,) s.
+    """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
 
-    They are those of each scored horizon's weights, by its age, and that of the filtered position's
-    offset, which fades towards the first of them.
+    horizons: bytes of a float64 array (n,) s.
+    ages_ms: ages for which the weights of the scored horizons hold.
+
+    The last factor is that of the correction by the filtered position.  It falls from one at
+    horizon zero to zero at the first age.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
@@ -267,10 +289,11 @@ def _find_shares(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
 
 
 def combine(covariance: Floats) -> Floats:
-    """Return weights (..., models) of sum 1 that minimise the mean square of the combined error.
+    """Return the weights (..., models), with sum 1, that minimise the mean square combined error.
 
-    covariance: (..., models, models) of the models' errors, in any unit.  The measurement noise in
-        them is equal for all models, so that it changes nothing.
+    covariance: (..., models, models), covariance of the models' prediction errors, in any unit.
+        The errors include measurement noise.  It does not change the result, because it is the same
+        for all models.
     """
     count = covariance.shape[-1]
     own = covariance.trace(axis1=-2, axis2=-1) / count
@@ -284,22 +307,22 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """States of the filter bank (models, 5, 3) at one time, with the learnt weights.
+    """Estimate of the filter bank: states (models, 5, 3) at one time, and the learnt weights.
 
-    covariance: (3, 3) m^2 of the newest measured point, in the world frame.
-    axes: columns (3, 3) in the world frame along which the measurement noise is uncorrelated; the
-        states are along them.
+    covariance: (3, 3) m^2, noise of the newest measured point in the world frame.
+    axes: (3, 3), columns are the axes of the states, in the world frame.  The measurement noise is
+        uncorrelated along these axes.
     points: number of points since the track began.
-    past_ns, past: earlier times and states, oldest first, over the longest scored horizon.
-    error_covariance: (scored horizons, 3, models, models) m of the models' prediction errors by
-        axis, each divided by the root of its size at the time.
+    past_ns, past: earlier times and states, oldest first, for the longest scored horizon.
+    error_covariance: (scored horizons, 3, models, models) m, covariance of the models' prediction
+        errors by axis.  Each error was divided by the square root of the errors' size at its time.
     weights: (scored horizons, 3, models), with sum 1 over the models.
-    recent: mean squares (scored horizons, 3, models + 1) m^2 of the errors of each model and of the
-        combination in the last instants.
-    scored_ages_ms: ages of the states whose predictions of the newest point were scored.
-    innovation: mean square (3,) m^2 of the combined innovation.
+    recent: (scored horizons, 3, models + 1) m^2, recent mean square errors of each model, then of
+        the combination.
+    scored_ages_ms: ages of the states whose predictions were compared with the newest point.
+    innovation: (3,) m^2, mean square of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
-    velocity_variance: (3,) m^2/s^2.
+    velocity_variance: (3,) m^2/s^2, error variance of the velocity along the axes.
     """
 
     axes: Floats
@@ -318,7 +341,7 @@ class BankEstimate(Estimate):
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveBank:
-    """Filter and predict by the bank; see the module."""
+    """Tracking method that combines the predictions of the bank of Kalman filters."""
 
     max_speed_m_per_s: float
 
@@ -360,8 +383,9 @@ class AdaptiveBank:
         state = prior + gains * innovations[:, None, :]
         combined = (before.weights[0].T * innovations).sum(axis=0)
         innovation = before.innovation + forgotten * (combined**2 - before.innovation)
-        # The innovation's mean square is the sum of the prediction's and the point's variances, so
-        # that it gives the gain; a larger innovation means that the motion has just changed.
+        # The mean square innovation is the sum of the variances of the prediction and of the newly
+        # measured point.  The gain follows from it.  A larger innovation than the mean shows that
+        # the motion has just changed, so it replaces the mean.
         expected = np.maximum(innovation, combined**2) - variances
         expected = np.maximum(expected, MIN_GAIN * variances)
         gain = expected / (expected + variances)
@@ -372,16 +396,17 @@ class AdaptiveBank:
             [errors, (before.weights * errors).sum(axis=2, keepdims=True)], axis=2
         )
         recent = before.recent + _forget(dt, RECENT_S, RECENT_POINTS) * (both**2 - before.recent)
-        # A combination that is worse than its best model has been learnt from another motion.
+        # If the combination is worse than its best model, its weights fit an earlier motion.
         is_outdated = recent[:, :, -1] > OUTDATED_RATIO * recent[:, :, :-1].min(axis=2)
         sooner = max(forgotten, _forget(dt, OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS))
         fresh = np.where(is_outdated, sooner, forgotten)[:, :, None, None]
-        # A calm hand after a lively one must not wait until the larger errors are forgotten.
+        # Scale the errors by their size.  Otherwise the large errors of a fast motion would
+        # determine the weights for a long time after the hand has become slow.
         sizes = np.sqrt(np.einsum("sam,sam->sa", errors, errors) / len(MODELS))
         errors /= np.sqrt(sizes + MIN_ERROR_M)[:, :, None]
         error_covariance = (1.0 - fresh) * before.error_covariance
         error_covariance += errors[..., None] * fresh * errors[:, :, None]
-        # The weights change slowly, and solving for them takes as long as all the rest.
+        # The weights change slowly, and their computation takes as long as the rest of the update.
         weights = before.weights
         if points % COMBINE_EVERY_POINTS == 0:
             weights = combine(error_covariance)
@@ -424,12 +449,16 @@ class AdaptiveBank:
 
 
 def _forget(dt: float, memory_s: float, memory_points: int) -> float:
-    """Return the weight of a new value in a mean over a time, and at least over some points."""
+    """Return the weight of a new value in an exponential average.
+
+    dt: time since the last value, s.  memory_s: time constant of the average.
+    memory_points: minimum number of points in the average.
+    """
     return min(-math.expm1(-dt / memory_s), 1.0 / memory_points)
 
 
 def predict_by_model(estimate: BankEstimate, horizons_s: Floats) -> Floats:
-    """Return the positions (n, models, 3) that each model predicts at times (n,) s."""
+    """Return the positions (n, models, 3) that each model predicts at horizons (n,) s."""
     rows = _find_rows(horizons_s.tobytes())
     by_model = np.einsum("nms,msa->nma", rows.reshape(-1, len(MODELS), STATES), estimate.state)
     return np.asarray(by_model @ estimate.axes.T)
@@ -442,10 +471,15 @@ def _prediction_errors(
     point: Floats,
     innovations: Floats,
 ) -> tuple[Floats, tuple[int, ...]]:
-    """Return the errors (scored horizons, 3, models) m with which earlier states predicted a point.
+    """Return how far the predictions of earlier states are from a newly measured point.
 
-    The first are the innovations (models, 3) after the newest state.  Each other horizon takes the
-    newest state that is as old, else the oldest.  The second result contains their ages in ms.
+    times_ns, states: earlier states, oldest first.
+    at_ns, point: time and position (3,) m of the new point, along the axes of the states.
+    innovations: (models, 3) m, errors of the predictions from the newest state.
+
+    The first result are the errors (scored horizons, 3, models) m, and those at the first horizon
+    are the innovations.  At each other horizon they are those of the newest state that is at least
+    as old as the horizon, or of the oldest one.  The second result are these states' ages, ms.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -463,6 +497,7 @@ def _prediction_errors(
 def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Floats]:
     """Rotate an estimate's axes if the noise of a new point is correlated between them.
 
+    covariance: (3, 3) m^2, noise of the new point.
     Returns the estimate and the noise variances (3,) m^2 along its axes.
     """
     noise = estimate.axes.T @ covariance @ estimate.axes
@@ -473,7 +508,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         return estimate, variances
     variances, axes = np.linalg.eigh(covariance)
     rotation = estimate.axes.T @ axes
-    # Mean squares along the new axes, as if errors along the old ones were uncorrelated.
+    # This converts mean squares to the new axes, assuming uncorrelated errors along the old axes.
     mix = rotation.T**2
     rotated = replace(
         estimate,
@@ -496,4 +531,4 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "one_euro": OneEuro,
     "adaptive": AdaptiveBank,
 }
-"""Filters by name, made for a finger's maximum speed (m/s)."""
+"""Tracking methods by name: functions that make a filter, given the finger's maximum speed, m/s."""

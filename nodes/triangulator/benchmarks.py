@@ -1,4 +1,4 @@
-"""Benchmark the triangulator's method families: time per image pair, and error over many pairs."""
+"""Benchmark the marker and triangulation methods: time per image pair, error over many pairs."""
 
 from __future__ import annotations
 
@@ -27,18 +27,20 @@ Image = NDArray[np.uint8]
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)
 BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
-"""Baselines of the rigs.  The smallest, a tenth of the scene's, gives nearly parallel rays."""
+"""Baselines of the stereo cameras.  The smallest, a tenth of the usual one, gives nearly parallel
+rays."""
 
 MAX_NOISE_PX = 0.1
-"""Maximum noise of a marker method within its range."""
+"""Maximum standard deviation of a marker's centre for which the methods may be used."""
 
 
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
-    """Yield trials with points in slabs of the finger's volume, by pixel noise and baseline.
+    """Yield a trial for each pixel noise, baseline and slab of the finger's volume.
 
-    The scene's baseline replaces the nearest of BASELINES_M.  Trials in range have at least this
-    baseline, and at most MAX_NOISE_PX; those in the scene's range have its baseline, and the noise
-    that its tolerance allows.
+    The points of a trial are random in one of three slabs, at increasing height.  The scene's
+    baseline replaces the nearest of BASELINES_M.  Trials in the methods' range have at least this
+    baseline, and at most the noise MAX_NOISE_PX.  Trials in the scene's range have exactly its
+    baseline, and at most the noise that the scene's tolerance allows.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
@@ -91,7 +93,7 @@ def _triangulation_trial(
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
     def error_mm(_: Floats) -> float:
-        """Return the root mean square error, mm; the error of a lost point is its depth."""
+        """Return the root mean square error, mm; the error of a lost point is set to its depth."""
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
         away = np.linalg.norm(points - truth, axis=1)
         depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
@@ -124,24 +126,25 @@ RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""Half the width of the sloped ground under a marker."""
+"""Distance from the marker's centre up to which the background has a gradient."""
 
 MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
     *((3.2, 1.0, motion_px, 0.0) for motion_px in (2.0, 4.0, 8.0)),
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
-"""Radius (px), noise (multiples of the sensor's), motion in the exposure (px), ground slope (levels
-per px).  A marker of 3 mm radius has 3.2 px at half a metre, 6 px at 0.27 m and 1.6 px at 1 m.  At
-1 m/s it moves by 4 px in 4 ms.  A finger lit from the side has a gradient of 2 or 3 levels per
-px."""
+"""Radius (px), noise (multiple of the sensor's noise), motion during the exposure (px), background
+gradient (levels per px).  A marker with 3 mm radius appears with 3.2 px at half a metre, 6 px at
+0.27 m and 1.6 px at 1 m.  At 1 m/s it moves by 4 px in 4 ms.  A finger that is lit from the side
+has a gradient of 2 or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnDisc:
-    """Synthetic disc: centre, radius, motion and blur (standard deviation), px; levels.
+    """Parameters of a synthetic disc: centre, radius, motion and blur (standard deviation), px.
 
-    slope: gradient of the ground along y, levels per px.
+    marker, ground: grey levels of the disc and of the background.
+    slope: gradient of the background along y, levels per px.
     """
 
     centre: Floats
@@ -153,7 +156,7 @@ class DrawnDisc:
     slope: float = 0.0
 
     def levels(self) -> Floats:
-        """Render the image without noise by supersampling, independent of the fit's edge model."""
+        """Render the image without noise, by supersampling instead of the fit's edge model."""
         fine = (np.arange(IMAGE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
         x, y = fine[None, :] - self.centre[0], fine[:, None] - self.centre[1]
         steps = 1 + int(4.0 * np.linalg.norm(self.motion))
@@ -169,17 +172,17 @@ class DrawnDisc:
 
 
 def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:
-    """Add photon and read noise, and round to whole levels as a sensor does."""
+    """Add a sensor's photon and read noise to an image, and round it to whole grey levels."""
     deviation = np.sqrt(noise.read_levels**2 + levels / noise.photons_per_level)
     seen = levels + deviation * random.standard_normal(levels.shape)
     return np.asarray(np.clip(np.rint(seen), 0, 255), dtype=np.uint8)
 
 
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
-    """Return the Cramer-Rao bound on a disc's centre, px per axis; all parameters are unknown.
+    """Return the Cramer-Rao bound on the standard deviation of a disc's centre, px per axis.
 
-    The derivatives are central differences.  Rounding, and the dependence of the noise on the
-    levels, are neglected.
+    All parameters of the disc are unknown.  The derivatives are central differences.  Rounding is
+    neglected, and so is the information in the noise, which depends on the levels.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -204,7 +207,10 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
-    """Return the cases at the sheet, at rest and at the scene's speed; see `MARKER_CASES`."""
+    """Return cases (as in `MARKER_CASES`) for the scene: a marker at the screen's centre.
+
+    It is at rest or moves at the scene's speed.
+    """
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
     radius_px = round(MARKER_RADIUS_M * px_per_m, 2)
@@ -216,9 +222,10 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
 
 
 def _marker_trials(scene: Scene) -> Iterator[Trial]:
-    """Yield trials with discs at random subpixel positions, moving in random directions.
+    """Yield trials with discs at random subpixel positions that move in random directions.
 
-    The noise is a multiple of the scene's sensor noise, which the fit assumes.
+    The noise of the images is a multiple of the scene's sensor noise.  The fit always assumes the
+    scene's noise.
     """
     scene_cases = _scene_cases(scene)
     sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
@@ -273,7 +280,10 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, appearance, sensor)
 
     def error_px(_: list[Marker]) -> float:
-        """Return the rms error per axis, px; the image's size unless one marker is found."""
+        """Return the rms error per axis, px.
+
+        An image in which not exactly one marker is found counts with the size of the image.
+        """
         found = [markers_in(image) for image in images]
         off = [
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))
@@ -293,7 +303,10 @@ def _marker_trial(
 
 
 def _marker_tolerance_px(scene: Scene) -> float:
-    """Return the marker noise, px, that gives the scene's tolerance at the screen's centre."""
+    """Return the standard deviation of a marker's centre, px, that the scene's tolerance allows.
+
+    It causes an error of scene.tolerances.fingertip_m at the centre of the screen.
+    """
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
     one_px = measure(
@@ -305,7 +318,10 @@ def _marker_tolerance_px(scene: Scene) -> float:
         right_covariance=np.eye(2),
     )
     if one_px is None:
-        raise ValueError("scene: camera: the screen's centre must be in front of both cameras")
+        raise ValueError(
+            "scene: camera: the centre of the screen (the world's origin) is not in front of both "
+            "cameras; correct camera.world_from_left"
+        )
     return scene.tolerances.fingertip_m / one_px.deviation_m
 
 

@@ -1,10 +1,11 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-A marker outside the finger's gate is clutter.  Clutter is tracked separately, so that it is not
-confused with the finger during an occlusion or after both were merged in the images.  The most
-likely assignment of markers to tracks, by position and brightness, is a global nearest neighbour
-(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation).  If another
-assignment is about as likely, a marker is ambiguous and no fingertip is reported.
+Clutter is every marker-like spot that is not the finger's marker.  A marker outside the finger's
+gate (the region in which the finger is expected) is clutter.  Clutter is tracked separately, so
+that it is not confused with the finger while the finger is hidden, or after both were merged in the
+images.  The most likely assignment of markers to tracks, by position and brightness, is found as
+the global nearest neighbour (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
+and Navigation).  If another assignment is about as likely, no fingertip is reported.
 """
 
 from __future__ import annotations
@@ -25,19 +26,20 @@ from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
-"""Status of a track beside the finger's.
+"""Status of a track other than the finger's.
 
-tentative: may be the finger.  ambiguous: finger or clutter.  clutter: certainly not the finger.
+tentative: may start the finger's track.  ambiguous: may be the finger or clutter, so it must not
+start the track yet.  clutter: certainly not the finger.
 """
 
 POSITION_SIGMA_M = 0.0005
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
 STUDENT_T_DOF = 2.0
-"""Scales of a marker's residual from constant velocity per axis: position and acceleration.
-Residuals follow Student's t distribution with STUDENT_T_DOF degrees of freedom."""
+"""Scale per axis of a marker's deviation from motion at constant velocity: constant part, and
+acceleration.  Deviations follow Student's t distribution with STUDENT_T_DOF degrees of freedom."""
 
 MERGE_DISTANCE_M = 0.002
-"""Minimum distance of two markers; closer ones are one marker, detected twice."""
+"""Distance below which two detected markers are considered as one marker, detected twice."""
 
 MAX_POSITION_SIGMA_M = 0.1
 """Upper bound of the predicted position error."""
@@ -45,9 +47,9 @@ MAX_POSITION_SIGMA_M = 0.1
 MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
 INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
 POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
-"""Standard deviations of appearance, relative to the level of a marker and of its surroundings.
-The minimum is that from image to image, the initial value that of a new track, and the population
-value that between different markers."""
+"""Relative standard deviations of the grey levels of a marker and of its surroundings.  MIN: of one
+marker from image to image.  INITIAL: value of a new track.  POPULATION: between different markers.
+"""
 
 APPEARANCE_TIME_CONSTANT_S = 0.2
 APPEARANCE_VARIANCE_TIME_CONSTANT_S = 3.0
@@ -57,40 +59,41 @@ NEW_TRACK_COST = 6.0 * math.log(MAX_POSITION_SIGMA_M) + 2.0 * float(
     np.log(POPULATION_APPEARANCE_SIGMA).sum()
 )
 INFEASIBLE_COST = 1e9
-"""Costs of a new track (see `_association_cost`) and of an infeasible assignment."""
+"""Costs of assigning a marker to a new track (see `_association_cost`), and to a track that cannot
+contain it."""
 
 AMBIGUITY_MARGIN = 9.0
-"""Difference in cost below which two assignments are ambiguous: 3 sigma."""
+"""Two assignments are ambiguous if their costs differ by less than this: 3 sigma, squared."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""Upper bound of the squared appearance distance; markers beyond it differ: 4 sigma."""
+"""Squared appearance distance, in squared standard deviations, above which two markers differ."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05
-"""Time constant of a clutter track's velocity."""
+"""Time constant of the low-pass filter for a clutter track's velocity."""
 
 CLUTTER_SEARCH_PERIOD_S = 0.1
 """Period of the search of the full images while the finger is tracked."""
 
 LATE_GATE_M = 0.03
-"""Maximum distance from the finger of its marker in a late image."""
+"""Maximum distance between the finger's newest position and its marker in a late image."""
 
 STATIONARY_RADIUS_M = 3e-4
 STATIONARY_TIME_S = 1.5
-"""Minimum time that a stationary marker stays within STATIONARY_RADIUS_M; a finger never does."""
+"""A marker is stationary if it stays within this radius for this time.  A finger never does."""
 
 TRACK_TIMEOUT_S = 1.0
 STATIONARY_TRACK_TIMEOUT_S = 10.0
-"""Times after which a track without detections is deleted: a moving one and a stationary one."""
+"""Time without detections after which a moving or a stationary track is deleted."""
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1
 """Timeout of a tentative track with fewer than MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
-"""Time after which the only marker in view, if ambiguous, is assigned to the finger."""
+"""Time after which an ambiguous marker is assigned to the finger if it is the only one in view."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""Time without the finger after which moving clutter becomes ambiguous."""
+"""Time without the finger after which moving clutter is ambiguous: it may be the finger."""
 
 
 @dataclass(slots=True)
@@ -104,17 +107,17 @@ class Track:
     at_ns: int
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
-        """Predict the position (3,) m and the scale of its error per axis, m."""
+        """Predict the marker's position (3,) m at a time, and its error scale per axis, m."""
         since_s = (at_ns - self.at_ns) * 1e-9
         sigma_m = POSITION_SIGMA_M + 0.5 * ACCELERATION_SIGMA_M_PER_S2 * since_s**2
         return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)
 
     def appearance_distance_sq(self, appearance: Floats) -> float:
-        """Return the squared Mahalanobis distance of an appearance (2,) from the track's."""
+        """Return the squared Mahalanobis distance of an appearance (2,) from the track's mean."""
         return float((np.square(appearance - self.appearance) / self.appearance_variance).sum())
 
     def update_appearance(self, appearance: Floats, at_ns: int) -> None:
-        """Add an appearance (2,) to the exponential averages of the mean and the variance."""
+        """Update the exponential averages of mean and variance with a new appearance (2,)."""
         since_s, residual = (at_ns - self.at_ns) * 1e-9, appearance - self.appearance
         self.appearance = (
             self.appearance - math.expm1(-since_s / APPEARANCE_TIME_CONSTANT_S) * residual
@@ -128,11 +131,12 @@ class Track:
 
 @dataclass(slots=True)
 class ClutterTrack(Track):
-    """Track of a marker that is not the finger's.
+    """Track of a marker that is not known to be the finger.
 
-    stationary_point, stationary_since_ns: centre (3,) m of the ball of STATIONARY_RADIUS_M that the
-        marker has not left, and the time since then.
+    stationary_point, stationary_since_ns: centre (3,) m of the ball with radius STATIONARY_RADIUS_M
+        that the marker has not left since this time.
     sole_since_ns: time since which it is the only marker in view.
+    hits: number of detections.
     """
 
     stationary_point: Floats
@@ -166,7 +170,10 @@ class ClutterTrack(Track):
         return Track.predict(self, at_ns)
 
     def update(self, marker: Candidate, at_ns: int, *, is_sole: bool) -> None:
-        """Update the track by a detection; is_sole: it is the only one of its image pair."""
+        """Update the track with a detection.
+
+        is_sole: whether it is the only marker in its image pair.
+        """
         since_s = (at_ns - self.at_ns) * 1e-9
         weight = 1.0 if self.hits == 1 else -math.expm1(-since_s / VELOCITY_TIME_CONSTANT_S)
         velocity = (marker.point - self.point) / since_s
@@ -179,7 +186,7 @@ class ClutterTrack(Track):
             self.sole_since_ns = at_ns
 
     def is_alive(self, at_ns: int) -> bool:
-        """Return whether the track's last detection is neither too old nor in the future."""
+        """Return whether the last detection is neither too old for the track nor in the future."""
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
             timeout_s = STATIONARY_TRACK_TIMEOUT_S
@@ -189,7 +196,7 @@ class ClutterTrack(Track):
 
 
 class DataAssociation:
-    """Selector of the finger's marker that also tracks the clutter."""
+    """Selector of the finger's marker in each image pair, which also tracks the clutter."""
 
     def __init__(self) -> None:
         self.clutter_tracks: list[ClutterTrack] = []
@@ -200,7 +207,10 @@ class DataAssociation:
     def select_finger(
         self, at_ns: int, detection: StereoDetection, tracker: Tracker
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-        """Update the tracker from an image pair; return the reason and the finger's point."""
+        """Select the finger's marker among the detections of an image pair, and update the tracker.
+
+        Return "ok" or the reason why there is no fingertip, and the triangulated marker.
+        """
         if tracker.is_late(at_ns):
             return self._associate_late(at_ns, detection, tracker)
         if tracker.gate(at_ns) is not None:
@@ -219,8 +229,8 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger in an image pair that is older than the newest one.
 
-        Only the distance from the finger decides, since past clutter is not stored.  Several late
-        pairs in a row restart the track, since the clock has stepped back.
+        The selection uses only the distance from the finger, since past clutter is not stored.
+        Several late pairs in a row mean that the clock was set back, so they restart the track.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
@@ -238,11 +248,11 @@ class DataAssociation:
         return result, marker.measured
 
     def is_clutter_search_due(self, at_ns: int) -> bool:
-        """Return whether the full images are due to be searched for clutter."""
+        """Return whether it is time to search the full images for clutter again."""
         return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
 
     def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:
-        """Update the clutter tracks from the full images in which the finger was just found."""
+        """Update the clutter tracks with the detections in full images that contain the finger."""
         self._clutter_searched_ns = at_ns
         seen = [one.point for one in self.clutter_tracks if one.at_ns == at_ns]
         if self._finger is not None:
@@ -271,7 +281,7 @@ class DataAssociation:
     def _continue_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker of a tracked finger, or the reason if there is none."""
+        """Return the marker that continues the finger's track, or the reason if there is none."""
         tracks = self._associate(at_ns, [*detection.markers, *detection.clutter], self._finger)
         near = tracks[: len(detection.markers)]
         finger_markers = [
@@ -279,8 +289,8 @@ class DataAssociation:
         ]
         for track in tracks if finger_markers else tracks[len(near) :]:
             if track is not None and track.status == "tentative":
-                # Without the finger in view, it is only certain that the marker is outside the
-                # gate.
+                # If the finger is not in view, this marker may be the finger, although it is
+                # outside the gate.
                 track.status = "clutter" if finger_markers else "ambiguous"
         if detection.reason not in ("ok", "two_markers"):
             return detection.reason
@@ -310,7 +320,7 @@ class DataAssociation:
         return "no_marker" if is_all_clutter else "two_markers"
 
     def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
-        """Return the track that continues the lost finger's; None if it is ambiguous."""
+        """Return the track that is most likely the lost finger; None if none is certain enough."""
         finger = self._finger
         absence_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
         candidates: list[tuple[float, ClutterTrack]] = []
@@ -345,7 +355,11 @@ class DataAssociation:
     def _associate(
         self, at_ns: int, markers: Sequence[Candidate], finger: Track | None
     ) -> list[ClutterTrack | None]:
-        """Assign the markers of an image pair to tracks; None is the finger's."""
+        """Assign the markers of an image pair to tracks, and update or create the clutter tracks.
+
+        finger: track of the finger, if any.
+        Return the track of each marker; None stands for the finger's track.
+        """
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
         if not markers:
             return []
@@ -382,7 +396,11 @@ class DataAssociation:
 
 
 def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
-    """Return twice the negative log likelihood of a marker in a track, up to a constant."""
+    """Return the cost of assigning a marker to a track.
+
+    It is twice the negative log likelihood of the marker's position and appearance, up to a
+    constant.
+    """
     if one.at_ns == at_ns:  # it was already updated by this image pair
         return INFEASIBLE_COST
     point, sigma_m = one.predict(at_ns)
@@ -395,14 +413,18 @@ def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the markers (rows) whose assignment to the finger (a column) is ambiguous."""
+    """Return the rows (markers) for which it is ambiguous whether they are the finger.
+
+    costs: cost of assigning each marker (row) to each track (column).
+    columns: track assigned to each marker.  finger: column of the finger's track.
+    """
     finger_row = next((row for row, column in enumerate(columns) if column == finger), None)
     ambiguous = set[int]()
     for row, column in enumerate(columns):
         if column >= finger:
             continue
         cost, swapped = costs[row, column], costs[row, finger]
-        if finger_row is not None:  # the two markers would swap
+        if finger_row is not None:  # cost if the two markers swap their tracks
             cost, swapped = (
                 cost + costs[finger_row, finger],
                 swapped + costs[finger_row, column],

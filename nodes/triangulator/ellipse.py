@@ -1,14 +1,15 @@
-"""Render the image of a blurred ellipse, as of a flat round marker that is seen at an angle.
+"""Render the image of a blurred ellipse, such as a flat round marker that is seen at an angle.
 
-The ellipse is uniform, its point spread is Gaussian with standard deviation `blur`.  The light at a
-pixel p is the area integral of the Gaussian over the ellipse.  Green's theorem turns it into an
-integral along the edge q with the outward normal n:
+The ellipse is uniformly bright and blurred by a Gaussian with standard deviation `blur`.  The light
+S at a pixel p (0 to 1) is the integral of the Gaussian over the ellipse's area.  Green's theorem
+converts it to an integral along the edge, whose points are q with outward normals n:
 
     S(p) = closed integral of (q - p) . n (1 - exp(-|q - p|^2 / 2 blur^2)) / (2 pi |q - p|^2).
 
-Its derivatives are edge integrals of the Gaussian.  The sum over equidistant angles converges
-exponentially, because the integrand is smooth and periodic.  The result is exact for any ratio of
-blur and axes, whereas the error function of the edge distance (`subpixel`) needs a smooth edge.
+Its derivatives are integrals of the Gaussian along the edge.  They are computed as sums over
+equidistant angles t, which converge exponentially, because the integrand is smooth and periodic.
+The result is exact for any ratio of blur and axes.  The faster model of the module `subpixel`, a
+function of the distance from the edge, requires a blur that is small relative to the radius.
 
 The edge is q = centre + A (cos t, sin t), A = [[r + e, f], [f, r - e]].  The semi-axes are r plus
 and minus the length of the elongation (e, f).
@@ -24,19 +25,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 NODE_SPACING = 1.4
-"""Maximum distance of nodes on the edge, in standard deviations of the blur; the error of the light
-is then less than a thousandth."""
+"""Maximum distance between integration nodes on the edge, in standard deviations of the blur.  The
+error of the light is then below 0.001."""
 
 MIN_NODES, MAX_NODES = 12, 64
-"""Bounds on the number of nodes.  The maximum is enough for a radius of 11 px in focus, and bounds
-the time for a large light."""
+"""Bounds on the number of nodes.  The maximum is enough for a sharp marker with a radius of 11 px,
+and limits the time for a large bright spot."""
 
 
 def integrate_ellipse(shapes: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return light (n, m) of ellipses at m pixels, and its derivatives (n, 6, m) by the shape.
+    """Return the light (n, m) of n ellipses at m pixels, and its derivatives (n, 6, m).
 
-    shapes: (n, 6) px: centre (x, y), mean semi-axis, blur, elongation (e, f).
-    x, y: (m,) px.
+    shapes: (n, 6) px: centre (x, y), mean semi-axis, blur, elongation (e, f).  The derivatives are
+        with respect to these parameters.
+    x, y: (m,) px, coordinates of the pixels.
     """
     radius, blur, elongation = shapes[:, 2], shapes[:, 3], shapes[:, 4:]
     longest = float((radius + np.hypot(*elongation.T)).max())
@@ -58,7 +60,7 @@ def integrate_ellipse(shapes: Floats, x: Floats, y: Floats) -> tuple[Floats, Flo
     spread = np.exp(away * (-0.5 / variance))
     flux = dx * normal_x[:, :, None] + dy * normal_y[:, :, None]
     light = np.add.reduce(flux * (1.0 - spread) / away, axis=1) / math.tau
-    # One row of weights per derivative but the blur's: how far its change moves the edge outwards.
+    # For each parameter except the blur: how far the edge moves outwards if it changes.
     moved = np.stack(
         [
             normal_x,

@@ -1,9 +1,9 @@
 """Estimate the finger's position from measured points, and predict it.
 
-Each method is a filter with four functions on an immutable estimate.  `initialize` makes it from
-one measurement, and `update` adds a later one.  `moments` gives position, velocity and their
-covariance, and `predict` gives positions at future times.  Points are (3,) in the world frame, m,
-with covariances (3, 3) m^2.
+Each method is a filter with four functions that make or use an immutable estimate.  `initialize`
+makes the estimate from one measurement, and `update` adds a later one.  `moments` returns position,
+velocity and their covariance, and `predict` returns positions at future times.  Points are (3,) in
+the world frame, m, with covariances (3, 3) m^2.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """State (n,) of a filter at one time, and its error covariance (n, n)."""
+    """State of a filter at one time, and a covariance, whose shapes depend on the method."""
 
     at_ns: int
     state: Floats
@@ -40,7 +40,7 @@ class Filter(Protocol):
         ...
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-        """Return position (3,), velocity (3,) and their joint covariance (6, 6)."""
+        """Return position (3,) m, velocity (3,) m/s and their joint covariance (6, 6)."""
         ...
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
@@ -50,7 +50,7 @@ class Filter(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Unfiltered:
-    """Method without a filter: the last measured point, constant in predictions."""
+    """Tracking method without a filter: every prediction is the last measured point."""
 
     max_speed_m_per_s: float
 
@@ -109,7 +109,7 @@ class OneEuro:
 
 
 def _low_pass_weight(cutoff_hz: float, dt: float) -> float:
-    """Return the weight of the newest value in a first-order low-pass stepped by dt."""
+    """Return the weight of the newest value in a first-order low-pass filter with step dt, s."""
     return 1.0 / (1.0 + 1.0 / (2.0 * np.pi * cutoff_hz * dt))
 
 

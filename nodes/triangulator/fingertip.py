@@ -1,4 +1,8 @@
-"""Detect the fingertip in a stereo pair: blobs, their matches, triangulation, rejection reasons."""
+"""Detect the fingertip's marker in a stereo image pair.
+
+Bright blobs are detected in each image and matched to pairs.  The markers of likely pairs are
+refined to subpixel accuracy and triangulated.  A pair that cannot be the marker gets a reason.
+"""
 
 from __future__ import annotations
 
@@ -40,50 +44,54 @@ Image = NDArray[np.uint8]
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""Standard deviation of the logarithm of a blob's radius over the marker's at that depth."""
+"""Standard deviation of the log ratio of a blob's radius to the marker's expected radius there."""
 
 HEIGHT_SIGMA = 0.25
-"""Standard deviation of the log ratio of a marker's heights in both views."""
+"""Standard deviation of the log ratio of a marker's brightness above its surroundings in the left
+view to that in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
-"""Standard deviation of the distance between a marker's rays before its centres are refined."""
+"""Standard deviation of the distance between a marker's two rays, projected into the images, before
+the centres are refined."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""Maximum log ratio of a blob's size to the expected one: 0.55 to 1.8 times the size."""
+"""Maximum log ratio of a blob's radius to the expected one, which allows 0.55 to 1.8 times it."""
 
 SIZE_SIGMAS = 3.5
 MARKER_SIZE_SIGMA = 0.035
-"""Bound on a refined marker's size deviation, in standard deviations, and the relative standard
-deviation of real markers.  A marker beyond the bound is partly occluded or merged with a light."""
+"""Maximum deviation of a refined marker's radius from the expected one, in standard deviations, and
+the relative standard deviation of the radii of real markers.  A marker that deviates more is partly
+occluded, or merged with another bright spot."""
 
 STEREO_SIZE_SIGMAS = 4.5
 MAX_MOTION_DIFFERENCE_PX = 2.5
-"""Bounds on the differences between both views, in size (standard deviations) and in motion.  A
-marker beyond them is partly occluded in one view, or merged with a light there."""
+"""Maximum differences between both views of a marker, in radius (standard deviations) and in motion
+during the exposure.  A marker that differs more is partly occluded, or merged with another bright
+spot, in one view."""
 
 WINDOW_MARGIN_PX = 5
-"""Width of the surroundings that a search window includes around the marker."""
+"""Margin that a search window includes around the region in which the marker is expected."""
 
 GATE_RADIUS_SIGMAS = 4.0
-"""Radius of a gate in standard deviations of the expected position."""
+"""Radius of a gate (see `tracking.Gate`), in standard deviations of the expected position."""
 
 MAX_FLAT_PAIRS = 4
-"""Maximum number of pairs that are refined as flat markers, those with the lowest costs."""
+"""Maximum number of pairs that are refined as flat markers, in the order of their costs."""
 
 AMBIGUITY_MARGIN = 9.0
-"""Minimum cost difference of a unique match to every other, in squared standard deviations."""
+"""Minimum cost by which other matches must exceed a unique one, in squared standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
     """Settings of the detection, refinement and triangulation of markers.
 
-    blob_filter: criteria of a blob.
-    refine, triangulate: the methods.
+    blob_filter: criteria for a blob that may be the marker.
+    refine, triangulate: functions of the selected methods.
     max_reprojection_px: maximum reprojection error of a pair.
-    noise_px: standard deviation of a marker's centre; None for the method's estimate.
+    noise_px: standard deviation of a marker's centre; None uses the estimate of `refine`.
     marker_radius_m: true radius of the marker.
-    max_deviation_m: maximum standard deviation of a point.
+    max_deviation_m: maximum standard deviation of a triangulated point.
     sensor: noise of the pixels.
     """
 
@@ -101,11 +109,12 @@ class DetectorConfig:
 class BlobPair:
     """Pair of blobs, left and right, that may be one marker.
 
-    depth_m: depth of the intersection of their rays in the left camera's frame.
-    gate_fraction: distance from the gate's centre over its radius; 0 without a gate.
+    depth_m: depth in the left camera's frame at which the rays of both blobs meet.
+    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 without a
+        gate.
     cost: mismatch of rays, sizes, heights and distance from the gate's centre, in squared standard
         deviations.
-    rejection_reason: None if the pair may be a marker in the volume.
+    rejection_reason: None if the pair may be a marker in the finger's volume.
     """
 
     left: Blob
@@ -120,7 +129,9 @@ class BlobPair:
 class Candidate:
     """Detection that may be the finger's marker.
 
-    appearance: (2,) logarithms of its level and of its surroundings' level, mean of both views.
+    measured: triangulated position.
+    appearance: (2,) logarithms of the grey level of the marker and of that of its surroundings,
+        averaged over both views.
     """
 
     measured: TriangulatedPoint
@@ -136,7 +147,8 @@ class Candidate:
 class StereoDetection:
     """Detections in an image pair.
 
-    reason, measured: result of `detect`.
+    reason: "ok", or why no finger was found.
+    measured: triangulated point, if any; see `detect`.
     markers: candidates inside the gate, sorted by cost.
     clutter: candidates outside the gate.
     """
@@ -149,7 +161,7 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """Arguments of `detect`."""
+    """Arguments of `detect`, where they are described."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -170,14 +182,15 @@ def detect(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Detect the marker in an image pair; return the reason ("ok" if valid) and the point.
+    """Detect the marker in an image pair.
 
     left, right: images (height, width).
-    volume: minimum and maximum corner of the finger's volume, world frame, m.
+    volume: minimum and maximum corner (3,) m of the region that the finger may reach, world frame.
     gate: region to search.  None searches both images, which must then contain one marker only.
     left_origin_px, right_origin_px: column and row of the sensor where each image begins.
 
-    The point is also given for other reasons than "ok" if two rays meet.
+    Return "ok" or the reason why no valid marker was found, and the triangulated point.  If two
+    rays meet, a point is also returned for a marker that is not valid.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
@@ -196,9 +209,9 @@ def detect_all(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> StereoDetection:
-    """Detect the fingertip, see `detect`, and all other markers.
+    """Detect the finger's marker as `detect` does, and return all other markers with it.
 
-    If the fingertip is not found inside its gate, the full images are searched for other markers.
+    If the finger is not found inside its gate, the full images are searched for other markers.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
@@ -210,7 +223,7 @@ def detect_all(
 
 
 def _finite_gate(gate: Gate | None) -> Gate | None:
-    """Return the gate; None if its centre is not finite."""
+    """Return the gate; None (search the full images) if its centre is not finite."""
     return gate if gate is not None and np.isfinite(gate.point).all() else None
 
 
@@ -224,7 +237,7 @@ def _detect_in(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of the gate in each image; None twice without a gate or outside a view."""
+    """Return the window of each image that shows the gate; None twice unless both views show it."""
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
@@ -261,7 +274,7 @@ def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Detect markers in one window of each image, or in the full images (None)."""
+    """Detect markers in one window of each image; None as window means the full image."""
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -292,9 +305,10 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Make all pairs of blobs whose rays meet in front of the cameras, with their costs.
+    """Return all pairs of blobs whose rays meet in front of the cameras, with their costs.
 
-    A pair outside the volume, or with a depth that contradicts its size, gets a rejection reason.
+    A pair outside the finger's volume gets a rejection reason, and so does one whose radius does
+    not match its depth.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
@@ -338,10 +352,10 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """Pair with refined markers.
+    """Pair of blobs with refined markers.
 
     rejection_reason: None for a valid marker.
-    cost: sum for the pair and for the refined sizes, in squared standard deviations.
+    cost: cost of the pair plus mismatch of the refined radii, in squared standard deviations.
     """
 
     pair: BlobPair
@@ -351,10 +365,10 @@ class RefinedPair:
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
-    """Select the marker among one or more pairs.
+    """Select the pair that is the finger's marker, from pairs that are likely markers.
 
-    Of pairs with about the same cost, only those that are discs after refinement remain: round
-    ones, or flat ones seen at an angle.
+    Among pairs with similar costs, only those that are discs after refinement remain.  These are
+    round markers, or flat ones that are seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -377,7 +391,7 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine pairs, sorted by their cost before the refinement."""
+    """Refine the markers of pairs; return them sorted by their cost before the refinement."""
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -388,7 +402,7 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
 
 
 def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> list[RefinedPair]:
-    """Refine rejected pairs as flat markers; return those that are such markers."""
+    """Refine pairs that are not round markers as flat ones; return those that are flat markers."""
     refine = FLAT_METHODS.get(inputs.config.refine)
     if refine is None:
         return []
@@ -407,11 +421,13 @@ def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> lis
 def _check_flat_pair(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> tuple[Marker, Marker] | None:
-    """Return two ellipses with the centre of the flat marker; None if they are no such marker.
+    """Check that two ellipses are one flat marker, and correct their centres for perspective.
 
-    The centres are those of the marker, without the effect of perspective.  The radius is the major
-    semi-axis.  The mismatch of both shapes increases the covariance, because an occluder that
-    covers a strip changes the semi-axis by as much as the centre.
+    Return both markers with the image of the marker's centre as centre, and the major semi-axis as
+    radius.  Return None if they are not one flat marker.
+
+    The mismatch of the two shapes increases the covariance.  A strip that an obstacle covers
+    changes the semi-axis and the centre by the same amount, so the mismatch shows the error.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -440,7 +456,7 @@ def _check_flat_pair(
 def _flat_pose(
     inputs: DetectionInput, point_world: Floats, markers: tuple[Marker, Marker]
 ) -> FlatPose:
-    """Return the pose of a flat marker at a point (3,), m."""
+    """Estimate the orientation of a flat marker at a world point (3,) m from its two images."""
     geometry = inputs.geometry
     left_from_world, right_from_left = geometry.left_from_world, geometry.right_from_left
     in_left = left_from_world[:3, :3] @ point_world + left_from_world[:3, 3]
@@ -462,8 +478,8 @@ def _unique_candidates(
 ) -> tuple[Candidate, ...]:
     """Return the unique markers among refined pairs, sorted by cost.
 
-    A pair is dropped if pairs with lower cost contain both its blobs, or if one with much lower
-    cost contains one of them.  Such pairs arise when blobs of two markers match crosswise.
+    Blobs of two markers can match crosswise and give wrong pairs.  A pair is therefore dropped if
+    pairs with lower cost contain both its blobs, or if one with much lower cost contains one blob.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -490,7 +506,10 @@ def _appearance(pair: BlobPair) -> Floats:
 def _refine_markers(
     inputs: DetectionInput, pairs: Sequence[BlobPair], refine: Refine | None = None
 ) -> list[tuple[Marker, Marker]]:
-    """Refine the markers of all pairs at once, by the configured method or another."""
+    """Refine the markers of all pairs in one call.
+
+    refine: function to use; None uses the configured method.
+    """
     config = inputs.config
     images = [image for _ in pairs for image in inputs.images]
     blobs = [blob for pair in pairs for blob in (pair.left, pair.right)]
@@ -502,7 +521,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return the rejection reason of a refined pair; None for a valid marker."""
+    """Return why a refined pair cannot be the marker; None if it is a valid marker."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason
@@ -523,7 +542,7 @@ def _rejection_reason(
 
 
 def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]) -> float:
-    """Return the mismatch of the refined sizes, in squared standard deviations."""
+    """Return the mismatch of refined and expected radii, in squared standard deviations."""
     sizes = (
         _size_deviation(inputs, marker.radius, pair.depth_m)
         / math.hypot(MARKER_SIZE_SIGMA, marker.radius_deviation)
@@ -533,7 +552,7 @@ def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Ma
 
 
 def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) -> float:
-    """Return the magnitude of the log ratio of a radius to the marker's radius at that depth."""
+    """Return the absolute log ratio of a radius to the marker's expected radius at that depth."""
     expected_px = _focal_px(inputs.geometry) * inputs.config.marker_radius_m / depth_m
     return abs(math.log(radius_px / expected_px))
 
@@ -550,7 +569,7 @@ def _inside(volume: tuple[Floats, Floats], point_world: Floats) -> bool:
 def _triangulate(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> TriangulatedPoint | None:
-    """Triangulate two refined markers."""
+    """Triangulate a marker from its refined images in both views; None if the rays do not meet."""
     noise_px, occlusion = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
     left, right = (
         (marker.covariance if noise_px is None else noise_px**2 * np.eye(2)) + occlusion
@@ -567,10 +586,11 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Return the variance of a centre from partial occlusion, by the size difference of both views.
+    """Estimate the variance that partial occlusion adds to a centre, from the radii in both views.
 
-    An occluder that covers a strip of a disc shifts its centre by half the strip's width, and
-    reduces the radius by the same amount.  The variance of the method's radii is subtracted.
+    An obstacle that covers a strip of a disc shifts its centre by half the strip's width, and
+    reduces the radius by the same amount.  The squared difference of the radii is therefore the
+    variance, less the variance of the estimated radii.
     """
     one, other = markers
     noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
@@ -580,7 +600,10 @@ def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
 def _validate(
     inputs: DetectionInput, measured: TriangulatedPoint | None
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Check reprojection error, uncertainty and volume; return the reason and the point."""
+    """Check the reprojection error, standard deviation and volume of a triangulated point.
+
+    Return "ok" or the reason to reject the point, and the point itself.
+    """
     config = inputs.config
     if (
         measured is None

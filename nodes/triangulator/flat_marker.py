@@ -1,9 +1,9 @@
 """Check that two ellipses are one flat round marker, and correct their centres for perspective.
 
-A disc with radius R, centre p and normal n has the image A A^T = R^2 J (I - n n^T) J^T, with J the
-derivative of the pixel by the point.  Each ellipse gives two normals, mirrored about the line of
-sight; the other view decides.  A marker that is partly covered, or merged with a light, in general
-has no normal that agrees with both views.
+A disc with radius R and normal n has the image A A^T = R^2 J (I - n n^T) J^T.  A is the matrix of
+the ellipse's edge (module `ellipse`), J the derivative of the pixel with respect to the point.
+Each ellipse allows two normals, mirrored about the line of sight; the other view selects one.  If a
+marker is partly covered, or merged with a bright spot, usually no normal agrees with both views.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Floats = NDArray[np.float64]
 class DiscView:
     """One camera's view of a disc.
 
-    camera_from_left: (3, 3) rotation from the left camera's axes.
-    point: (3,) the disc's centre in this camera, m.
-    jacobian: (2, 3) px/m, derivative of its pixel by the point.
-    axes: (2, 2) px, the symmetric matrix A of the ellipse's edge, see `ellipse`.
+    camera_from_left: (3, 3) rotation from the left camera's axes to those of this camera.
+    point: (3,) m, centre of the disc in this camera's frame.
+    jacobian: (2, 3) px/m, derivative of the pixel with respect to the point.
+    axes: (2, 2) px, symmetric matrix A of the ellipse's edge; see the module `ellipse`.
     """
 
     camera_from_left: Floats
@@ -36,10 +36,11 @@ class DiscView:
 
 @dataclass(frozen=True, slots=True)
 class FlatPose:
-    """Best normal (3,) of a disc, in the left camera's axes.
+    """Normal (3,) of a disc, in the left camera's axes, that fits its two images best.
 
-    mismatch_px: largest difference of a semi-axis between an ellipse and the disc's image.
-    centre_offsets_px: (2, 2) centre of the disc's image minus image of its centre, per view.
+    mismatch_px: largest difference of a semi-axis between a measured ellipse and the disc's image.
+    centre_offsets_px: (2, 2), for each view, centre of the disc's image minus the image of the
+        disc's centre.  They differ because of perspective.
     """
 
     normal: Floats
@@ -48,7 +49,7 @@ class FlatPose:
 
 
 def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
-    """Return the normal for which the disc's images in two views fit the ellipses best."""
+    """Find the normal for which a disc's images in two views fit the measured ellipses best."""
     found = [list(_possible_normals(view, radius_m)) for view in views]
     normals = [normal for normals in found for normal in normals]
     for one in found[0]:
@@ -65,7 +66,7 @@ def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
 
 
 def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
-    """Yield both normals (3,) for which the disc has this image, in the left camera's axes."""
+    """Yield both normals (3,), in the left camera's axes, that explain the ellipse of one view."""
     sideways, triangle = np.linalg.qr(view.jacobian.T)
     back = np.linalg.solve(triangle.T, view.axes) / radius_m
     values, vectors = np.linalg.eigh(back @ back.T)
@@ -79,7 +80,9 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the largest difference of a semi-axis; the normal is in the view's axes."""
+    """Return the largest difference of a semi-axis between the measured ellipse and the disc's
+    image for a normal (3,) in this camera's axes.
+    """
     along = view.jacobian @ normal
     square = radius_m**2 * (view.jacobian @ view.jacobian.T - np.outer(along, along))
     # Square root of a symmetric 2 x 2 matrix.
@@ -89,9 +92,10 @@ def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
 
 
 def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats:
-    """Return the centre of a disc's image minus the image of its centre (2,), from the dual conic.
+    """Return the centre of a disc's image minus the image of the disc's centre (2,), px.
 
-    The lens's distortion is linearised.
+    normal: (3,) of the disc in the left camera's axes.
+    The image's centre follows from the dual conic of the disc, with linearised lens distortion.
     """
     in_camera, point = view.camera_from_left @ normal, view.point
     conic = radius_m**2 * (np.eye(3) - np.outer(in_camera, in_camera)) - np.outer(point, point)

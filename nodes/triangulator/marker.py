@@ -24,37 +24,40 @@ Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""Side of the square around a pixel whose mean is the local threshold."""
+"""Side of the square around a pixel whose mean grey level is the local threshold."""
 
 SURROUND_PX = 3
-"""Width of the border around a blob; its outermost pixels are the surroundings."""
+"""Width of the border around a blob; the outermost pixels of the border are its surroundings."""
 
 SURROUND_RANK = 0.75
-"""Quantile of the surrounding pixels that is used as their level.  It separates the marker from a
-bright finger on one side, with darkness on the other."""
+"""Quantile of the surrounding pixels' grey levels that is used as their common level.  A high
+quantile is needed if a bright finger is on one side of the marker and the other side is dark."""
 
 SKIRT_FRACTION = 0.1
-"""Lower bound of the light, as a fraction of the marker's height; light below it is noise."""
+"""Fraction of the marker's height (its grey levels above its surroundings) below which the light of
+a pixel is ignored as noise."""
 
 MAX_REGIONS = 64
-"""Maximum number of bright regions to search; the largest are searched."""
+"""Maximum number of bright regions to search; if there are more, the smallest are skipped."""
 
 WHITE_LEVEL = 250
 WHITE_FRACTION = 0.2
-"""Level of a white pixel, and the fraction of white pixels of an overexposed image."""
+"""An image is overexposed if more than this fraction of its pixels has at least this grey level."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlobFilter:
-    """Criteria of a marker.
+    """Criteria for blobs that may be a marker, and for refined markers.
 
-    min_contrast: levels of its brightest pixel above its surroundings.
-    min_area_px, max_area_px: number of pixels brighter than half that contrast.
+    min_contrast: minimum difference of grey levels between its brightest pixel and its
+        surroundings.
+    min_area_px, max_area_px: limits on the number of pixels brighter than half that contrast.
     window_half_px: half the side of the smallest search window around an expected position.
     max_motion_px: maximum motion during an exposure.
     max_blur: maximum standard deviation of the edge of a marker in focus, as a fraction of the
         radius.
-    max_misfit: maximum residual of a disc, root mean square, as a fraction of the marker's height.
+    max_misfit: maximum root mean square residual of a fitted disc, as a fraction of the marker's
+        height.
     """
 
     min_contrast: float = 60.0
@@ -68,14 +71,14 @@ class BlobFilter:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Bright blob that may be a marker, in pixels of the searched image.
+    """Bright blob that may be a marker; lengths are pixels of the searched image.
 
     centre: centroid of its light.
-    radius: of a disc of the same area at half height.
-    motion: (x, y) displacement during the exposure, from its second moments.
-    spread: smallest second moment of its light, relative to that of a uniform disc of its radius.
-    peak, surround: levels of its brightest pixel and of its surroundings.
-    window: its pixels and their surroundings.
+    radius: radius of the disc with the same area as the pixels above half the height.
+    motion: (x, y) displacement during the exposure, estimated from the second moments of its light.
+    spread: smallest second moment of its light, relative to that of a uniform disc of this radius.
+    peak, surround: grey levels of its brightest pixel and of its surroundings.
+    window: part of the image that contains its pixels and their surroundings.
     """
 
     centre: tuple[float, float]
@@ -88,12 +91,12 @@ class Blob:
 
     @property
     def blur(self) -> float:
-        """Return the standard deviation of its edge, px, estimated from the spread."""
+        """Return the standard deviation of the edge blur, px, estimated from the spread."""
         return min(max(0.5 * self.radius * math.sqrt(max(self.spread - 0.85, 0.0)), 0.6), 3.0)
 
     @property
     def height(self) -> float:
-        """Return the number of levels of the peak above the surroundings."""
+        """Return the difference of grey levels between the peak and the surroundings."""
         return self.peak - self.surround
 
 
@@ -102,15 +105,14 @@ MarkerRejection = Literal["merged", "blurred"]
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """Refined marker: centre (2,) px with covariance (2, 2) px^2.
+    """Refined image of a marker: centre (2,) px with covariance (2, 2) px^2.
 
-    radius: of the disc, px.
-    radius_deviation: standard deviation of the radius by the method, as a fraction of it.
-    blur: standard deviation of its edge, px.
-    motion: (x, y) px during the exposure, of unknown sign.
-    elongation: (e, f) px of a flat marker seen at an angle, see `ellipse`.  Its radius is the mean
-        semi-axis.
-    height: levels above its surroundings.
+    radius: radius of the disc, px, or mean semi-axis of the ellipse.
+    radius_deviation: standard deviation of the estimated radius, as a fraction of the radius.
+    blur: standard deviation of the edge blur, px.
+    motion: (x, y) px displacement during the exposure; its sign is unknown.
+    elongation: (e, f) px of a flat marker that is seen at an angle; see the module `ellipse`.
+    height: grey levels above its surroundings.
     rejection_reason: None for a valid marker.
     """
 
@@ -126,11 +128,14 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
-"""Function that refines blobs; blob i is of image i."""
+"""Function that refines blobs to markers.  Blob i belongs to image i."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
-    """Return the window around a pixel of an image (height, width); None outside the image."""
+    """Return the window of 2 half_px + 1 pixels around a pixel, clipped to the image.
+
+    shape: (height, width) of the image.  Return None if the window is outside the image.
+    """
     x, y = pixel.tolist()
     if not abs(x) + abs(y) < 1e6:  # also rejects NaN
         return None
@@ -151,9 +156,10 @@ def is_overexposed(image: Image, window: Window | None = None) -> bool:
 def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = None) -> list[Blob]:
     """Detect all blobs in an image, or in a window of it, that may be a marker.
 
-    Bright regions exceed their neighbourhood's mean.  In each region, blobs are the pixels above
-    half the height over the surroundings.  This finds a marker on a bright finger and beside a
-    brighter light.  Blobs at the border are dropped, because their centre would be wrong.
+    First find regions that are brighter than the mean of their neighbourhood.  In each region, the
+    pixels above the middle between the levels of the peak and the surroundings form blobs.  This
+    finds a marker on a bright finger or next to a brighter spot.  Blobs at the image border are
+    dropped, because their centre would be wrong.
     """
     top, left = (0, 0) if window is None else (window[0].start, window[1].start)
     part = image if window is None else image[window]
@@ -185,7 +191,7 @@ def _detect_in_box(
 ) -> list[Blob]:
     """Detect the blobs in a box (x, y, width, height) of an image part.
 
-    origin: first row and column of the part.
+    origin: row and column of the image at which the part begins.
     """
     rows, columns = _add_border(box)
     cut = part[rows, columns]
@@ -222,7 +228,7 @@ def _add_border(box: Sequence[int]) -> Window:
 
 
 def _surround_level(cut: Image) -> float:
-    """Return the level of a cut-out's outermost pixels."""
+    """Return the grey level of the surroundings, a quantile over the cut-out's outermost pixels."""
     border = np.concatenate((cut[0], cut[-1], cut[:, 0], cut[:, -1]))
     border.sort()
     return float(border[int(SURROUND_RANK * border.size)])
@@ -237,15 +243,17 @@ def _make_blob(
     peak: float,
     origin: tuple[int, int],
 ) -> Blob:
-    """Make the blob of `area` pixels in a window of an image part.
+    """Compute centre, radius, motion and spread of the blob in a window of an image part.
 
-    origin: first row and column of the part.
+    cut: pixels of the window.
+    area: number of pixels above half the height.
+    origin: row and column of the image at which the part begins.
     """
     rows, columns = window
     found = _light_moments(cut, surround, peak)
     light = found["m00"]
     a, b, c = found["mu20"] / light, found["mu11"] / light, found["mu02"] / light
-    # Motion at constant speed adds a twelfth of its square to the second moment along it.
+    # A motion of length l at constant speed adds l^2 / 12 to the second moment along it.
     uneven = math.hypot(0.5 * (a - c), b)
     angle, length = 0.5 * math.atan2(2.0 * b, a - c), math.sqrt(24.0 * uneven)
     return Blob(
@@ -266,31 +274,31 @@ def _make_blob(
 
 
 def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]:
-    """Return the moments of the light above the noise threshold (skirt)."""
+    """Return the image moments (`cv2.moments`) of the light above the noise threshold (skirt)."""
     skirt = surround + SKIRT_FRACTION * (peak - surround)
     return cv2.moments(np.maximum(cut - np.float32(skirt), np.float32(0.0)))
 
 
 SHARP_PX = 1.2
-"""Maximum blur of an edge in focus, one standard deviation."""
+"""Maximum standard deviation of the blur of an edge that is in focus."""
 
 MAX_SPREAD = 1.7
-"""Maximum spread of a blob that is sharp enough to be a disc."""
+"""Maximum value of `Blob.spread`; a blob with a larger one is too blurred to be a marker."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystematicError:
-    """Systematic errors of a method, one standard deviation per axis.
+    """Systematic errors of the centre by a refinement method, one standard deviation per axis.
 
-    still_px: error from the pixel grid and uneven ground.
-    moving: additional error, as a fraction of the motion during the exposure.
+    still_px: error from the pixel grid and an uneven background.
+    moving: additional error of a moving marker, as a fraction of its motion during the exposure.
     """
 
     still_px: float
     moving: float
 
     def covariance(self, motion: tuple[float, float]) -> Floats:
-        """Return the covariance (2, 2) px^2 for a marker with this motion during the exposure."""
+        """Return the covariance (2, 2) px^2 of the error for a marker's motion (x, y), px."""
         variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
         return np.array([[variance, 0.0], [0.0, variance]])
 
@@ -298,8 +306,8 @@ class SystematicError:
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
 BY_WEIGHTED_CENTROID = SystematicError(still_px=0.03, moving=0.012)
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""Systematic errors for which simulated errors, normalised by the covariance, have unit variance
-(`tests/test_marker.py`)."""
+"""Systematic errors of the methods.  They were chosen such that errors in simulation, divided by
+their predicted standard deviations, have unit variance (`tests/test_marker.py`)."""
 
 
 def moments(
@@ -320,9 +328,10 @@ def weighted_centroid(
 ) -> list[Marker]:
     """Refine blobs to the centroid of the marker's light.
 
-    A pixel on the edge is weighted by its lit fraction, which removes most of the pixel grid's
-    error.  The weight is continuous at the noise threshold (skirt).  The noise of each pixel
-    changes the centre by the pixel's distance from it, divided by the total light.
+    A pixel on the edge is weighted by its lit fraction, which removes most of the error that the
+    pixel grid causes.  The weight is continuous at the noise threshold (skirt).  The covariance
+    follows from pixel noise: a pixel changes the centre by its noise, times its distance from the
+    centre, divided by the total light.
     """
     markers = []
     for image, blob in zip(images, blobs, strict=True):
@@ -354,7 +363,10 @@ def _marker_from_moments(
     blob_filter: BlobFilter,
     systematic: SystematicError,
 ) -> Marker:
-    """Make a marker from the moments of its window; reject it by spread or motion."""
+    """Make a marker from the moments of its window; reject it if spread or motion is too large.
+
+    covariance: (2, 2) px^2 of the centre due to pixel noise.
+    """
     rows, columns = blob.window
     rejection_reason: MarkerRejection | None = None
     if blob.spread > MAX_SPREAD:
@@ -378,7 +390,7 @@ def _marker_from_moments(
 def subpixel_fit(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Refine blobs by a maximum-likelihood fit of a motion-blurred disc; see `subpixel`."""
+    """Refine blobs by a maximum-likelihood fit of a motion-blurred disc (module `subpixel`)."""
     markers = []
     for blob, fit in zip(blobs, fit_discs(images, _fit_starts(blobs), noise), strict=True):
         rejection_reason: MarkerRejection | None = None
@@ -407,15 +419,15 @@ def subpixel_fit(
 
 MAX_ELLIPSE_MISFIT = 0.035
 MAX_ODD_MISFIT = 0.03
-"""Bounds on an ellipse's residuals and on their odd part, as a fraction of the marker's height.
-They are tighter than a disc's, because an ellipse fits a partly covered disc well, except for the
-odd part."""
+"""Maximum root mean square residual of a fitted ellipse, and of the residuals' odd part about the
+centre, as a fraction of the marker's height.  They are smaller than the limit for a disc, because
+an ellipse fits a partly covered disc well, except for the odd part."""
 
 
 def fit_flat_markers(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Refine blobs by a maximum-likelihood fit of an ellipse at rest; see `subpixel`."""
+    """Refine blobs by a maximum-likelihood fit of an ellipse at rest (module `subpixel`)."""
     markers = []
     for blob, fit in zip(blobs, fit_ellipses(images, _fit_starts(blobs), noise), strict=True):
         rejection_reason: MarkerRejection | None = None
@@ -458,4 +470,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""Method for flat markers that belongs to a method for round ones."""
+"""For each method that refines round markers, the one that refines flat markers.  Methods without
+an entry do not detect flat markers."""

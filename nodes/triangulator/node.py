@@ -1,4 +1,4 @@
-"""Turn stereo image pairs into a tracked fingertip."""
+"""Track the fingertip in stereo image pairs."""
 
 from __future__ import annotations
 
@@ -43,17 +43,18 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 PREDICTION_STEP_S = 0.01
-"""Time between the points of the predicted path: ten per period of a 10 Hz tremor."""
+"""Time between the points of the predicted path, a tenth of the period of a 10 Hz tremor."""
 
 TIMEOUT_PERIODS = 2.5
-"""Minimum timeout of a track in periods of the camera: one image pair may be missed."""
+"""Minimum timeout of a track in periods of the camera, so that one image pair may be missing."""
 
 
 class Triangulator(Node):
     """Node that detects the fingertip in each stereo pair and tracks it.
 
-    The marker is tracked. The fingertip is the pad's contact point, a constant distance from it,
-    since the cameras do not see how the finger turns.
+    The marker on the finger is tracked. The fingertip is the point of the finger's pad that touches
+    the sheet. Its offset from the marker is constant, since the cameras cannot see the finger's
+    rotation.
     """
 
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
@@ -126,7 +127,7 @@ class Triangulator(Node):
         self._restart(self.epoch)
 
     def _adapt_timeout(self, source_ns: int) -> None:
-        """Let a track outlast a missed image pair at the camera's measured rate."""
+        """Adapt the track's timeout to the measured camera rate, so that one pair may be lost."""
         timeout_s = max(
             self.parameters.track_timeout_s, TIMEOUT_PERIODS * self._period.add(source_ns)
         )
@@ -139,7 +140,7 @@ class Triangulator(Node):
             return
         check_images(pair, self.geometry)
         at_ns = header.source_ns
-        if header.epoch != self.epoch:  # the camera has restarted, and its clock with it
+        if header.epoch != self.epoch:  # The camera has restarted, so its times start again.
             self._restart(header.epoch)
         self._adapt_timeout(at_ns)
         detect_pair = partial(
@@ -166,7 +167,7 @@ class Triangulator(Node):
             self.reasons[reason] += 1
             self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
         if reason == "ok" and self.association.is_clutter_search_due(at_ns):
-            # After publishing, since nothing waits for this search.
+            # Search after publishing, since no other node waits for the clutter.
             found = detect_pair(gate=None)
             others = self._check.exclude_marks(found, tracked=False)
             self.association.track_clutter(at_ns, others)

@@ -17,65 +17,71 @@ class TriangulatorParameters(NodeParameters):
 
     calibration: CameraCalibrationFile | None = Field(
         default=None,
-        description="file of `flexsheet calibrate stereo`; null takes the scene's optics",
+        description="calibration file from `flexsheet calibrate stereo`; null: the optics in the "
+        "scene",
     )
     marker_calibration: MarkerCalibrationFile | None = Field(
         default=None,
-        description="file of `flexsheet calibrate marker`; null takes the scene's "
+        description="calibration file from `flexsheet calibrate marker`; null: the scene's "
         "finger.marker_from_pad_m",
     )
     marker: MarkerMethod | Literal["auto"] = Field(
         default="auto",
-        description="refinement of the marker's centre; auto takes the scene's method, else "
+        description="method that refines the marker's centre; auto: the scene's method, else "
         "subpixel_fit",
     )
     triangulation: TriangulationMethod | Literal["auto"] = Field(
-        default="auto", description="triangulation method; auto takes the scene's method, else dlt"
+        default="auto", description="triangulation method; auto: the scene's method, else dlt"
     )
     marker_noise_px: Positive | None = Field(
         default=None,
-        description="standard deviation of a marker's centre; null takes the method's estimate",
+        description="standard deviation of a marker's centre, px; null: the method's estimate",
     )
     marker_radius_m: Positive = Field(
-        default=0.003, description="true radius of the marker, a ball or a flat disc"
+        default=0.003, description="true radius of the marker (ball or flat disc), m"
     )
     max_reprojection_px: Positive = Field(
-        default=1.5, description="maximum reprojection error of a marker pair"
+        default=1.5, description="maximum reprojection error of a triangulated marker, px"
     )
     marker_min_contrast: Positive = Field(
-        default=60.0, description="minimum height of a marker above its surroundings, levels of 255"
+        default=60.0, description="minimum contrast of a marker, grey levels above its surroundings"
     )
     marker_min_area_px: Annotated[int, Field(ge=1)] = Field(
-        default=4, description="minimum number of pixels of a marker"
+        default=4, description="minimum area of a marker in an image, pixels"
     )
     marker_max_area_px: Annotated[int, Field(ge=1)] = Field(
-        default=1500, description="maximum number of pixels of a marker"
+        default=1500, description="maximum area of a marker in an image, pixels"
     )
     window_half_px: Annotated[int, Field(ge=8)] = Field(
-        default=16, description="half the side of the smallest search window"
+        default=16, description="half the side of the smallest search window, px"
     )
     tracking: TrackingMethod | Literal["auto"] = Field(
         default="auto",
-        description="filter of the fingertip; auto takes the scene's method, else adaptive",
+        description="tracking method that filters and predicts the fingertip; auto: the scene's "
+        "method, else adaptive",
     )
     max_acceleration_m_per_s2: Positive = Field(
-        default=60.0, description="maximum acceleration of a finger; faster points are rejected"
+        default=60.0,
+        description="maximum acceleration of a finger, m/s^2; points beyond it are rejected",
     )
     track_timeout_s: Positive = Field(
         default=0.1,
-        description="maximum time without a point before the track is lost; at least 2.5 frames",
+        description="maximum time without a point before the track is lost, s; at least 2.5 camera "
+        "periods are used",
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
-        default=3, description="number of consecutive consistent points that start a track"
+        default=3, description="number of consecutive points that are needed to start a track"
     )
-    prediction_horizon_s: Positive = Field(default=0.12, description="length of the predicted path")
+    prediction_horizon_s: Positive = Field(
+        default=0.12, description="duration of the predicted path, s"
+    )
     reference_marks_world_m: tuple[tuple[Finite, Finite, Finite], ...] = Field(
         default=(),
-        description="positions of fixed marks that look like the finger's marker, for the "
-        "self-check of the camera's pose",
+        description="world positions, m, of fixed marks that look like the finger's marker, to "
+        "check the camera's pose",
     )
     touch_point_world_m: tuple[Finite, Finite, Finite] | None = Field(
         default=None,
-        description="position of the fingertip when it rests at a known point, for the self-check "
-        "of the marker's offset",
+        description="world position, m, of a known point at which the fingertip may rest, to check "
+        "the marker's offset",
     )

@@ -1,9 +1,9 @@
 """Check the stereo camera and the marker by residuals of triangulated points.
 
-Three residuals are independent of each other.  The reprojection error shows a motion of one camera
-against the other.  Fixed reference marks show a motion of the whole stereo camera.  A finger that
-rests at a known point shows an offset of its marker, after the shift of the reference marks has
-been subtracted.
+There are three independent residuals.  The reprojection error shows that one camera has moved
+relative to the other.  The position of fixed reference marks shows that the whole stereo camera has
+moved.  The position of a finger that rests at a known point, less the shift of the reference marks,
+shows that the marker has moved on the finger.
 """
 
 from __future__ import annotations
@@ -22,31 +22,35 @@ from flexsheet.nodes.triangulator.fingertip import StereoDetection
 Floats = NDArray[np.float64]
 
 REPROJECTION_THRESHOLD_PX = 0.2
-"""Mean reprojection error.  A calibration leaves 0.024 px, uncalibrated drift of the right camera
-(0.2 mrad) some 0.1 px; 1 mm of vertical shift at half a metre causes 0.5 px."""
+"""Maximum mean reprojection error.  It is 0.024 px after a calibration, and about 0.1 px after the
+right camera has drifted by 0.2 mrad.  A vertical shift of one camera by 1 mm, with the finger at
+half a metre, causes 0.5 px."""
 
 MARK_THRESHOLD_M = 6e-4
-"""Shift of the reference marks.  After a calibration (docs/apparatus.md) it has 0.12 mm of standard
-deviation per axis, so that five are allowed."""
+"""Maximum shift of the reference marks, five standard deviations.  The standard deviation per axis
+is 0.12 mm after a calibration (docs/apparatus.md)."""
 
 MARKER_THRESHOLD_M = 1.5e-3
-"""Distance of a resting finger from the known point: 0.3 mm of calibrated marker offset per axis,
-0.12 mm of the camera and 0.1 mm of noise; more than four standard deviations per axis."""
+"""Maximum distance of a resting finger from the known point, more than four standard deviations.
+Per axis, these are 0.3 mm from the calibrated marker offset, 0.12 mm from the camera and 0.1 mm of
+noise."""
 
 MARK_RADIUS_M = 0.008
 TOUCH_RADIUS_M = 0.012
-"""Distances within which a point is the reference mark, and a finger is at the known point."""
+"""Maximum distance of a detected point from the reference mark that it is taken for, and of a
+finger that is considered to be at the known point."""
 
 STILL_S = 0.7
 STILL_M = 2.5e-4
-"""Time and standard deviation of a finger at rest.  A finger that hovers moves more."""
+"""A finger is at rest if its standard deviation over this time is below this limit.  A finger that
+hovers moves more."""
 
 
 class CameraCheck:
     """Self-checks of the stereo camera and of the marker.
 
     reference_marks: world positions (n, 3) m of fixed marks that look like the finger's marker.
-    touch_point: world position (3,) m of the fingertip when it rests at the known point, or None.
+    touch_point: world position (3,) m of the known point, or None.
     """
 
     def __init__(self, reference_marks: Floats, touch_point: Floats | None) -> None:
@@ -57,7 +61,7 @@ class CameraCheck:
         self._resting: deque[tuple[int, Floats]] = deque()
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Add the positions (3,) of all marks beside the finger's in an image pair."""
+        """Check the reference marks with the positions (3,) m of all markers in an image pair."""
         if not len(self._marks) or not points:
             return
         found = np.stack(points)
@@ -67,13 +71,13 @@ class CameraCheck:
         rows = np.arange(len(self._marks))
         seen = distances[rows, nearest] <= MARK_RADIUS_M
         if seen.any():
-            # A moved camera shifts all marks; a median ignores one mark that has moved alone.
+            # A moved camera shifts all marks.  The median ignores a single mark that has moved.
             self._camera.add(np.median(offsets[rows, nearest][seen], axis=0), at_ns)
 
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
         """Return a detection without the reference marks, which must not compete with the finger.
 
-        tracked: whether the search had a gate; a marker in the gate is then the finger's.
+        tracked: whether the finger was searched in a gate, so that a marker there is the finger's.
         """
         if not len(self._marks):
             return detection
@@ -87,7 +91,7 @@ class CameraCheck:
         return bool((np.linalg.norm(self._marks - point, axis=1) <= MARK_RADIUS_M).any())
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
-        """Add a triangulated fingertip (3,) with its reprojection error."""
+        """Add the triangulated marker (3,) m of the finger with its reprojection error."""
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:
             return
@@ -106,7 +110,7 @@ class CameraCheck:
         self._marker.add(offset - shift, at_ns)
 
     def results(self) -> tuple[SelfCheck, ...]:
-        """Return the checks that have data."""
+        """Return the results of those checks for which there is data."""
         found = []
         if self._reprojection.has_data:
             found.append(

@@ -1,4 +1,4 @@
-"""Compensate the motion between two exposures of cameras without a common trigger."""
+"""Compensate the finger's motion between the exposures of two cameras without a common trigger."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def compensate_skew(
     velocity: Floats,
     velocity_covariance: Floats,
 ) -> TriangulatedPoint:
-    """Return the point (3,) at the middle between both exposures.
+    """Correct a triangulated point to the mean time of both exposures.
 
-    skew_s: time of the right exposure after the left one.
+    skew_s: time of the right exposure minus that of the left one.
     velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
 
-    To first order, a finger with velocity v is measured with the error M v, M = s (A_r J_r - 1/2).
-    J_r is the Jacobian of the right pixel, and A_r the derivative of the point by that pixel.
-    The error is mostly in depth: speed times skew times depth over baseline.  The uncertainty of v
-    adds to the covariance.
+    To first order, a finger with velocity v is measured with the error M v, M = s (A_r J_r - I/2).
+    Here s is the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the
+    triangulated point with respect to that pixel.  The error is mostly in depth, with the size
+    speed * skew * depth / baseline.  The uncertainty of v is added to the covariance.
     """
     world = geometry.world_from_left[:3, :3]
     in_left = geometry.left_from_world[:3, :3] @ measured.point_world
@@ -59,7 +59,7 @@ def compensate_detection_skew(
     velocity: Floats,
     velocity_covariance: Floats,
 ) -> StereoDetection:
-    """Compensate the skew of all detections with the finger's velocity; see `compensate_skew`."""
+    """Apply `compensate_skew` to all detections of an image pair, with the finger's velocity."""
 
     def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:
         return compensate_skew(measured, geometry, skew_s, velocity, velocity_covariance)

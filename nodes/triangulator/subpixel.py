@@ -1,21 +1,23 @@
 """Estimate a marker's centre by maximum likelihood: fit a motion-blurred disc to its pixels.
 
-The image of a marker is a uniform disc on a background with a constant gradient (ground).  The
-lens, the pixel's area and the motion during the exposure blur it.  The level at a distance d
-outside its edge is
+The image of a marker is a uniform disc on a background with a constant gradient, called ground.
+The lens, the pixel's area and the motion during the exposure blur it.  With the distance d of a
+pixel outside the disc's edge, its grey level is
 
-    level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur),
+    level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur).
 
-with Phi the normal cumulative distribution.  A Gauss-Newton method fits all parameters at once,
-with each pixel weighted by its noise.  The inverse of the Fisher information is the covariance of
-the result, which is the Cramer-Rao bound for images that follow the model.  For other images, the
-odd part of the residuals increases the covariance.
+Here ground and marker are grey levels, S is the fraction of the pixel that the disc covers, and Phi
+is the normal cumulative distribution.  A Gauss-Newton method fits all parameters at once, with each
+pixel weighted by its noise.  The covariance of the result is the inverse of the Fisher information,
+the Cramer-Rao bound for images that follow the model.  For other images it is increased by the part
+of the residuals that is odd (antisymmetric) about the centre.
 
-A flat marker that is seen at an angle is an ellipse.  `fit_ellipses` fits two more parameters, its
-elongation, with the exact image of `ellipse`; it leaves the motion out.
+A flat marker that is seen at an angle is an ellipse.  `fit_ellipses` fits its elongation, two
+parameters, in place of the motion; the module `ellipse` gives its exact image.
 
-The image's derivatives by centre and slopes are odd functions about the centre, all others even.  A
-wrong radius, blur, level or motion therefore changes the covariance, but not the centre.
+The derivatives of the image with respect to the centre and the ground's gradient are odd about the
+centre; all others are even.  A wrong radius, blur, level or motion therefore changes only the
+covariance, not the centre.
 """
 
 from __future__ import annotations
@@ -37,63 +39,65 @@ X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range
 STILL_PARAMETERS = 8
 ELONGATION = slice(8, 10)
 ELLIPSE = [X, Y, RADIUS, BLUR, 8, 9]
-"""Parameters of an ellipse: its elongation replaces the motion."""
+"""Indices of an ellipse's shape parameters; its elongation takes the place of the motion."""
 
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-"""Parameters whose image derivative is odd about the disc's centre."""
+"""1 for each parameter for which the derivative of the image is odd about the disc's centre."""
 
 WHITE = 255
 MARGIN_PX = 3.0
 MIN_MARGIN_PX = 1.25
 MARGIN_PER_MOTION = 0.5
-"""Width of the surroundings in the fit: enough to estimate the ground, without the finger's edge,
-which is not a uniform slope.  Motion brings that edge nearer."""
+"""Width of the surroundings that the fit uses.  They suffice to estimate the ground, but exclude
+the finger's edge, where the ground is not linear.  A moving marker comes closer to that edge, so
+its margin is reduced by MARGIN_PER_MOTION times the motion, at most to MIN_MARGIN_PX."""
 
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""Inverse prior variances of the start.  They only matter where pixels carry no information, as for
-the level of a saturated marker."""
+"""Inverse variances of the parameters' starting values.  They matter only where the pixels contain
+no information, as for the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
-"""Bounds of radius and blur, px."""
+"""Bounds on radius and blur, px."""
 
 MAX_ELONGATION = 0.6
 START_ELONGATION = 0.45
-"""Maximum elongation of an ellipse over its radius, and that of a start.  The axis ratio is at
-least a quarter."""
+"""Maximum ratios of an ellipse's elongation to its radius: in the fit, and for the starting value.
+The ratio of the minor to the major axis is then at least a quarter."""
 
 ELLIPSE_BLUR_PX = 0.8
-"""Blur at the start of an ellipse's fit; the spread of the light depends on the elongation."""
+"""Starting value of the blur of an ellipse.  The blob's spread gives no estimate of it, because it
+also depends on the elongation."""
 
 MOTION_STEP_PX = 1.8
-"""Maximum step of the sum over the motion."""
+"""Maximum distance between the positions over which a moving disc is averaged."""
 
 MIN_MOTION_PX = 2.0
-"""Minimum motion to fit; a shorter one cannot be distinguished from blur."""
+"""Minimum motion that is fitted; a shorter one cannot be distinguished from blur."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""Maximum last steps of centre, radius and blur.  The remaining error is the step's square over the
-blur, less than a thousandth of a pixel."""
+"""The fit has converged if its last steps of centre (x, y), radius and blur are below these values.
+The remaining error is about the squared step divided by the blur: less than 0.001 px."""
 
 CONVERGED_ELONGATION_PX = 0.05
-"""Maximum last step of an ellipse's elongation."""
+"""The fit of an ellipse has converged if its last step of the elongation is below this value."""
 
 MAX_STEP_PX = 0.7
 MAX_SHIFT_PX = 2.0
-"""Bounds on one step, and on the centre's distance from its start."""
+"""Maximum change of a parameter in one step, and of the centre in the whole fit."""
 
 MIN_VARIANCE_RATIO = 0.7
-"""Lower bound on the noise estimated from residuals, as a fraction of the sensor model's."""
+"""Minimum ratio of the noise variance estimated from the residuals to that of the sensor model."""
 
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
-    """Noise of a sensor: the variance of a level L is read_levels^2 + L / photons_per_level."""
+    """Noise of a sensor: a grey level L has the variance read_levels^2 + L / photons_per_level."""
 
     read_levels: float = 1.5
     photons_per_level: float = 40.0
@@ -101,7 +105,10 @@ class PixelNoise:
 
 @dataclass(frozen=True, slots=True)
 class DiscStart:
-    """Start of a fit: centre (x, y), radius, blur and motion (x, y) in px; both levels."""
+    """Starting values of a fit: centre (x, y), radius, blur and motion (x, y), px.
+
+    marker, ground: grey levels of the disc and of the background.
+    """
 
     centre: tuple[float, float]
     radius: float
@@ -113,15 +120,15 @@ class DiscStart:
 
 @dataclass(frozen=True, slots=True)
 class DiscFit:
-    """Fitted disc.
+    """Fitted disc or ellipse.
 
     centre: (2,) px with covariance (2, 2) px^2.
     radius, blur, motion: px; motion is (x, y).  The radius of an ellipse is the mean semi-axis.
-    elongation: (e, f) px of an ellipse, see `ellipse`.
-    height: levels between ground and marker.
-    misfit: root mean square of the residuals beyond noise, as a fraction of the height.
-    odd_misfit: the same of the residuals' odd part about the centre.
-    converged: whether the fit converged to a disc.
+    elongation: (e, f) px of an ellipse; see the module `ellipse`.
+    height: difference of the grey levels of marker and ground.
+    misfit: root mean square residual in excess of the noise, as a fraction of the height.
+    odd_misfit: as misfit, but for the part of the residuals that is odd about the centre.
+    converged: whether the fit converged to a disc that is brighter than the ground.
     """
 
     centre: Floats
@@ -137,7 +144,7 @@ class DiscFit:
 
 
 RenderDiscs = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
-"""Function that renders discs; see `_render_disc`."""
+"""Function that renders images of discs and their derivatives; see `_render_disc`."""
 
 
 def fit_discs(
@@ -145,8 +152,8 @@ def fit_discs(
 ) -> list[DiscFit]:
     """Fit one disc in each image (height, width), all in the same array operations.
 
-    Pixels outside the image and outside the disc's surroundings are excluded.  A white pixel is
-    used only while the model is darker.
+    Pixels outside the image and outside the disc's surroundings are excluded.  A saturated (white)
+    pixel is used only in iterations in which the model is darker than it.
     """
     if not starts:
         return []
@@ -165,10 +172,10 @@ def fit_discs(
 def fit_ellipses(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one ellipse at rest in each image; otherwise as `fit_discs`.
+    """Fit one ellipse at rest in each image, as `fit_discs` fits discs.
 
-    The motion of a start is that of a round disc with the same second moments.  Each ellipse is
-    fitted alone, because the time grows with the third power of its size.
+    Starting values describe a moving disc; the ellipse starts with the same second moments.  Each
+    ellipse is fitted alone, because the time grows with the third power of its size.
     """
     found = []
     for image, one in zip(images, starts, strict=True):
@@ -205,14 +212,14 @@ def _fit(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> list[DiscF
 
 @dataclass(frozen=True, slots=True)
 class DiscSolution:
-    """Result of the Gauss-Newton iteration, and the residuals of its last image.
+    """Result of the Gauss-Newton iteration for n discs in cut-outs of s x s pixels.
 
     found: (n, parameters) after the last step.
-    residuals: (n, s s).
-    weights: (n, s s), zero for excluded pixels.
-    information: (n, parameters, parameters).
-    gains: (n, parameters), first-order reduction of the weighted squared residuals by the last
-        step.
+    residuals: (n, s s), image minus model before the last step.
+    weights: (n, s s), inverse noise variances of the pixels, zero for excluded pixels.
+    information: (n, parameters, parameters), Fisher information plus prior.
+    gains: (n, parameters), reduction of the weighted squared residuals by the last step of each
+        parameter, to first order.
     """
 
     found: Floats
@@ -224,7 +231,10 @@ class DiscSolution:
 
 
 def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolution:
-    """Return the most likely parameters (n, parameters) of the discs or ellipses."""
+    """Find the most likely parameters of n discs or ellipses by the Gauss-Newton method.
+
+    start: (n, parameters) starting values.
+    """
     prior_weights = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(prior_weights)
     found, converged, used = start.copy(), False, cutouts.weights
@@ -253,10 +263,11 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
 
 
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
-    """Return per fit: weighted squared residuals, number of pixels, sum of weights, variance ratio.
+    """Return for each fit: weighted squared residuals, number of pixels, sum of weights, and ratio.
 
-    The variance ratio is the variance of the odd part of the residuals over the sensor's.  Only
-    this part, the difference of pixels mirrored about the centre, affects the centre.
+    The ratio is that of the variance of the residuals' odd part to the variance of the sensor
+    noise.  The odd part is the difference of pixels that are mirrored about the centre.  No other
+    part affects the fitted centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -279,12 +290,12 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 
 @dataclass(frozen=True, slots=True)
 class DiscCutouts:
-    """Square cut-outs of n images, s x s pixels, each around the start of a disc.
+    """Square cut-outs of n images, s x s pixels, each around the starting centre of a disc.
 
     corners: column and row of each cut-out's first pixel, the origin of its coordinates.
     offsets: starting centres in these coordinates.
-    levels, weights: (n, s s).
-    x, y: coordinates (n, 1, s) and (n, s, 1).
+    levels, weights: (n, s s), grey levels of the pixels, and inverses of their noise variances.
+    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
     white: (n, s s), whether a pixel is saturated; None if no pixel is.
     """
 
@@ -300,7 +311,7 @@ class DiscCutouts:
 def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
-    """Cut out the pixels of the fits; outside the image their weight is zero."""
+    """Cut out the pixels around each disc; pixels outside the image get the weight zero."""
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
         one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
@@ -353,9 +364,11 @@ def _cut_out_discs(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render discs: levels (n, s s) and their derivatives (n, parameters, s s).
+    """Render discs; return grey levels (n, s s) and their derivatives (n, parameters, s s).
 
-    x: (1, 1, s), y: (1, s, 1).  A moving disc is the mean over k positions: (n, k, s, s).
+    found: (n, parameters) of the discs.  x, y: coordinates of pixels, (1, 1, s) and (1, s, 1).
+
+    A moving (motion-blurred) disc is averaged over k positions, in arrays (n, k, s, s).
     """
     count, parameters = found.shape
     moving = parameters > STILL_PARAMETERS
@@ -399,7 +412,7 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render ellipses as `_render_disc` does: levels (n, s s), derivatives (n, parameters, s s)."""
+    """Render ellipses; return the same arrays as `_render_disc`."""
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
     columns = found.T[:, :, None]
@@ -416,18 +429,18 @@ def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats
 
 
 def _elongation(start: DiscStart) -> tuple[float, float]:
-    """Return the elongation (e, f) of an ellipse with the second moments of a moving disc."""
+    """Return the elongation (e, f), px, of the ellipse with a moving disc's second moments."""
     length = math.hypot(*start.motion)
     if length == 0.0:
         return 0.0, 0.0
-    # The variance along the motion exceeds the one across by length^2 / 12; a disc's is a^2 / 4.
+    # Motion adds length^2 / 12 to the variance along it; an ellipse's semi-axis a gives a^2 / 4.
     excess_px = min(length**2 / (12.0 * start.radius), START_ELONGATION * start.radius)
     cosine, sine = start.motion[0] / length, start.motion[1] / length
     return excess_px * (cosine**2 - sine**2), 2.0 * excess_px * cosine * sine
 
 
 def _bound_elongation(found: Floats) -> None:
-    """Limit the elongations of ellipses (n, parameters) in place."""
+    """Limit the elongations of ellipses to MAX_ELONGATION, in the array (n, parameters) itself."""
     elongation = found[:, ELONGATION]
     length = np.maximum(np.hypot(*elongation.T), 1e-12)
     elongation *= np.minimum(MAX_ELONGATION * found[:, RADIUS] / length, 1.0)[:, None]
@@ -442,8 +455,9 @@ def _make_fit(
     is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of a fit; residuals beyond noise increase its covariance.
+    """Make the result of one fit; its covariance increases if residuals exceed the noise.
 
+    found: fitted parameters.  corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness
@@ -458,7 +472,8 @@ def _make_fit(
     return DiscFit(
         centre=np.array([corner[0] + x, corner[1] + y]),
         covariance=covariance * max(ratio, MIN_VARIANCE_RATIO),
-        # Blur shifts a round edge inwards by blur^2 / 2 radius; an ellipse's image is exact.
+        # In the disc model, blur makes the radius too small by blur^2 / (2 radius).  The model of
+        # an ellipse is exact.
         radius=radius if is_ellipse else radius + 0.5 * blur * blur / radius,
         blur=blur,
         motion=motion,

@@ -1,6 +1,7 @@
-"""Decide which measured points enter the track: gating, late points, loss and track initiation.
+"""Decide which measured points belong to the finger's track, and when a track starts or is lost.
 
-The filter in `flexsheet.nodes.triangulator.filters` estimates the motion from these points.
+A track is the sequence of accepted points.  A filter (module `filters` or `adaptive`) estimates the
+motion from them.  The gate is the region in which the next point is expected.
 """
 
 from __future__ import annotations
@@ -18,19 +19,20 @@ Floats = NDArray[np.float64]
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
 """Result for a measured point.
 
-ok: added to the track.  too_fast: faster than a finger.  unconfirmed: may start a track, or arrived
-late and corrected the track.
+ok: added to the track.  too_fast: farther away than a finger can move.  unconfirmed: the point may
+start a track, or arrived late; a late point is inserted into the track or dropped.
 """
 
 GATE_SIGMAS = 5.0
-"""Size of the gate beyond a finger's motion, in standard deviations of the errors."""
+"""Margin of the gate for measurement and prediction errors, in their standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
     """Settings of the tracker.
 
-    max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger; faster points are rejected.
+    max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion.  Points outside these
+        limits are rejected.
     track_timeout_s: maximum time without a point before the track is lost.
     confirm_frames: number of consecutive consistent points that start or replace a track.
     history_s: maximum age of a late point that can be inserted.
@@ -45,7 +47,7 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """Measured point (3,) m with its covariance (3, 3) m^2."""
+    """Measured marker position (3,) m at a time, with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
@@ -60,22 +62,22 @@ class PositionMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Ball around the predicted point (3,) m in which the finger is expected."""
+    """Ball around the predicted point (3,) m in which the finger's marker is expected."""
 
     point: Floats
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether a measured point can be the finger's, allowing for its noise."""
+        """Return whether a measured point can be the finger's marker, allowing for its noise."""
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
 
 @dataclass(frozen=True, slots=True)
 class TrackPrediction:
-    """State of the finger at one time, and its predicted path (n, 3) m.
+    """Predicted state of the tracked point at one time, and its predicted path (n, 3) m.
 
-    covariance: (6, 6) of position (3,) m and velocity (3,) m/s.
+    covariance: (6, 6), joint covariance of position (3,) m and velocity (3,) m/s.
     """
 
     position: Floats
@@ -85,11 +87,11 @@ class TrackPrediction:
 
 
 INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
-"""Covariance (m, m/s) before the first detection."""
+"""Covariance of position (m) and velocity (m/s) that is reported before the first detection."""
 
 
 class Tracker:
-    """Tracker of one finger that gates the measured points."""
+    """Tracker of one finger, which accepts or rejects measured points and predicts the motion."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
@@ -107,7 +109,7 @@ class Tracker:
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Return the state of the track at a time not before its newest point."""
+        """Return the state of the track at a time that is not earlier than its newest point."""
         if not self._is_alive(at_ns):
             return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
@@ -116,7 +118,7 @@ class Tracker:
     def gate(self, at_ns: int) -> Gate | None:
         """Return the gate at a time after the newest point.
 
-        Return None without a track and for times before its newest point.
+        Return None if there is no track, or if the time is not after its newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
@@ -131,16 +133,17 @@ class Tracker:
         acceleration_m = 0.5 * self.settings.max_acceleration_m_per_s2 * dt * dt
         travel_m = self.settings.max_speed_m_per_s * dt
         offset_m = float(np.linalg.norm(point - measurement.measured))
-        # Both the acceleration limit and the speed limit bound the motion: take the smaller bound.
+        # Acceleration limit and speed limit both bound the motion, so use the smaller distance.
         radius_m = min(acceleration_m + GATE_SIGMAS * float(sigma), travel_m + offset_m)
         return Gate(
             point, radius_m + GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict the finger from a time not before the newest point.
+        """Predict position, velocity and path at a time that is not before the newest point.
 
-        A lost finger is predicted to stay at its last position.
+        horizons_s: (n,) times of the path's points after `at_ns`.  The first must be 0.
+        If the track is lost, the predicted finger stays at its last position.
         """
         estimate = self.estimate
         if estimate is None:
@@ -157,14 +160,17 @@ class Tracker:
         return TrackPrediction(ahead[0], velocity, covariance, ahead)
 
     def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
-        """Return the finger's velocity (3,) m/s and its covariance (3, 3); zero without a track."""
+        """Return the velocity (3,) m/s and its covariance (3, 3); without a track it is zero."""
         if self.estimate is None or not self._is_alive(at_ns):
             return np.zeros(3), np.eye(3) * (self.settings.max_speed_m_per_s / 3.0) ** 2
         _, velocity, covariance = self.filter.moments(self.estimate)
         return velocity, covariance[3:, 3:]
 
     def update(self, at_ns: int, measured: Floats, covariance: Floats) -> GateResult:
-        """Add a measured point (3,), covariance (3, 3), to the track if the gate accepts it."""
+        """Add a measured point (3,) m to the track if it is inside the gate.
+
+        covariance: (3, 3) m^2 of the point's noise.
+        """
         measurement = PositionMeasurement(at_ns, measured, covariance)
         if self.is_late(at_ns):
             return self._insert_late(measurement)
@@ -200,7 +206,10 @@ class Tracker:
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track, which replaces the track once it is confirmed."""
+        """Add a point to the tentative track, which replaces the track once it is long enough.
+
+        unconfirmed_result: result to return until then.
+        """
         self._tentative_track = self._consistent_run(self._tentative_track, measurement)
         if len(self._tentative_track) < self.settings.confirm_frames:
             return unconfirmed_result
@@ -209,7 +218,7 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to consecutive points, or restart them if one finger cannot reach it."""
+        """Append a point to a sequence; start a new one if the finger cannot have moved there."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
@@ -227,9 +236,9 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter the later points again.
 
-        Several late points in a row mean that the clock has stepped back, so that the track
-        restarts with them.  A late point is dropped if it is older than the history, a duplicate,
-        outside a gap in the history, or outside the gate.
+        Several late points in a row mean that the clock was set back, so the track restarts with
+        them.  A late point is dropped if it is older than the history or a duplicate.  It is also
+        dropped if no point is missing at its time, or if it is outside the gate.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:
@@ -250,7 +259,7 @@ class Tracker:
         return "unconfirmed"
 
     def _is_missing_between(self, previous: int, after: int) -> bool:
-        """Return whether a point is missing between two points of the track."""
+        """Return whether the time between two points (indices) shows that one is missing."""
         times_ns = np.array([entry[0].at_ns for entry in self._history])
         usual_ns = float(np.median(np.diff(times_ns)))
         return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns

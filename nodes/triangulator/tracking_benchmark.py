@@ -16,27 +16,31 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, meas
 
 Floats = NDArray[np.float64]
 TruePath = Callable[[float], Floats]
-"""Function that returns the true fingertip (3,) m in the world at a time, s."""
+"""Function that returns the true fingertip (3,) m in the world at a given time, s."""
 
 MARKER_NOISE_PX = 0.01
-"""Noise of a marker's centre by the subpixel fit, at half a metre (`flexsheet chart marker`)."""
+"""Standard deviation of a marker's centre, found by the subpixel fit at a distance of half a metre
+(`flexsheet chart marker`)."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""Prediction horizons: at the exposure, for the image, and for the arms with their servo lag."""
+"""Prediction horizons after the exposure: none, until the image is displayed, and until the arms
+have moved, which includes their servo lag."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""Factor on the scene's speed that allows for tremor and acceleration."""
+"""A path belongs to the scene if its speed is at most this factor times the scene's speed.  The
+factor allows for tremor and acceleration."""
 WITHOUT_VELOCITY = ("none",)
-"""Methods whose range is a resting finger; without a horizon it includes a moving one."""
+"""Methods that estimate no velocity.  They may be used for a resting finger, and for a moving one
+only without prediction."""
 
 
 @dataclass(frozen=True, slots=True)
 class TruePathCase:
-    """True path of a finger from time 0.
+    """True path of a finger, starting at time 0.
 
-    resting: whether the finger moves only by tremor.
+    resting: whether the finger has no motion except tremor.
     """
 
     path: TruePath
@@ -45,7 +49,7 @@ class TruePathCase:
 
     @property
     def speed_m_per_s(self) -> float:
-        """Return the speed that the path exceeds for a tenth of the time, m/s."""
+        """Return the speed, m/s, that the finger exceeds during a tenth of the time."""
         times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
         points = np.array([self.path(float(time)) for time in times])
         distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -54,9 +58,9 @@ class TruePathCase:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """Measured path: times (n,) ns, points (n, 3), covariances (n, 3, 3).
+    """Simulated measurements of a path: times (n,) ns, points (n, 3) m, covariances (n, 3, 3) m^2.
 
-    truth: true points (n, 3) by prediction horizon.
+    truth: for each prediction horizon, the true points (n, 3) m at the predicted times.
     """
 
     times_ns: NDArray[np.int64]
@@ -68,7 +72,7 @@ class MeasuredPath:
 def measure_path(
     scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
 ) -> MeasuredPath:
-    """Simulate the measurement of a path with the scene's rig: triangulate markers with noise."""
+    """Simulate how the scene's stereo camera measures a path: triangulate markers with noise."""
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
     covariance_px = noise_px**2 * np.eye(2)
@@ -97,7 +101,10 @@ def measure_path(
 
 
 def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Floats:
-    """Return the filter's prediction (n, 3) at the horizon after each measurement."""
+    """Run a filter over a measured path; return its predictions (n, 3) m at a horizon.
+
+    There is one prediction for each measurement.
+    """
     horizons, predicted = np.array([horizon_s]), np.empty_like(seen.points)
     estimate: Estimate | None = None
     for i, at_ns in enumerate(seen.times_ns.tolist()):
@@ -114,7 +121,11 @@ def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Float
 def make_tracking_family(
     motions: Callable[[Scene], Mapping[str, TruePathCase]], noise_px: float = MARKER_NOISE_PX
 ) -> Family:
-    """Make the method family from true paths by name; noise_px: of a marker's centre."""
+    """Make the family of tracking methods for the benchmark.
+
+    motions: function that returns the true paths by name, for a scene.
+    noise_px: standard deviation of a marker's centre.
+    """
 
     def trials(scene: Scene) -> Iterator[Trial]:
         for name, motion in motions(scene).items():
@@ -144,7 +155,10 @@ def make_tracking_family(
 def _trial(
     scene: Scene, method: str, case: Case, seen: MeasuredPath, horizon_s: float, *, in_range: bool
 ) -> Trial:
-    """Make a trial that times one update with its prediction; its error excludes the warm-up."""
+    """Make a trial that measures the time of one update with its prediction, and the error.
+
+    The error is that of predictions at one horizon, without those in the first WARM_UP_S.
+    """
     filter_ = TRACKING_METHODS[method](scene.finger.max_speed_m_per_s)
     middle = len(seen.times_ns) // 2
     before = filter_.initialize(

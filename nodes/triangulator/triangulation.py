@@ -1,8 +1,8 @@
-"""Triangulate a marker from two images, with its covariance.
+"""Triangulate a marker from two images, and compute the covariance of its position.
 
-The methods take undistorted normalized coordinates (n, 2) of both views and `right_from_left`.
-They return points (n, 3) in the left camera's frame, m.  Parallel rays give infinite or NaN
-elements, which the caller must reject.
+A triangulation method takes undistorted normalized coordinates (n, 2) of both views and the
+transform `right_from_left`.  It returns points (n, 3) in the left camera's frame, m.  For parallel
+rays these contain infinite or NaN elements, which the caller must reject.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""Minimum slope of the distortion; below it the lens model maps two rays to one pixel."""
+"""Minimum determinant of the distortion's Jacobian.  Near zero, the lens model is not invertible:
+it maps two rays to one pixel."""
 
 MIN_SINE = 1e-6
-"""Minimum sine of the angle between two rays."""
+"""Minimum sine of the angle between two rays that are not considered parallel."""
 
 MAX_DISTANCE_M = 1e4
-"""Maximum distance of a point; beyond it the rays are parallel up to rounding."""
+"""Maximum depth of a point.  The rays to a more distant one are parallel within rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +53,10 @@ class StereoGeometry:
     def of(
         scene_camera: StereoCamera, calibration: StereoCalibration | None = None
     ) -> StereoGeometry:
-        """Make the geometry of the scene's rig, with the optics of a calibration if one is given.
+        """Make the geometry of the scene's stereo rig, with the optics of a calibration if given.
 
-        The rig's pose always comes from the scene.  Raises CalibrationMismatchError.
+        The pose of the rig is always taken from the scene.  Raises CalibrationMismatchError if the
+        calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
         if calibration is not None:
@@ -96,17 +98,17 @@ def _matrix(lens: Lens) -> Floats:
 
 
 class ImageMismatchError(FlexsheetError, ValueError):
-    """The images are of another device, or larger than the sensor of the scene's camera."""
+    """Error for images of another device, or larger than the sensor of the scene's camera."""
 
     code = "image-mismatch"
     remedy = "Set the camera in the scene to the one that took the images."
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
-    """Raise ImageMismatchError unless the images are of that rig, full or cropped."""
+    """Raise ImageMismatchError unless the images, full or cropped, can come from this rig."""
     if pair.device != geometry.device:
         raise ImageMismatchError(
-            f'images of device "{pair.device}"; expected the scene\'s camera "{geometry.device}"'
+            f'the images are of device "{pair.device}", but the scene has "{geometry.device}"'
         )
     views = (("left", pair.left, pair.left_origin_px), ("right", pair.right, pair.right_origin_px))
     for side, image, (column, row) in views:
@@ -114,17 +116,19 @@ def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
         inside = column >= 0 and row >= 0
         if not inside or column + width > geometry.width_px or row + height > geometry.height_px:
             raise ImageMismatchError(
-                f"{side} image of {width}x{height} px at column {column}, row {row}; the "
-                f"scene's camera {pair.device} has {geometry.width_px}x{geometry.height_px} px"
+                f"the {side} image has {width}x{height} px from column {column}, row {row}, but the"
+                f" scene's camera {pair.device} has {geometry.width_px}x{geometry.height_px} px"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ClosestApproach:
-    """Solver for the closest approach of two rays, with the rig as plain numbers.
+    """Solver for the closest approach of two camera rays.
 
-    rotation_rows: rows of the rotation left_from_right.
-    origin: of the right camera in the left camera's frame, m.
+    The geometry is stored as plain numbers, since these are faster than small arrays.
+
+    rotation_rows: rows of the rotation from the right to the left camera's axes.
+    origin: position of the right camera in the left camera's frame, m.
     """
 
     rotation_rows: tuple[tuple[float, float, float], ...]
@@ -143,6 +147,7 @@ class ClosestApproach:
     ) -> tuple[Floats, float] | None:
         """Return the midpoint (3,) of the shortest segment between two rays, and its length, m.
 
+        left, right: undistorted normalized coordinates (x, y) of the rays.
         Return None if the rays are parallel or the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
@@ -162,7 +167,7 @@ class ClosestApproach:
 
 
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
-    """Solve both projections by linear least squares in homogeneous form (direct linear transform).
+    """Triangulate by the direct linear transform: linear least squares in homogeneous form.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
@@ -181,9 +186,9 @@ TRIANGULATION_METHODS: dict[str, Triangulate] = {"dlt": dlt}
 def project_with_jacobian(
     point: Floats, matrix: Floats, distortion: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the pixel (2,) of a point (3,) in a camera's frame, and its Jacobian (2, 3) px/m.
+    """Return the pixel (2,) of a point (3,) m in a camera's frame, and its Jacobian (2, 3) px/m.
 
-    Plain numbers are ten times faster than arrays with two elements.
+    It computes with plain numbers, which are ten times faster than arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
@@ -230,7 +235,10 @@ def _intrinsics(matrix: Floats) -> tuple[float, float, float, float]:
 def _distort(
     x: float, y: float, distortion: list[float]
 ) -> tuple[float, float, float, float, float, float]:
-    """Apply Brown's distortion to one ray; return u, v, du/dx, du/dy, dv/dx, dv/dy."""
+    """Apply Brown's lens distortion to a ray (x, y); return u, v, du/dx, du/dy, dv/dx, dv/dy.
+
+    (u, v) are the distorted normalized coordinates.
+    """
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -248,10 +256,10 @@ def _distort(
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """Triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error px.
+    """Triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error, px.
 
-    The covariance is that of the marker centres, propagated to first order.  For nearly parallel
-    rays it grows with the fourth power of the depth, which allows to reject them.
+    The covariance of the marker's centres in both images is propagated to first order.  For nearly
+    parallel rays it grows with the fourth power of the depth, so that they can be rejected by it.
     """
 
     point_world: Floats
@@ -260,7 +268,7 @@ class TriangulatedPoint:
 
     @property
     def deviation_m(self) -> float:
-        """Return the square root of the total variance, m."""
+        """Return the square root of the variances' sum over the axes, m."""
         return float(np.sqrt(np.trace(self.covariance)))
 
 
@@ -273,11 +281,12 @@ def measure(
     left_covariance: Floats,
     right_covariance: Floats,
 ) -> TriangulatedPoint | None:
-    """Triangulate a marker from its two pixels (2,), with covariances (2, 2) px^2.
+    """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
     Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
-    the lens model.  The covariance weights both views equally, as the methods do: (J'J)^-1 J' with
-    the Jacobian J of the four pixel coordinates.
+    the range of the lens model.  Both views have equal weights, as in the triangulation methods.
+    Pixel errors are thus propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel
+    coordinates with respect to the point.
     """
     left = undistort_pixel(left_px, geometry.matrices[0], geometry.distortions[0])
     right = undistort_pixel(right_px, geometry.matrices[1], geometry.distortions[1])
@@ -296,7 +305,7 @@ def measure(
     )
     slope = np.concatenate((left_slope, right_slope @ rig[:3, :3]))
     is_regular, information = cv2.invert(slope.T @ slope)
-    if not is_regular:  # the rays are parallel up to rounding
+    if not is_regular:  # The rays are parallel within rounding errors.
         return None
     inverse = information @ slope.T
     world = geometry.world_from_left
