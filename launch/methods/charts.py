@@ -342,7 +342,7 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return for each method its largest median time, largest error and number of cases in range."""
+    """Return each method's largest median time, its largest error and number of cases in range."""
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):

@@ -1,4 +1,4 @@
-"""Choose methods with which the whole system meets its tolerances, confirmed by runs of the graph."""
+"""Choose methods with which the whole system meets its tolerances, as runs of the graph confirm."""
 
 from __future__ import annotations
 
