@@ -109,7 +109,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     check_mesh(vertices, triangles)
     crossings = count_intersections(vertices, triangles)
     if crossings > MAX_CUTTING_RATIO * len(triangles):
-        raise MeshError(f"{crossings} pairs of triangles of the mesh intersect; repair the mesh")
+        raise MeshError(f"{crossings} pairs of triangles intersect in the mesh; repair it")
     if crossings:
         repairs.append(f"{crossings} intersecting pairs of triangles bridged")
     if smoothing_m is None:
