@@ -411,7 +411,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """Periodic methods of a node on a virtual clock."""
+    """Scheduler that calls the periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node

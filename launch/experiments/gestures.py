@@ -1,4 +1,4 @@
-"""Evaluate the tracking of the fingertip during gestures of the simulated finger."""
+"""Evaluate how accurately the fingertip is tracked during gestures of the simulated finger."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack points as rows (n, 3); n may be 0."""
+    """Stack points (3,) as rows of an array (n, 3), also for n = 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 

@@ -63,8 +63,8 @@ class Motion:
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
     time; infinite if it has died out. amplitude_m (n,): amplitude in the last quarter.
-    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s after
-    the first eighth of the time, minus that of a passive sheet, divided by the energy at release.
+    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s, minus
+    that of a passive sheet, divided by the energy at release. The first eighth is ignored.
     """
 
     decay_per_s: Floats
@@ -126,7 +126,7 @@ class HeldOffset:
         return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offset (n,) at a step."""
+        """Return the sheet's offset (n,), m, at a time step; call it for each step in order."""
         row = step % self._ring
         due = self._due[row]
         self._held = np.where(due, self._queued[row, 0], self._held + self._step_s * self._rate)

@@ -32,13 +32,12 @@ def estimate_lag_s(
     all shifts within +-max_lag_s. A parabola through the best shift and its neighbours refines the
     result. Mean and linear trend are removed from both motions, since in uniform motion a lag
     cannot be distinguished from an offset. If slow and fast parts have different lags, larger
-    motions dominate. The standard error for ten seconds at 60 Hz and 0.5 mm of motion per axis is
-    0.6 ms with white noise of 0.1 mm, and 1.9 ms with 0.3 mm.
+    motions dominate. For ten seconds at 60 Hz and 0.5 mm of motion per axis, the standard error is
+    0.6 ms with white noise of 0.1 mm. It is 1.9 ms with 0.3 mm.
 
-    Returns None if the leader does not move besides its trend, the correlation is below
-    MIN_CORRELATION, or the best shift is at the end of the range. Raises ValueError for invalid
-    times, values that are not finite or differ in number, and durations up to four times
-    `max_lag_s`.
+    Returns None if the motion is only a linear trend, the correlation is below MIN_CORRELATION, or
+    the best shift is at the end of the range. Raises ValueError for invalid times, values that are
+    not finite or differ in number, and durations up to four times `max_lag_s`.
     """
     follower_rows, leader_rows = (_to_rows(values) for values in (follower, leader))
     leader_s = times_s if leader_times_s is None else leader_times_s

@@ -63,8 +63,8 @@ MAX_FORCE_DEPTHS_M = (0.004, 0.016)
 depth of the scene."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated force, and the ratio of the force at
-which the finger turns back to the evaluated force."""
+"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
+which the finger reverses, to the evaluated force."""
 
 MIN_FORCE_N = 0.1
 """Minimum denominator of relative force errors. Relative errors of smaller forces are not felt."""
@@ -220,7 +220,7 @@ class OfflineEvaluator:
     def evaluate(
         self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
     ) -> Evaluation:
-        """Evaluate the named metrics of an apparatus."""
+        """Evaluate the given metrics of an apparatus. Raises ExperimentError without a solution."""
         try:
             return self._evaluate(apparatus, metrics)
         except (NotConvergedError, ValueError) as error:
@@ -521,7 +521,7 @@ def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
 
 
 def metric_tolerances(scene: Scene) -> dict[Metric, float]:
-    """Return the scene's tolerance of each metric, in the metric's unit."""
+    """Return the scene's tolerances by metric, in the unit of the metric."""
     given = scene.tolerances
     return {
         Metric.SHEET: 1e3 * given.sheet_position_m,

@@ -1,4 +1,4 @@
-"""Choose free ports for the simulated arms, so that several graphs run on one computer."""
+"""Choose free TCP ports for the simulated arms, so that several graphs can run on one computer."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Run an experiment: start the graph with a recorder, run a procedure, and stop the graph.
 
-A procedure is a coroutine that controls the running graph by a `Driver`.
+A graph is the set of nodes (processes) and topics that a launch file describes. A procedure is a
+coroutine that controls the running graph by a `Driver`.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def new_folder(name: str, parent: Path = RUNS) -> Path:
 
 
 def require_scene(plan: ResolvedGraph) -> Scene:
-    """Return the graph's scene.  Raises ExperimentError for a graph without one."""
+    """Return the scene of a planned graph. Raises ExperimentError if it has none."""
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(

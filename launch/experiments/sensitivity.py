@@ -125,7 +125,11 @@ def run_sensitivity(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Evaluate each parameter alone; return the results of `experiment sensitivity --json`."""
+    """Evaluate deviations of single parameters; return `experiment sensitivity --json` results.
+
+    folder: for the rows of finished trials. with_graph: also run the graph for parameters whose
+    effect occurs only in motion. seconds: duration of a stroke.
+    """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
     common = {

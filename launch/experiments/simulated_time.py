@@ -59,7 +59,7 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 Floats = NDArray[np.float64]
 
 CYCLE_S = 0.0071
-"""Period of the arms' commands."""
+"""Period of the commands to the arms."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
 """Time to read out the camera, unless the apparatus states it; from there to the published target;
@@ -68,7 +68,7 @@ and from the target to the arm command that it causes."""
 PIXEL_NOISE_PX = 0.02
 PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
 SERVO_LAG_S = 0.025
-"""Lag of the simulated arms, unless the apparatus states it."""
+"""Servo lag of the simulated arms, unless the apparatus states it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
 """Parameters of the arm bridges."""

@@ -473,7 +473,7 @@ def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> Sampl
 
 
 def summary(values: Floats, scale: float) -> dict[str, float]:
-    """Return mean, standard deviation and maximum of values (n,) times `scale`."""
+    """Return mean, standard deviation and maximum of values (n,), multiplied by `scale`."""
     scaled = values * scale
     return {
         "mean": float(scaled.mean()),

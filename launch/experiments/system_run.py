@@ -118,7 +118,7 @@ def make_stroke(scene: Scene, seconds: float) -> FingerPath:
 
 
 def scene_speed(scene: Scene) -> float:
-    """Return the speed of a finger that leaves the object, m/s."""
+    """Return the speed at which the finger moves away from the object, m/s."""
     return max(scene.working_range.speed_m_per_s, compliance.PUSH_M_PER_S)
 
 

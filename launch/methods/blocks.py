@@ -35,7 +35,7 @@ class Interval:
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return a random order of the names for each block."""
+    """Return the configuration names in another random order for each block."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
@@ -59,9 +59,9 @@ def bootstrap_median(values: Floats) -> Interval | None:
 
 
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
-    """Return the median ratio of positive values (n,) to those of the control in the same block.
+    """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    Uses logarithms, so that a ratio and its inverse have the same weight.
+    It is computed from logarithms, so that a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))

@@ -118,7 +118,7 @@ def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[in
 
 
 def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """Return the result that `chart FAMILY --json` prints."""
+    """Return the result of a measured family as `flexsheet chart FAMILY --json` prints it."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -137,8 +137,8 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error over time on logarithmic axes, with a line along the Pareto front of each case.
 
-    If the family has a `sweep_key` (a varied property of the cases), also draw errors and extra
-    metrics over it, with a band for the reference's uncertainty.
+    If the family has a `sweep_key`, a property that varies over the cases, also draw errors and
+    extra metrics over it. A band shows the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 
@@ -214,7 +214,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     """Draw a metric over the sweep key, one line per method.
 
-    Markers out of range are hollow; the reference's uncertainty is grey.
+    Markers of cases outside the method's range are hollow. The reference's uncertainty is grey.
     """
     key, points = result["sweep_key"], result["points"]
 

@@ -66,5 +66,5 @@ def render_svg(figure: Figure) -> str:
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """Write the figure as SVG; see `render_svg`."""
+    """Write a figure to an SVG file for light and dark pages; see `render_svg`."""
     write_file(path, render_svg(figure))

@@ -191,7 +191,10 @@ def run_system_chart(
     launch_file: Path = DEMO_FILE,
     configurations: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Measure all scenes; return the result of `chart system --json`."""
+    """Measure the configurations for all scenes; return the result of `chart system --json`.
+
+    blocks: per scene. seconds: duration of the stroke. apparatuses: number of random ones.
+    """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
     for number, file in enumerate(scene_files, start=1):

@@ -34,7 +34,7 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""Shape names of scene files, in which a mesh is a file instead of arrays."""
+"""Shape names that scene files may contain. There a mesh is given as a file, not as arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0

@@ -50,7 +50,10 @@ CHECKED = (
 
 
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
-    """Find all problems: overload first, as it causes most others, then failures."""
+    """Return all problems in the numbers of a session.
+
+    Overload is first, as it causes most other problems; failures follow.
+    """
     found = [
         *_check_bag(numbers),
         *_check_arms(numbers),

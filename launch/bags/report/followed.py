@@ -1,4 +1,4 @@
-"""Measure how well the sheet followed the simulator's finger along one path."""
+"""Measure how well the sheet followed the simulated finger along one path."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Sizes:
         self._moments, self._spread = RunningMoments(), Spread(Grid(0, 1.0, 1))
 
     def add(self, values: Floats) -> None:
-        """Add values (n,)."""
+        """Add values (n,) to the statistics."""
         self._moments.add(values)
         for value in values.tolist():
             self._spread.add(0, value)

@@ -1,4 +1,4 @@
-"""Compute the numbers of a session as one JSON document, for `bag report --json` and the page."""
+"""Compute all numbers of the bag report, for `bag report --json` and the HTML page."""
 
 from __future__ import annotations
 

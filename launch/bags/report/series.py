@@ -36,7 +36,7 @@ class Grid:
         return min(max(int(fraction * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
-        """Return the centres (count,) of the intervals, s since the start of the bag."""
+        """Return the centre times (count,) of the intervals, s since the start of the bag."""
         middles = np.arange(self.count, dtype=np.float64) + 0.5
         return np.asarray(middles * (self.duration_s / self.count))
 
@@ -64,7 +64,7 @@ class Range:
 
 
 class Spread:
-    """Logarithmic histogram of durations for each interval."""
+    """Distribution of durations (such as latencies) in each interval, as logarithmic histograms."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)

@@ -151,7 +151,7 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSummary:
-    """Summary of a node's status messages."""
+    """Summary of the status messages of a node: processor use, memory, starts and errors."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -255,7 +255,7 @@ class Session:
         self._late_before: int | None = None
 
     def add(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
-        """Add one message of the bag."""
+        """Add one message of the bag to the summary. log_ns: time at which it was recorded."""
         self._add_flow(topic, header, log_ns)
         if isinstance(message, Clocks) and header.clock_id == self.clock_id:
             self._table.update(message)

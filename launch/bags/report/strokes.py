@@ -211,7 +211,7 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Compute the errors of all complete samples."""
+        """Compute the errors for all buffered samples that have both edges."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
             self.measured, self.true = MotionBuffer(), MotionBuffer()
