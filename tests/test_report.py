@@ -398,11 +398,11 @@ def test_where_no_page_can_be_written_the_bag_is_not_read(
     monkeypatch.setattr(
         "flexsheet.launch.bags.report.write.read_session", lambda *_: pytest.fail("it was read")
     )
-    with pytest.raises(BagError, match="name a file in a writable folder with -o"):
+    with pytest.raises(BagError, match="give a file in a writable folder with -o"):
         report(bag, tmp_path / "none" / "a.html", lambda done, whole: None)
     folder = tmp_path / "a.html"
     folder.mkdir()
-    with pytest.raises(BagError, match="name a file in a writable folder with -o"):
+    with pytest.raises(BagError, match="give a file in a writable folder with -o"):
         report(bag, folder, lambda done, whole: None)
     assert [*tmp_path.iterdir()] == [folder]
 

@@ -1,1 +1,1 @@
-"""Play, replay, report and export bags."""
+"""Play, replay, report and export bags (files of recorded topics)."""

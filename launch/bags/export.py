@@ -1,7 +1,7 @@
 """Export bags as MCAP files with standard schemas, which Foxglove and rerun open.
 
-Each topic becomes a JSON channel of the same name with its numbers; arrays of more than `PLOTTED`
-values are left out. Images and 3D data become separate channels:
+Each topic becomes a JSON channel of the same name that contains its fields, without arrays of more
+than `PLOTTED` values. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
@@ -9,8 +9,9 @@ values are left out. Images and 3D data become separate channels:
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
     object      the deformed skin of the soft body                        foxglove.SceneUpdate
 
-The world frame is flexsheet's (x right, y up, z towards the user). Times are the recorder's. They
-count from 1970 if the bag contains the time of day of its start, else from the host's start.
+The world frame is that of flexsheet (x right, y up, z towards the user). Times are those at which
+messages were recorded. They count from 1970 if the bag contains the wall-clock time of its start,
+else from the start of the recording computer.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ else:
     HAS_FOXGLOVE = True
 
 PLOTTED = 64
-"""Maximum size of an array that is exported as numbers."""
+"""Maximum number of values of an array that is exported as JSON."""
 
 SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
@@ -69,11 +70,11 @@ Output = tuple[str, Any]
 
 
 MIN_FREE_BYTES = 4 << 20
-"""Minimum free space on the disk of an export; exceeds the library's write buffer."""
+"""Minimum free disk space during an export. It exceeds the write buffer of the library."""
 
 
 class ExportError(FlexsheetError, RuntimeError):
-    """An export that cannot be made; the text gives the reason and the remedy."""
+    """Raised if an export cannot be made; the text gives the reason and the remedy."""
 
     code = "export"
     remedy = "Install the package that the text names, or choose another output file."
@@ -81,7 +82,7 @@ class ExportError(FlexsheetError, RuntimeError):
 
 @dataclass(slots=True)
 class ExportResult:
-    """Number of messages per channel, and unreadable topics."""
+    """Result of an export: number of messages per channel, and topics that could not be read."""
 
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -95,17 +96,17 @@ def export(
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Write the bag as an MCAP file of Foxglove's schemas.
+    """Write a bag as an MCAP file with the schemas of Foxglove.
 
-    topics: names; default: all. A topic whose type has changed since the recording cannot be read,
-    and is named in the result. Raises ExportError and BagError.
+    topics: names; default: all. Topics whose message type has changed since the recording cannot
+    be read, and are named in the result. Raises ExportError and BagError.
     """
     if not HAS_FOXGLOVE:
         raise ExportError(
             "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
         )
     if output.exists():
-        raise ExportError(f"{output}: exists already; name a new file")
+        raise ExportError(f"{output}: file exists already; give the name of a new file")
     reader = BagReader(bag)
     summary = reader.info()
     wanted = set(reader.topics if topics is None else topics)
@@ -123,7 +124,7 @@ def export(
         _check_free_space(output)
         with foxglove.open_mcap(draft, context=context, allow_overwrite=True) as writer:
             for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
-                # The library would print a line for each message that it cannot write.
+                # On a full disk, the library would print a line for each message.
                 _check_free_space(output)
                 at_ns = log_time_ns + (offset_ns or 0)
                 views = state.views(topic, message, at_ns)
@@ -154,14 +155,14 @@ def _check_free_space(output: Path) -> None:
 
 @dataclass(slots=True)
 class ViewState:
-    """Latest scene, skin and flanges, which the drawing of later messages needs."""
+    """Latest scene, soft-body skin and flange poses, which are needed to draw later messages."""
 
     scene: Scene | None = None
     skin: Skin | None = None
     flanges: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
-        """Yield images and 3D data of a message: (channel, message of foxglove)."""
+        """Yield the images and 3D data of a message as (channel, Foxglove message)."""
         stamp = fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
         match message:
             case Scene():
@@ -211,7 +212,7 @@ class ViewState:
         return fg.SceneUpdate(entities=[entity])
 
     def _sheet(self, stamp: Any) -> Any | None:
-        """Return the sheet as a flat quadrilateral between both clamped edges."""
+        """Return the sheet, drawn as a flat quadrilateral between both edges; None if unknown."""
         if self.scene is None or len(self.flanges) < 2:
             return None
         half_m = 0.5 * self.scene.sheet.height_m
@@ -240,7 +241,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
 
 
 def _wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """Return the offset from the recorder's clock to 1970, ns; None if it is unknown."""
+    """Return what to add to a recorded time to count from 1970, ns; None if it is unknown."""
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])
@@ -259,7 +260,7 @@ def _channel(name: str, value: Any, context: Any) -> Any:
 
 
 def _make_schema(value: Any) -> dict[str, Any]:
-    """Make the JSON Schema of a value: its fields, for selection in other tools."""
+    """Make the JSON Schema of a value, so that other tools can list its fields."""
     match value:
         case dict():
             fields = {name: _make_schema(item) for name, item in value.items()}
@@ -277,7 +278,7 @@ def _make_schema(value: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a message to types of JSON; arrays of more than PLOTTED values are left out."""
+    """Convert a message to JSON types, without arrays of more than PLOTTED values."""
     if isinstance(value, BaseModel):
         plain = {name: _plain(getattr(value, name)) for name in type(value).model_fields}
         return {name: item for name, item in plain.items() if item is not _TOO_LARGE}

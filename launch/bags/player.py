@@ -1,4 +1,4 @@
-"""Play a bag into a running graph, as the writer "tools"."""
+"""Play a bag: publish its messages in a running graph, under the writer name "tools"."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexsheet.messages.clock_table import shift_stamps
 from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
-"""Called with (seconds of the bag played, seconds in all)."""
+"""Function that is called with (played seconds of the bag, total seconds to play)."""
 
 
 NEVER_PLAYED = {
@@ -26,12 +26,12 @@ NEVER_PLAYED = {
     "estop": "an e-stop or its reset is not repeated",
     "recording": "requests to record are not repeated",
 }
-"""Topics that are never played, and why."""
+"""Topics that are never played, with the reasons."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicSelection:
-    """Topics of a bag that can be played, and the others with the reason."""
+    """Topics of a bag that will be played, and topics that are left out, with the reasons."""
 
     topics: tuple[str, ...]
     left_out: dict[str, str]
@@ -40,9 +40,9 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of the bag that tools may write.
+    """Select the topics of the bag that may be published under the writer name "tools".
 
-    Raises BagError if a wanted topic cannot be played.
+    wanted: topics to play; empty for all. Raises BagError if one of them cannot be played.
     """
     writable = list_tool_topics(plan)
     left_out = {}
@@ -74,10 +74,10 @@ async def play(
     start_s: float = 0.0,
     progress: Progress = lambda played, total: None,
 ) -> int:
-    """Play the bag once from `start_s`; return the number of messages sent.
+    """Play the bag once from `start_s`; return the number of sent messages.
 
-    rate: speed factor. The last value of every latched topic before the start is sent first.
-    Stamps are shifted, so that a message has the same age as in the recording.
+    rate: speed factor. The last message of each latched topic before `start_s` is sent first.
+    Timestamps are shifted, so that a message has the same age as in the recording.
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)
@@ -118,7 +118,7 @@ async def play(
 def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
-    """Return the last message of every latched topic before `begin_ns`."""
+    """Return the last message before `begin_ns` of every latched topic, in a bag."""
     latched = [name for name in topics if find_topic(name).delivery is Delivery.LATCHED]
     last = {}
     for entry in BagReader(bag, latched, end_ns=begin_ns):

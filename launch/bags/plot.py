@@ -16,7 +16,7 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.topics import UnknownTopicError, find_topic
 
 MAX_COMPONENTS = 16
-"""Maximum number of lines in one chart; images and meshes have more components."""
+"""Maximum number of lines in one chart. It excludes images and meshes."""
 
 CHART_SIZE_IN = (8.0, 2.4)
 """Width and height of the chart of one field, inches."""
@@ -24,9 +24,10 @@ CHART_SIZE_IN = (8.0, 2.4)
 
 @dataclass(frozen=True, slots=True)
 class FieldSeries:
-    """Values (n, components) of a field over the times (n,) of its sources, from the bag's start.
+    """Values of a message field over time.
 
-    name: "TOPIC.FIELD".
+    name: "TOPIC.FIELD". times_s: (n,), source times relative to the start of the bag. values:
+    (n, components).
     """
 
     name: str
@@ -34,7 +35,7 @@ class FieldSeries:
     values: NDArray[np.float64]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the series as JSON types."""
+        """Return the series converted to JSON types."""
         return {
             "field": self.name,
             "times_s": self.times_s.tolist(),
@@ -45,9 +46,9 @@ class FieldSeries:
 def read_fields(
     bag: Path, names: Sequence[str], progress: Callable[[float, float], None]
 ) -> list[FieldSeries]:
-    """Read fields named "TOPIC.FIELD" from a bag; inner fields are "TOPIC.FIELD.FIELD".
+    """Read fields named "TOPIC.FIELD" from a bag; nested fields are "TOPIC.FIELD.FIELD".
 
-    Raises BadInputError for a topic or field that the bag does not contain, or that has no number.
+    Raises BadInputError if the bag does not contain the topic or field, or the field is no number.
     """
     paths = {name: _parse(name) for name in names}
     reader = BagReader(bag)
@@ -96,13 +97,13 @@ def _get_number(
         return None
     if isinstance(value, BaseModel):
         inner = list(type(value).model_fields)
-        raise _error(bag, f"{name}: is a group of fields; add one of them", "", inner)
+        raise _error(bag, f"{name}: is a group of fields; append one of its fields", "", inner)
     try:
         numbers = np.asarray(value, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError) as error:
-        raise BadInputError.single(str(bag), (), f"{name}: is not a number") from error
+        raise BadInputError.single(str(bag), (), f"{name}: field is not a number") from error
     if numbers.size > MAX_COMPONENTS:
-        what = f"{name}: has {numbers.size} numbers; at most {MAX_COMPONENTS} are plotted"
+        what = f"{name}: field has {numbers.size} numbers; at most {MAX_COMPONENTS} can be plotted"
         raise BadInputError.single(str(bag), (), what, "choose another field")
     return numbers
 
@@ -111,7 +112,7 @@ def _make_series(
     bag: Path, name: str, rows: list[tuple[float, NDArray[np.float64]]]
 ) -> FieldSeries:
     if not rows:
-        raise BadInputError.single(str(bag), (), f"{name}: the bag contains no value")
+        raise BadInputError.single(str(bag), (), f"{name}: the bag contains no value of this field")
     width = max(values.size for _, values in rows)
     table = np.full((len(rows), width), np.nan)
     for row, (_, values) in zip(table, rows, strict=True):

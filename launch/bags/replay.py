@@ -1,12 +1,11 @@
-"""Step one node through its recorded inputs with a virtual clock, twice, and compare the
-outputs.
+"""Replay one node with its recorded inputs on a virtual clock, twice, and compare the outputs.
 
 The node is built from the plan in the bag. Its status messages contain the order and time of the
 messages that it handled (`messages.types.Status.execution_log`). The replay follows this log, so it
 skips the same messages as the live node. Bags of earlier versions contain no log. The replay then
-passes each recorded input in the order of the recorder, and calls timers when they are due. The
-same bag must give the same bytes each time. The output fields are compared with the live ones, with
-a tolerance.
+passes all recorded inputs in the order in which they were recorded, and calls timers when due. Both
+replays must give the same bytes. The fields of the outputs are compared with the recorded ones,
+with a tolerance.
 """
 
 from __future__ import annotations
@@ -38,17 +37,17 @@ from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 
 CLOCKS = "clocks"
 EPOCH = 0
-"""Epoch of the replayed writers; a live writer uses its start time."""
+"""Epoch (start of a writer) in replayed messages. A live writer uses the time of its start."""
 
 PROGRESS_STEPS = 100
-"""Number of steps between two reports of progress."""
+"""Number of replayed messages between two reports of progress."""
 
 Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class SentMessage:
-    """A message that a replayed node published, as bytes."""
+    """Message that a replayed node published, as bytes."""
 
     topic: str
     data: tuple[bytes, ...]
@@ -58,9 +57,9 @@ class SentMessage:
 class ReplayResult:
     """Result of one replay of the bag.
 
-    by_execution_log: the replay followed the execution log of the node; else the order of the
-    recorder. missing: logged messages that the bag does not contain. logged_until_ns: end of the
-    execution log, in time of the node's host.
+    messages_in: number of input messages. missing: number of logged messages that the bag does not
+    contain. by_execution_log: whether the replay followed the node's execution log, instead of the
+    recorded order. logged_until_ns: end of the execution log, on the clock of the node's host.
     """
 
     messages_in: int = 0
@@ -84,9 +83,10 @@ class ReplayResult:
 
 @dataclass(slots=True)
 class Comparison:
-    """Comparison of replayed and recorded messages of one topic, paired by source stamp.
+    """Comparison of replayed and recorded messages of one topic, paired by source timestamp.
 
-    worst: maximum difference by field, for fields that differ; 1 for values other than numbers.
+    recorded, replayed, compared, beyond_tolerance: numbers of messages. worst: maximum difference
+    of each field that differs; 1 for values other than numbers.
     """
 
     recorded: int = 0
@@ -98,7 +98,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Result of `bag verify`; by_execution_log, missing: see `ReplayResult`."""
+    """Result of `flexsheet bag verify`. For by_execution_log and missing, see `ReplayResult`."""
 
     node: str
     bag: str
@@ -115,12 +115,12 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both passes gave the same bytes, without an error."""
+        """Return whether both replays gave the same bytes, without an error."""
         return self.same_bytes and self.errors == 0
 
     @property
     def as_live(self) -> bool:
-        """Return whether the outputs equal the live ones within the tolerance."""
+        """Return whether the replayed outputs equal the recorded ones within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -132,15 +132,16 @@ class Verification:
 
 
 def _ignore_progress(done: float, total: float) -> None:
-    """Ignore the progress."""
+    """Do nothing; used where the caller needs no progress reports."""
 
 
 def verify(
     bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _ignore_progress
 ) -> Verification:
-    """Replay the node `name` of the bag's plan twice.
+    """Replay the node `name` of the bag's plan twice, and compare the outputs.
 
-    Raises BagError for a bag that does not allow it.
+    tolerance: maximum difference of a field. Raises BagError if the bag lacks the node, its inputs
+    or a valid plan, or if the node cannot be replayed.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)
@@ -153,8 +154,8 @@ def verify(
         why = refusal(node)
     except (ValidationError, UnknownNodeError) as error:
         raise BagError(
-            f"{bag}: this version has no node type {node.type}; verify {name} with the version of "
-            "the recording"
+            f"{bag}: this version of flexsheet has no node type {node.type}; verify {name} with "
+            "the version that recorded the bag"
         ) from error
     if why:
         raise BagError(f"{name} cannot be replayed: {why}")
@@ -182,13 +183,13 @@ def _read_plan(reader: BagReader) -> ResolvedGraph:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except ValidationError as error:
         raise BagError(
-            f"{reader.path}: its plan.json is not valid in this version; verify the bag with the "
-            "version of the recording"
+            f"{reader.path}: its plan.json is not valid in this version of flexsheet; verify the "
+            "bag with the version that recorded it"
         ) from error
 
 
 def refusal(node: ResolvedNode) -> str:
-    """Return why a node cannot be replayed; empty if it can."""
+    """Return the reason why a node cannot be replayed; an empty text if it can be."""
     class_ = node_class(node.type)
     return class_.replay_refusal(find_parameters_type(class_).model_validate(node.parameters))
 
@@ -196,7 +197,7 @@ def refusal(node: ResolvedNode) -> str:
 async def replay(
     bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress
 ) -> ReplayResult:
-    """Step a node through its inputs in the bag."""
+    """Pass the recorded inputs in the bag to a newly built node, once, and store its outputs."""
     result = ReplayResult()
     runs = read_runs(bag, planned.name)
     before, total = 0, sum(len(run.steps) for run in runs)
@@ -216,7 +217,7 @@ def _report_progress(progress: Progress, before: int, total: int, step: int) -> 
 
 
 def _build_node(planned: ResolvedNode, clock: VirtualClock, result: ReplayResult) -> Node:
-    """Build the node as a launcher does, and store its published messages."""
+    """Build the node as a launcher does; its published messages are stored in `result`."""
 
     def store(topic: Topic, message: Message, header: Header) -> None:
         result.sent.append(
@@ -250,7 +251,7 @@ async def _set_up(node: Node, result: ReplayResult) -> AsyncIterator[None]:
 async def _replay_in_order(
     bag: Path, planned: ResolvedNode, result: ReplayResult, progress: Progress
 ) -> None:
-    """Step the node through all its inputs, in the order of the recorder."""
+    """Pass all recorded inputs to the node in the order in which they were recorded."""
     ports: dict[str, list[str]] = {}
     for port in planned.inputs:
         ports.setdefault(port.topic, []).append(port.port)
@@ -282,13 +283,13 @@ async def _replay_run(
     result: ReplayResult,
     report: Callable[[int], None],
 ) -> None:
-    """Step the node through its execution log of one run."""
+    """Pass those inputs to the node that its execution log of one run contains, in its order."""
     clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
     node = _build_node(planned, clock, result)
     names, timers = list(node.inputs), find_timers(type(node))
     async with _set_up(node, result):
         messages = RecordedInputs(bag, node)
-        # The recorded execution log does not contain messages before the recording.
+        # The recorded log lacks messages that the node handled before the recording began.
         for port, message, header in messages.latched_before(run):
             result.messages_in += 1
             await node.step(port, message, header)
@@ -310,14 +311,17 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """Rows of the execution log of a node between two starts."""
+    """Execution log of a node between two of its starts.
+
+    steps: rows (input index or -1 - timer index, sequence, epoch, time in ns).
+    """
 
     clock_id: str
     steps: NDArray[np.int64]
 
 
 def read_runs(bag: Path, name: str) -> list[NodeRun]:
-    """Read the execution logs of a node, one per start; empty for bags of earlier versions."""
+    """Read the execution logs of a node, one per start; an empty list if the bag has none."""
     logs: dict[int, list[NDArray[np.int64]]] = {}
     clock_ids: dict[int, str] = {}
     if "status" not in BagReader(bag).topics:
@@ -325,7 +329,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
     for _, message, header, _ in BagReader(bag, ["status"]):
         if isinstance(message, Status) and message.node == name and len(message.execution_log):
             before = logs.setdefault(header.epoch, [])
-            # In its first seconds a node publishes its whole log repeatedly.
+            # For some seconds after its start, a node publishes its whole log again each time.
             if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
             before.append(message.execution_log)
@@ -334,10 +338,10 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
 
 
 class RecordedInputs:
-    """Reader of the recorded inputs of a node, as far ahead as its execution log needs."""
+    """Reader of a node's recorded inputs, which reads only as far as the execution log needs."""
 
     LOOK_AHEAD = 5000
-    """Number of messages that are read before a logged one counts as missing."""
+    """Number of messages to read before a logged message counts as missing."""
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node
@@ -351,7 +355,10 @@ class RecordedInputs:
         }
 
     def latched_before(self, run: NodeRun) -> list[tuple[str, Message, Header]]:
-        """Return the latched messages before the first step, in order."""
+        """Return the latched messages that the node had before the first step of the run.
+
+        Each entry is (port, message, header); the last message of each port.
+        """
         steps = {(names, *key) for names, *key in run.steps[:, :3].tolist()}
         latched = {
             source.topic.name
@@ -370,7 +377,7 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message with this number; None if the bag does not contain it."""
+        """Return the message of a port with this sequence number and epoch; None if missing."""
         waiting = self._waiting[port]
         latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
         read = seen = 0
@@ -382,7 +389,7 @@ class RecordedInputs:
                 if header.sequence > sequence:
                     return None
                 del waiting[i]
-                # A reader of the latest message never returns to a skipped one.
+                # A node that reads only the latest message never handles a skipped one later.
                 for _ in range(i if latest else 0):
                     waiting.popleft()
                 return message, header
@@ -404,7 +411,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """Periodic methods of a node on a virtual clock."""
+    """Scheduler that calls the periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
@@ -415,7 +422,7 @@ class Timers:
         self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
 
     async def call_until(self, now_ns: int, clock: VirtualClock) -> None:
-        """Call the methods that are due up to `now_ns`, in the order of time."""
+        """Call the methods that are due up to `now_ns`, in the order of their times."""
         while self._due_ns:
             next_one = min(self._due_ns, key=lambda one: (self._due_ns[one], one[1].method))
             due_ns = self._due_ns[next_one]
@@ -429,7 +436,7 @@ class Timers:
 def compare(
     bag: Path, node: ResolvedNode, replayed: ReplayResult, tolerance: float
 ) -> dict[str, Comparison]:
-    """Compare the outputs that the node published live with the replayed ones."""
+    """Compare the node's recorded outputs with the replayed ones, by topic."""
     outputs = {port.topic for port in node.outputs} - {"status"}
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
     comparisons = {topic: Comparison() for topic in sorted(outputs)}
@@ -460,7 +467,7 @@ def compare(
 def compute_field_differences(
     one: BaseModel, other: BaseModel, prefix: str = ""
 ) -> dict[str, float]:
-    """Compute the differences by field; see `Comparison.worst`."""
+    """Return the difference of each field in which two messages differ; see `Comparison.worst`."""
     found: dict[str, float] = {}
     for name in type(one).model_fields:
         a, b = getattr(one, name), getattr(other, name)
@@ -484,7 +491,7 @@ def _difference(a: Any, b: Any) -> float:
 
 
 def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return the largest difference; infinite where only one value is NaN."""
+    """Return the largest difference of two arrays; infinite if a value is NaN in only one."""
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore"):
         apart = np.where(same, 0.0, np.abs(a - b))
@@ -492,7 +499,7 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
-    """Raise BagError for an input that was not recorded; an input without messages is allowed."""
+    """Raise BagError if an input topic was not recorded. A topic without messages is allowed."""
     recorded = set(reader.topics)
     for other in plan.nodes.values():
         if other.role is NodeRole.RECORDER:
@@ -505,4 +512,4 @@ def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: Resol
             f"record it with: flexsheet bag record BAG {options}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):
-        raise BagError(f"{bag}: contains no input of {node.name}; replay another node")
+        raise BagError(f"{bag}: contains no input messages of {node.name}; verify another node")

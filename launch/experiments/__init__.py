@@ -1,4 +1,7 @@
-"""The paper's experiments, run on a graph and evaluated from the recorded bags."""
+"""Experiments on a running graph that are evaluated from recorded bags.
+
+They include those of Furukawa et al. 2007.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,17 @@ Entry = TypeVar("Entry")
 
 
 class ExperimentError(FlexsheetError, RuntimeError):
-    """Raised for an experiment that failed, or a bag without the expected recording."""
+    """Raised if an experiment failed, or a bag does not contain the data of the experiment."""
 
     code = "experiment"
     remedy = "Try `launch/demo.yaml` first. A bag must be a recording of the same experiment."
 
 
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
-    """Return a bag's entry with that label.  Raises ExperimentError if it is missing."""
+    """Return the entry of a bag with a label. Raises ExperimentError if it is missing.
+
+    kind: what the entry is, for the error.
+    """
     if label not in entries:
         labels = ", ".join(entries) or "none"
         raise ExperimentError(

@@ -1,8 +1,8 @@
-"""Compare the rendered force of the simulated sheet with that of the soft body.
+"""Compare the force of the simulated sheet on the finger with the force of the virtual object.
 
 The finger pushes at a few positions and rests at several depths; then it moves in and out without a
-stop. At each evaluated time, the simulator's membrane between the true edges and under the true
-fingertip gives the rendered force. The object's force is that of the published force curve at the
+stop. The rendered force is computed by the simulator's membrane model, from the true edges of the
+sheet and the true fingertip. The object's force is read from the published force curve, at the
 finger's true depth.
 """
 
@@ -43,7 +43,7 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""Positions along the object, and around it from its front, m."""
+"""Pushed positions: distance along the object, and arc length around it from its front, m."""
 
 DEPTH_RATIOS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Depths at which the finger rests, as fractions of the scene's push depth."""
@@ -52,21 +52,21 @@ HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""Duration of a rest, and of its last part, in which the force is evaluated."""
+"""Duration of a rest, and duration of its last part, in which the force is evaluated."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 HISTORY_STEP_S = 0.01
-"""Interval at which the history of a push is followed; it moves by 0.5 mm in it."""
+"""Time step in which the force history of the rubber is computed; the finger moves 0.5 mm in it."""
 HISTORY_DEPTHS = 9
 HISTORY_CELLS = 16
-"""Number of depths, and elements per side, of the force curve by which a history is followed."""
+"""Number of depths, and membrane elements per side, of the elastic force curve for the history."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestInterval:
-    """Evaluated interval of a rest at a depth, in the path's time (s)."""
+    """Evaluated interval of a rest at a depth, s from the start of the finger path."""
 
     depth_m: float
     begin_s: float
@@ -75,10 +75,10 @@ class RestInterval:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """Path of the finger in one push, with the intervals at rest; none for the moving push.
+    """Finger path of one push.
 
-    place: name of the pushed position. surface, normal: (3,) of the undeformed object there, in the
-    world.
+    place: name of the pushed position. surface, normal: point (3,) and normal (3,) of the
+    undeformed object there, world frame. holds: evaluated rests; empty if the finger does not rest.
     """
 
     path: FingerPath
@@ -89,7 +89,7 @@ class Press:
 
 
 def make_presses(scene: Scene) -> list[Press]:
-    """Make all pushes of the experiment."""
+    """Make all pushes of the experiment for a scene."""
     depths = scene.working_range.push_depth_m * np.array(DEPTH_RATIOS)
     resting = [_make_resting_press(scene, along, around, depths) for along, around in POSITIONS_M]
     return [*resting, _make_moving_press(scene, float(depths[-1]))]
@@ -123,10 +123,7 @@ def _make_press(
     motion: Floats,
     holds: tuple[RestInterval, ...],
 ) -> Press:
-    """Make a push.
-
-    motion: (n, 2), times (s) and heights above the surface (m).
-    """
+    """Make a push from times (s) and heights above the surface (m), given as motion (n, 2)."""
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
@@ -140,7 +137,7 @@ def _make_press(
 
 
 def make_compliance_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that pushes at each position, then moves in and out."""
+    """Make the procedure of the experiment: push at each position, then move in and out."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for press in make_presses(scene):
@@ -152,10 +149,10 @@ def make_compliance_procedure(progress: Progress) -> Procedure:
 
 @dataclass(frozen=True, slots=True)
 class ComplianceRecording:
-    """Data of a compliance experiment from a bag.
+    """Data of a compliance experiment, read from a bag.
 
-    windows_ns: (start, end) of each path, by label. edges: poses of the clamped edges as rows
-    (16,). curves: the object's force over depth, (m, 2) each, at `curve_times_ns`.
+    windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
+    as rows (16,). curves: object force over depth, (m, 2) each, published at `curve_times_ns`.
     """
 
     scene: Scene
@@ -168,7 +165,7 @@ class ComplianceRecording:
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
-    """Read the data from a bag. Raises ExperimentError if the scene or force curve is missing."""
+    """Read the data of a bag. Raises ExperimentError if the scene or the force curve is missing."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     finger: list[tuple[int, Floats]] = []
@@ -195,7 +192,8 @@ def read_bag(bag: Path) -> ComplianceRecording:
                 pass
     if scene is None or not curves:
         raise ExperimentError(
-            f"{bag}: does not contain a scene and a force curve; record scene and soft_body"
+            f"{bag}: does not contain a scene and a force curve; record the topics scene and "
+            "soft_body"
         )
     curves.sort(key=lambda entry: entry[0])
     return ComplianceRecording(
@@ -211,7 +209,11 @@ def read_bag(bag: Path) -> ComplianceRecording:
 
 @dataclass(frozen=True, slots=True)
 class ForceSample:
-    """Finger depth, object force, rendered force and the sheet's normal offset at one time."""
+    """Forces at one time.
+
+    depth_m: true finger depth. wanted_n, rendered_n: force of the object and of the sheet.
+    normal_offset_m: depth of the sheet's centre below the undeformed surface.
+    """
 
     depth_m: float
     wanted_n: float
@@ -220,12 +222,12 @@ class ForceSample:
 
     @property
     def error_ratio(self) -> float:
-        """Return the error relative to the object's force, at least FORCE_JND_FLOOR_N."""
+        """Return the relative force error; divisors are at least FORCE_JND_FLOOR_N."""
         return (self.rendered_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
 
 
 class ForceReference:
-    """Reference for rendered forces in a recording: the simulator's membrane."""
+    """Computation of the true forces in a recording with the simulator's membrane model."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
         scene = apply_apparatus(recorded.scene, recorded.apparatus)
@@ -239,7 +241,7 @@ class ForceReference:
         self._ratios: dict[str, tuple[Times, Floats]] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
-        """Return the forces at a time; the depth is measured from the pressed point."""
+        """Return the forces at a time; the depth is measured from the pushed surface point."""
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
         pressed_n = self._solve_n(left, right, tip, press)
@@ -252,7 +254,7 @@ class ForceReference:
         )
 
     def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
-        """Return the fingertip (3,) and both edges (4, 4) at a time."""
+        """Return the fingertip (3,) and the poses of both clamped edges (4, 4) at a time."""
         times = np.array([at_ns])
         left, right = (
             edges.interpolate(times)[0].reshape(4, 4) @ clamp
@@ -263,7 +265,7 @@ class ForceReference:
     def _solve_n(
         self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
     ) -> float:
-        """Return the force (N) of the elastic sheet along the press's normal."""
+        """Return the force (N) of a purely elastic sheet along the normal of the push."""
         pressed = solve(
             self._rubber,
             left,
@@ -276,7 +278,7 @@ class ForceReference:
         return float(pressed.finger_force_n @ press.normal)
 
     def _history_ratio(self, at_ns: int, press: Press) -> float:
-        """Return the force of the rubber over that of the elastic sheet at a time of a press."""
+        """Return the ratio of the rubber's force to the elastic sheet's at a time of a push."""
         if ForceHistory.of(self._recorded.apparatus) is None:
             return 1.0
         label = press.path.label
@@ -286,10 +288,10 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return times (ns) of a press, and the ratio of both forces at them.
+        """Return the times (ns) of a push, and the force ratio of `_history_ratio` at them.
 
-        The elastic force over the indentation is that at the press's deepest point. So the
-        membrane is solved at a few depths only; the ratio depends on the curve's shape alone.
+        The membrane is solved at a few depths only, with the edges at the deepest point of the
+        push. That suffices, because the ratio depends only on the shape of the force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
@@ -320,13 +322,13 @@ class ForceReference:
 
 
 def _sheet_normal(left: Floats, right: Floats) -> Floats:
-    """Return the unit normal (3,) of the unpushed sheet, towards the user."""
+    """Return the unit normal (3,) of the unloaded sheet, towards the user."""
     normal = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
     return np.asarray(normal / np.linalg.norm(normal))
 
 
 def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
-    """Return how far the fingertip is behind the unpushed sheet, m; at least zero."""
+    """Return the depth of the fingertip behind the plane of the unloaded sheet, m; at least 0."""
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
     return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
 
@@ -336,7 +338,7 @@ def _make_transform(pose: Pose) -> Floats:
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
-    """Return the results of `experiment compliance --json`, in mm, N and %."""
+    """Evaluate a bag; return the results of `experiment compliance --json`, in mm, N and %."""
     recorded = read_bag(bag)
     reference = ForceReference(recorded)
     resting: list[dict[str, Any]] = []

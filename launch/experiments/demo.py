@@ -1,4 +1,4 @@
-"""`flexsheet demo`: run the whole system on one machine, and draw tables and figures."""
+"""Run the demo (`flexsheet demo`): the whole system on one computer, with tables and figures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
-"""Resolution of the paper's images: sufficient for figures, four times faster than the default."""
+"""Resolution of images in Furukawa et al. 2007. It is sufficient for figures, and images take a
+quarter of the time of the default resolution."""
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -36,7 +37,7 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 class DemoResult:
     """Results of the demo.
 
-    strokes: result of each stroke. followed: result of following a given path, or None.
+    strokes: result of each stroke. followed: result of following the given path, or None.
     """
 
     folder: Path
@@ -55,7 +56,7 @@ def run_demo(
     path: FingerPath | None = None,
     apparatus: str | None = None,
 ) -> DemoResult:
-    """Stroke in 10 s and in 30 s (or follow `path`), then image a tilted and a pushed sheet."""
+    """Stroke in 10 s and 30 s (or follow `path`), then take images of a tilted and pushed sheet."""
     bag = folder / "demo.mcap"
     procedure = chain_procedures(
         make_stroke_procedure(SECONDS, progress, path=path),
@@ -74,9 +75,9 @@ def run_demo(
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return the result of following the path with that label.
+    """Return how well the sheet followed the finger path with a label.
 
-    Raises ExperimentError if the bag does not contain it.
+    Raises ExperimentError if the bag does not contain the path.
     """
     runs = {run["path"]: run for run in read_followed(bag)}
     return find_recorded(runs, "finger path", label)
@@ -85,7 +86,7 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 def summarize(
     bag: Path, folder: Path, *, strokes: tuple[float, ...], path_label: str | None = None
 ) -> DemoResult:
-    """Compute the demo's results from its bag, and draw its images into `folder`."""
+    """Compute the results of the demo from its bag, and draw its figures into `folder`."""
     recording = stroke.read_recording(bag)
     eye_images = image.read_images(bag)
     views, plot, latency = (folder / f"{name}.png" for name in ("eye", "stroke", "latency"))

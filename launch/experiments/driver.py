@@ -1,7 +1,7 @@
-"""Drive a running graph for an experiment: move the simulated finger and set the display.
+"""Control a running graph during an experiment: move the simulated finger and set the display.
 
-The driver publishes as the writer "tools" and subscribes to the topics that it evaluates. Every
-wait has a deadline; its error contains the awaited condition and the nodes' notes.
+The driver publishes with the writer name "tools" and subscribes to the topics that it evaluates.
+Every wait has a deadline. The timeout error names the awaited condition and the nodes' notes.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ from flexsheet.messages.types import (
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
 
-# Noise of the measured finger moves the sheet; these limits separate rest from motion.
+# Measurement noise of the finger moves the sheet slightly; below these limits it counts as at rest.
 SETTLED_POSITION_M = 1e-3
 SETTLED_SPEED_M_PER_S = 0.05
 SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""Odd, so that the frames of both eyes carry pixels in turn."""
+"""Every how many frames contain pixels. An odd number, so that both eyes' frames do in turn."""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_LOAD_PER_CORE = 3.0
-"""Load per core above which the computer is overloaded; the demo causes less."""
+"""Load average per core above which the computer counts as overloaded; the demo causes less."""
 
 
 class Driver:
-    """Publisher and subscriber of a running graph; an async context manager."""
+    """Connection of an experiment to a running graph; an asynchronous context manager."""
 
     def __init__(
         self, plan: ResolvedGraph, run: Run, pids: Callable[[], Mapping[str, int]] = dict
     ) -> None:
-        """pids: returns the process id of each running node, for measurements."""
+        """pids: function that returns the process id of each running node, for measurements."""
         self._plan, self._run, self.pids = plan, run, pids
         self._writer: GraphWriter | None = None
         self._subscribers: list[Subscriber] = []
@@ -126,9 +126,9 @@ class Driver:
     async def wait_for(
         self, condition: Callable[[], bool], description: str, seconds: float
     ) -> None:
-        """Wait until `condition` is true, checked at each message. Raises ExperimentError.
+        """Wait until `condition` is true; it is checked at each message.
 
-        description: of the condition, for the error. seconds: maximum time.
+        description: text for the error. Raises ExperimentError after `seconds`.
         """
         if condition():
             return
@@ -151,7 +151,7 @@ class Driver:
         return self._newest.get(topic)
 
     async def wait_ready(self) -> None:
-        """Wait until both arms are in the mode "follow", and a soft body is published if needed."""
+        """Wait until both arms are in mode "follow" and, if needed, a soft body is published."""
         needs_body = bool(self._plan.writers.get("soft_body"))
 
         def ready() -> bool:
@@ -182,7 +182,7 @@ class Driver:
         )
 
     async def wait_settled(self) -> None:
-        """Wait until the target is at rest and both arms are at their commanded poses."""
+        """Wait until the sheet target is at rest and both arms are at their commanded poses."""
         self._settled_since = 0
         await self.wait_for(
             lambda: self._settled_since >= SETTLED_MESSAGES, "the sheet at rest", WAIT_S
@@ -199,9 +199,9 @@ class Driver:
         *,
         pattern: Pattern = "object",
     ) -> TwinEye:
-        """Show the object with that correction, and wait for the eye's image of it.
+        """Show the object with an image correction; return the simulated eye's image of it.
 
-        Flat shading shows an outline for measurement, soft shading is for figures.
+        Flat shading shows a sharp outline for measurements, soft shading is for figures.
         """
         self.show(
             Display(
@@ -227,7 +227,7 @@ class Driver:
         return eye
 
     async def capture_both_eyes(self, label: str, correction: Correction, pattern: Pattern) -> None:
-        """Show the object to both eyes in turn, and wait for the image of each."""
+        """Show the object to both simulated eyes in turn, and wait for the image of each eye."""
         self.show(
             Display(
                 correction=correction,
@@ -252,7 +252,7 @@ class Driver:
 
 
 def _describe_load() -> str:
-    """Return a hint if the computer is overloaded, the most likely cause of a timeout."""
+    """Return a hint for timeout errors if the computer is overloaded, else an empty text."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return ""
@@ -263,7 +263,7 @@ def _describe_load() -> str:
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:
-    """Return whether the arm is at its commanded pose and the target is at rest."""
+    """Return whether an arm is at its commanded pose and the sheet target is at rest."""
     error = arm.world_from_flange[:3, 3] - arm.world_from_flange_commanded[:3, 3]
     return bool(
         arm.mode == "follow"

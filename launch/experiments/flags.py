@@ -1,4 +1,4 @@
-"""Read which causes of a wrong scene the nodes suspected during a recording."""
+"""Read from a bag which errors of the scene the nodes suspected during the recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from flexsheet.messages.types import Status, SuspectedCause
 
 
 def read_flags(bag: Path) -> list[SuspectedCause]:
-    """Return the suspected causes of all nodes in a bag, each once, in the order of time."""
+    """Return the causes that nodes suspected, each once, in the order of first occurrence."""
     found: dict[SuspectedCause, None] = {}
     for _, message, _, _ in BagReader(bag, topics=["status"]):
         if isinstance(message, Status):

@@ -1,17 +1,17 @@
-"""Follow a recorded finger, and bound what arms with the same limits could do at best.
+"""Follow a recorded finger, and compute a lower bound for the sheet's error with the same arms.
 
 The bound is the optimum of a linear program over the whole recording. It assumes that
 
 - the future of the finger is known, so delays, tracking and prediction cost nothing;
 - the sheet rolls on the undeformed object without slip, with a constant stretch;
-- joints obey their ranges, speeds and accelerations, and the ends of the clamped edges the scene's
-  tool speed, as in the bridges; there is no servo lag, and no limit of the jerk;
-- outside of contact the sheet may move as it likes;
-- small deviations of the contact move the joints linearly.
+- joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
+  limited as in the arm bridges; there is no servo lag and no limit of the jerk;
+- outside of contact the sheet may move freely;
+- joint angles change linearly with small deviations of the contact point.
 
-Limits on means over a time step and on second differences are implied by the limits themselves, and
-lengths are measured from below. Windows of the recording are independent. All three only make the
-bound smaller.
+Three simplifications only make the bound smaller. The limits apply to differences between time
+steps. The length of a deviation is replaced by its largest component along fixed directions.
+Windows of the recording are solved independently.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 STEP_S = 1.0 / 30.0
-"""Time step of the bound."""
+"""Time step of the linear program."""
 
 WINDOW_STEPS = 60
-"""Steps of a window; the time of a solution grows faster than their number."""
+"""Time steps in a window. Solution time grows faster than linearly with this number."""
 
 MAX_DEVIATION_M = 0.05
 DEVIATION_M = 1e-4
-"""Displacement of the contact by which the joints' slopes are computed."""
+"""Displacement of the contact for numerical derivatives of the joint angles."""
 
 ROLL_STEPS = 40
 
@@ -75,19 +75,19 @@ DIRECTIONS = np.array(
     [one for one in product((-1.0, 0.0, 1.0), repeat=3) if any(one)], dtype=np.float64
 )
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-"""Unit vectors (26, 3). The largest component along them is at least 0.91 of a vector's length."""
+"""Unit vectors (26, 3). A vector's largest component along them is at least 0.91 of its length."""
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
-"""Unit vectors (7, 3) along which the tool speed is limited, in both senses."""
+"""Unit vectors (7, 3) along which the tool speed is limited, forwards and backwards."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitedMotion:
-    """Quantities of a mechanism over time, linear in deviations from a nominal motion.
+    """m limited quantities of a mechanism at n time steps, linear in k deviations from a motion.
 
-    values: (n, m) of the nominal motion. slopes: (n, m, k) by the deviations (k,). max_rate,
-    max_acceleration: (m,), infinite where there is no limit. low, high: (m,), range.
+    values: (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to
+    the deviations. max_rate, max_acceleration, low, high: (m,), limits; infinite if there is none.
     """
 
     values: Floats
@@ -101,10 +101,10 @@ class LimitedMotion:
 def find_least_deviation(
     motion: LimitedMotion, weights: Floats, step_s: float, *, max_deviation: float
 ) -> Floats | None:
-    """Return lengths (n,) of the deviations that minimize the weighted mean length.
+    """Return the lengths (n,) of the deviations with the least weighted mean length.
 
-    weights: (n,), zero where a deviation does not count. The lengths are lower bounds, of which the
-    mean is a bound of the mean. None if no motion fulfils the limits.
+    weights: (n,), zero where a deviation does not count. max_deviation: limit of each component.
+    The weighted mean of the lengths is a lower bound. None if no motion fulfils the limits.
     """
     steps, _, deviations = motion.slopes.shape
     scale = max_deviation
@@ -112,7 +112,7 @@ def find_least_deviation(
     limits: list[Floats] = []
 
     def add(operator: Any, nominal: Floats, bound: Floats) -> None:
-        """Limit |nominal + operator e| to bound; nominal, bound: (rows,)."""
+        """Add the constraint |nominal + operator e| <= bound on the scaled deviations e."""
         known = np.isfinite(bound)
         kept = operator[known]
         rows.extend((kept, -kept))
@@ -162,12 +162,12 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the operator of differences of an order over time, (steps - order, steps)."""
+    """Return the matrix (steps - order, steps) of finite differences of an order over time."""
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
 def _block_rows(rows: Floats) -> csr_array:
-    """Return (n, n k) with the rows (n, k) as blocks of a diagonal."""
+    """Return the block-diagonal matrix (n, n k) whose blocks are the rows (n, k)."""
     steps, width = rows.shape
     columns = np.arange(steps * width)
     owners = np.repeat(np.arange(steps), width)
@@ -176,8 +176,10 @@ def _block_rows(rows: Floats) -> csr_array:
 
 @dataclass(frozen=True, slots=True)
 class RolledSheet:
-    """A sheet that touches the object: point and rotation in the object's frame, and the point of
-    the sheet (x, y, 0) that touches.
+    """Sheet that touches the object.
+
+    point (3,), rotation (3, 3): contact point and orientation of the sheet, in the object's frame.
+    on_sheet_m: the same point in the sheet's coordinates, (x, y, 0).
     """
 
     point: Floats
@@ -185,12 +187,12 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return object_from_sheet (4, 4), lifted along the sheet's normal."""
+        """Return object_from_sheet (4, 4) of the sheet, lifted along its normal by `lifted_m`."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 
     def rolled_to(self, point: Floats, normal: Floats) -> RolledSheet:
-        """Return the sheet after rolling without slip to a near point with that normal."""
+        """Return the sheet after rolling without slip to a nearby point with the given normal."""
         before = self.rotation[:, 2]
         axis = np.cross(before, normal)
         sine, cosine = float(np.linalg.norm(axis)), float(before @ normal)
@@ -206,7 +208,7 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """The sheet that follows a finger exactly, and its reaction to deviations of the contact."""
+    """Computation of the sheet motion that follows a finger exactly, and of deviations from it."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
@@ -223,7 +225,7 @@ class FollowedContact:
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Return the sheet below each finger position (n, 3), rolled there from the front."""
+        """Return the sheet at each finger position (n, 3), after rolling there from the front."""
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
         front, above = apply(object_from_world, front_world)
@@ -247,10 +249,11 @@ class FollowedContact:
         return sheet.rolled_to(found.point, found.normal)
 
     def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
-        """Return joints and ends of the clamped edges over the deviation of the contact.
+        """Return the joint angles and the positions of the edge ends, linear in the deviations.
 
-        The deviation is that along the sheet's x and y over the object, and along its normal, m.
-        reachable gets whether the arms reach each nominal sheet; the values of others are NaN.
+        The three deviations of the contact are along the sheet's x and y on the object, and along
+        its normal, m. For each nominal sheet, appends to `reachable` whether the arms reach it. The
+        values of unreachable sheets are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
@@ -292,7 +295,7 @@ class FollowedContact:
         )
 
     def _deviated(self, sheet: RolledSheet) -> list[Floats]:
-        """Return the nominal pose, and those deviated along x, y and the normal."""
+        """Return the nominal pose, and poses with a small deviation along x, y and the normal."""
         poses = [sheet.pose()]
         for axis in range(2):
             found = self._shape.closest(
@@ -311,11 +314,11 @@ def bound_errors(
     apparatus: Apparatus | None = None,
     step_s: float = STEP_S,
 ) -> dict[str, Any]:
-    """Return the lower bound of the contact error of a finger path, in mm.
+    """Return the lower bound of the contact error for a finger path, in mm.
 
-    times_s: (n,), increasing. positions_world: (n, 3) of the true fingertip.  mean, p95: over the
-    steps in contact; p95 is that of the motion with the least mean. Steps where the arms do not
-    reach the exact sheet, and windows without a solution, count as zero.
+    times_s: (n,), increasing. positions_world: (n, 3), true fingertip. The result contains the mean
+    and the 95 % quantile (p95) over the steps in contact, for the motion with the least mean. Steps
+    whose exact sheet the arms cannot reach, and windows without a solution, count as zero.
     Raises ExperimentError for a path without contact.
     """
     followed = FollowedContact(scene, apparatus)
@@ -324,10 +327,10 @@ def bound_errors(
     contact = followed.contact_heights_m(positions) <= MAX_CONTACT_HEIGHT_M
     if not contact.any():
         raise ExperimentError(
-            "the finger path never touches the object, so the bound has no samples; give a path "
-            "in contact"
+            "the finger path never touches the object, so no lower bound can be computed; give a "
+            "path in contact"
         )
-    # The sheet is free outside of contact, so a smooth nominal motion is best for the slopes.
+    # The sheet may move freely outside of contact. A smooth nominal motion there gives good slopes.
     touching = PchipInterpolator(grid[contact], positions[contact]) if contact.sum() > 1 else None
     nominal = positions[contact][:1].repeat(len(grid), axis=0)
     if touching is not None:
@@ -367,7 +370,7 @@ def bound_errors(
 
 
 def _windows(reachable: Bools) -> list[slice]:
-    """Return intervals of at most WINDOW_STEPS consecutive reachable steps, with three or more."""
+    """Divide the reachable steps into windows of 3 to WINDOW_STEPS consecutive steps."""
     changes = np.flatnonzero(np.diff(reachable.astype(int))) + 1
     ends = [0, *changes.tolist(), len(reachable)]
     windows = []
@@ -387,9 +390,9 @@ def run_follow(
     *,
     apparatus: str | None = None,
 ) -> dict[str, Any]:
-    """Follow a path in a graph; return the results of `experiment follow --json`.
+    """Follow a finger path; return the results of `experiment follow --json`.
 
-    bag: of the graph; None: in simulated time, without a graph.
+    bag: file in which to record the running graph; None to follow in simulated time, without one.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

@@ -1,4 +1,4 @@
-"""Evaluate the tracking of the fingertip during gestures of the simulated finger."""
+"""Evaluate how accurately the fingertip is tracked during gestures of the simulated finger."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
-"""Times after the exposure: zero, the latency to the arm, and that plus the arm's servo lag."""
+"""Evaluated prediction horizons: zero, the latency from exposure to arm command, and that latency
+plus the servo lag of the arm."""
 
 MAX_LAG_S = 0.08
-"""Maximum lag: less than half the period of the fastest taps, so that no tap matches another."""
+"""Maximum lag in the cross-correlation. It is less than half the period of the fastest taps, so
+that a tap is not matched with the next one."""
 
 MIN_SAMPLES = 10
 GAP_PERIODS = 2.5
@@ -46,11 +48,11 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""Gestures by name: the paper's strokes, and models of human gestures."""
+"""Finger paths by name: the strokes of Furukawa et al. 2007, and models of human gestures."""
 
 
 def gesture_path(name: str, scene: Scene) -> FingerPath:
-    """Make the path of a gesture on the scene's object, labelled with its name."""
+    """Make the finger path of a gesture on the scene's object; its label is the gesture's name."""
     try:
         return GESTURES[name](scene).model_copy(update={"label": name})
     except (FingerPathError, UnfitGeometryError) as error:
@@ -58,7 +60,7 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
 
 
 def select_gestures(names: Sequence[str]) -> list[str]:
-    """Check names of gestures and remove duplicates; no name selects all."""
+    """Check the names of gestures and remove duplicates; without names, return all names."""
     selected = list(dict.fromkeys(names)) or list(GESTURES)
     for name in selected:
         if name not in GESTURES:
@@ -67,9 +69,9 @@ def select_gestures(names: Sequence[str]) -> list[str]:
 
 
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
-    """Make the path of a gesture or of a recorded finger in the scene of a launch file.
+    """Make a finger path in the scene of a launch file, from a gesture's name or a recorded path.
 
-    settings: as for `load_graph`; a "scene=FILE" among them is another scene.
+    settings: as for `load_graph`; "scene=FILE" replaces the scene.
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
@@ -79,7 +81,7 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     file = Path(name_or_file)
     if not file.suffix and not file.exists():
         raise ExperimentError(
-            f'"{name_or_file}" is not a gesture or a file; '
+            f'"{name_or_file}" is neither a gesture nor a file; '
             f"{did_you_mean(name_or_file, list(GESTURES))} Or give a CSV file of a recorded finger"
         )
     try:
@@ -102,17 +104,17 @@ def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedu
 
 @dataclass(frozen=True, slots=True)
 class TrueFinger:
-    """True finger at the exposures: times (n,) ns, positions and velocities (n, 3)."""
+    """True finger motion, sampled at the exposures: times (n,) ns, positions, velocities (n, 3)."""
 
     times_ns: Times
     positions: Floats
     velocities: Floats
 
     def interpolate(self, times_ns: Times) -> Floats:
-        """Return positions (m, 3) at other times, by cubic Hermite interpolation.
+        """Return the positions (m, 3) at other times (m,), by cubic Hermite interpolation.
 
-        The error at 60 Hz is at most 45 um in the fastest taps, 13 um in slower ones, 8 um
-        otherwise. Positions between missed frames and outside all exposures are NaN.
+        At 60 Hz the interpolation error is at most 45 um in the fastest taps, 13 um in slower taps
+        and 8 um otherwise. Positions in gaps between exposures, and outside them, are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
@@ -129,9 +131,10 @@ class TrueFinger:
 
 @dataclass(frozen=True, slots=True)
 class GestureRecording:
-    """Data of gestures from a bag, with times in ns of one clock.
+    """Data of gestures, read from a bag; all times are in ns on the same clock.
 
-    fingertips: in the order of exposure. windows_ns: start and end of each gesture.
+    truth: true finger. fingertips: measured at the exposures `times_ns`. windows_ns: start and end
+    of each gesture.
     """
 
     truth: TrueFinger
@@ -141,9 +144,9 @@ class GestureRecording:
 
 
 def read_gestures(bag: Path) -> GestureRecording:
-    """Read the true finger and the fingertips from a bag.
+    """Read the true finger and the measured fingertips from a bag.
 
-    A gesture's window excludes the motion to its first point and the time after its last.
+    The window of a gesture excludes the motion to its first point and the time after its last one.
     """
     truths: dict[int, TwinFinger] = {}
     tips: dict[int, Fingertip] = {}
@@ -157,7 +160,8 @@ def read_gestures(bag: Path) -> GestureRecording:
                 pass
     if len(truths) < MIN_SAMPLES:
         raise ExperimentError(
-            f"{bag}: {len(truths)} messages of twin/finger, at least {MIN_SAMPLES} are required"
+            f"{bag}: contains {len(truths)} messages of twin/finger, at least {MIN_SAMPLES} are "
+            "required; record this topic with a simulated finger"
         )
     on_path: dict[str, list[int]] = {}
     for at_ns in sorted(truths):
@@ -179,11 +183,11 @@ def read_gestures(bag: Path) -> GestureRecording:
 
 
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
-    """Return the jumps of consecutive estimates without the finger's motion, in sigmas (n-1,).
+    """Return the jumps between consecutive position estimates, in standard deviations (n-1,).
 
-    errors: (n, 3) m. covariances: (n, 3, 3) m^2, of the estimates. Differences of errors exclude
-    the finger's motion. Sigma is the standard deviation of the difference along its direction, for
-    independent estimates.
+    errors: (n, 3) m, errors of the estimates. A jump is the difference of two errors, so it does
+    not contain the finger's motion. covariances: (n, 3, 3) m^2, covariances of the estimates. The
+    standard deviation is along the jump, for independent estimates.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -194,7 +198,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """Return rms, 99 % quantile and maximum of errors (n, 3) m, in mm; None without errors."""
+    """Return rms, 99 % quantile and maximum length of errors (n, 3) m, in mm; None without any."""
     if len(errors) == 0:
         return {"rms": None, "p99": None, "max": None}
     lengths = 1e3 * np.linalg.norm(errors, axis=1)
@@ -206,7 +210,7 @@ def error_mm(errors: Floats) -> dict[str, float | None]:
 
 
 def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
-    """Return the predicted positions (n, 3) of fingertips `lead_s` after their exposures."""
+    """Return the positions (n, 3) that fingertips predict for `lead_s` after their exposures."""
     if lead_s == 0.0:
         return _stack_rows([tip.position_world_m for tip in tips])
     return _stack_rows(
@@ -218,15 +222,15 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack points as rows (n, 3); n may be 0."""
+    """Stack points (3,) as rows of an array (n, 3), also for n = 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
-    """Return the results of one gesture in mm and ms; None for unknown values.
+    """Return the tracking results of one gesture in mm and ms; None for unknown values.
 
-    missing: number of exposures without a fingertip. reasons: counts of the reasons of invalid
-    fingertips. jump: between consecutive valid fingertips.
+    missing: number of exposures without a fingertip. reasons: number of invalid fingertips, by
+    reason. jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
     """
     begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)
     exposures = recorded.truth.times_ns
@@ -259,7 +263,7 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
 
 
 def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """Return the maximum jump between consecutive fingertips (n,), and the number above SIGMAS."""
+    """Return the largest jump between consecutive fingertips, and the number of jumps > SIGMAS."""
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}
     sigmas = jump_sigmas(errors, np.array([tip.covariance[:3, :3] for tip in tips]))
@@ -273,7 +277,7 @@ def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any
 def _evaluate_prediction(
     truth: TrueFinger, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
 ) -> dict[str, Any]:
-    """Return the error and lag of the predictions for `lead_s` after each exposure."""
+    """Return the error and lag of the positions predicted for `lead_s` after each exposure."""
     ahead_ns = times_ns + round(lead_s * 1e9)
     true = truth.interpolate(ahead_ns)
     known = np.isfinite(true).all(axis=1)
@@ -289,9 +293,9 @@ def _evaluate_prediction(
 
 
 def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Return the results of `experiment gestures --json` from its bag.
+    """Evaluate a bag; return the results of `experiment gestures --json`.
 
-    followed: errors of the sheet; None if the bag does not contain the arms or the scene.
+    followed: errors of the sheet for each path; None if the bag lacks the arms or the scene.
     """
     recorded = read_gestures(bag)
     followed = {run["path"]: run for run in read_followed(bag)}

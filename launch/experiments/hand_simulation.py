@@ -1,9 +1,9 @@
 """Simulate a hand that is coupled to the sheet, in time steps of a quarter of a millisecond.
 
-The simulation is the reference for the bounds of the planner and shares no code with them.  The
-finger is a mass on the spring and the damper of the hand, with the finger pad in series.  The sheet
-pushes it by a nonlinear force and cannot pull.  The camera samples the finger with a resolution,
-and the sheet's offset follows after a delay.
+The simulation is the reference for the stability bounds of the planner, with which it shares no
+code. The finger is a mass on the spring and damper of the hand, with the finger pad in series. The
+sheet pushes it with a nonlinear force and cannot pull. The camera samples the finger depth with a
+finite resolution. After a delay, the sheet moves to the offset (its depth) computed from this.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ Curve = Callable[[Floats], Floats]
 
 STEPS_PER_PERIOD = 64
 PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
-"""Finger pad in series, at about 1 N: Hertz contact of a tissue of 0.07 to 0.2 MPa."""
+"""Stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
 
 CAMERA_RESOLUTION_M = 2e-5
 RELEASE_M = 2e-3
 """Distance from the equilibrium at which the finger is released."""
 
 MAX_AMPLITUDE_M = 5e-5
-"""Largest oscillation that counts as none."""
+"""Maximum amplitude at which the finger counts as being at rest."""
 
 SLOWEST_DECAY_PER_S = 0.5
-"""Decay of an oscillation that counts as stable."""
+"""Minimum decay rate of an oscillation that counts as stable."""
 
 ENERGY_FRACTION = 0.05
-"""Energy that a stable sheet may deliver in 2 s, over the energy of the release."""
+"""Maximum ratio of the energy that a stable sheet delivers in 2 s to the energy at release."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cases:
-    """Hands and loops that are simulated together; each field has shape (n,).
+    """Hands and control loops that are simulated together; each field has shape (n,).
 
-    depth_m: equilibrium of the finger in the object.  gain: factor of the sheet's motion about the
-    equilibrium.  filter_s, lead_s: of the depth from which the offset follows.
+    delay_s: time from exposure to the sheet's motion. depth_m: finger depth at equilibrium. gain:
+    factor of the sheet's motion relative to its position at equilibrium. filter_s, lead_s: time
+    constants of the low-pass filter and of the lead (prediction) applied to the measured depth.
     """
 
     mass_kg: Floats
@@ -60,10 +61,10 @@ class Cases:
 class Motion:
     """Result of a simulation.
 
-    decay_per_s (n,): of the oscillation about its mean, between the second and the last quarter;
-    infinite if it has died out.  amplitude_m (n,): half the range of the last quarter.
-    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s after
-    the first eighth, beyond what a passive sheet returns, over that of the release.
+    decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
+    time; infinite if it has died out. amplitude_m (n,): amplitude in the last quarter.
+    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s, minus
+    that of a passive sheet, divided by the energy at release. The first eighth is ignored.
     """
 
     decay_per_s: Floats
@@ -72,20 +73,20 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return which cases (n,) have no sustained oscillation."""
+        """Return a mask (n,) of the cases without a sustained oscillation."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Return which cases (n,) decay, and in which the sheet delivers no energy."""
+        """Return a mask (n,) of the cases that decay and in which the sheet delivers no energy."""
         return np.asarray(self.decays & (self.energy_ratio <= ENERGY_FRACTION))
 
 
 class HeldOffset:
-    """Offset of the sheet from sampled depths: filtered, delayed and extrapolated.
+    """Sheet offset that is computed from sampled finger depths, with filter, delay and lead.
 
-    The sheet moves on at its last rate until the next offset takes effect, as the arms do.
+    Until the next offset takes effect, the sheet moves on at its last rate, as with the real arms.
     """
 
     def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:
@@ -99,7 +100,7 @@ class HeldOffset:
         self._rest_m = offset(cases.depth_m)
         delays = np.round(cases.delay_s / step_s).astype(int)
         self._delays, self._ring = delays, int(delays.max()) + 1
-        # A ring of due times holds at most one offset per sample and case.
+        # Ring buffer of queued offsets by the step at which they take effect, for each case.
         self._due = np.zeros((self._ring, len(cases)), dtype=bool)
         self._queued = np.zeros((self._ring, 2, len(cases)))
         self._last = self._rest_m.copy()
@@ -107,7 +108,7 @@ class HeldOffset:
         self._columns = np.arange(len(cases))
 
     def sample(self, step: int, depths_m: Floats) -> None:
-        """Measure the depths (n,) and queue the offsets that follow from them."""
+        """Measure the finger depths (n,), and queue the offsets that are computed from them."""
         seen = CAMERA_RESOLUTION_M * np.round(depths_m / CAMERA_RESOLUTION_M)
         before = self._filtered
         self._filtered = before + self._weight * (seen - before)
@@ -125,7 +126,7 @@ class HeldOffset:
         return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offset (n,) at a step."""
+        """Return the sheet's offset (n,), m, at a time step; call it for each step in order."""
         row = step % self._ring
         due = self._due[row]
         self._held = np.where(due, self._queued[row, 0], self._held + self._step_s * self._rate)
@@ -137,16 +138,17 @@ class HeldOffset:
 def simulate_release(
     cases: Cases, *, force: Curve, offset: Curve, period_s: float, seconds: float = 8.0
 ) -> Motion:
-    """Release each finger RELEASE_M before its equilibrium and return how it comes to rest.
+    """Release each finger at a distance of RELEASE_M from its equilibrium; return its motion.
 
-    force: of the sheet over its indentation, N.  offset: of the sheet over the depth, m; it must
-    leave the sheet indented at the equilibrium.
+    force: sheet force (N) as a function of the sheet's indentation (m). offset: sheet offset (m) as
+    a function of the finger depth (m); the sheet must be indented at equilibrium. period_s: camera
+    period.
     """
     step_s = period_s / STEPS_PER_PERIOD
     steps = round(seconds / step_s)
     sheet = HeldOffset(cases, offset, period_s, step_s)
     rest_force = force(np.maximum(cases.depth_m - offset(cases.depth_m), 0.0))
-    # The bone lies deeper than the skin by the compression of the pad.
+    # The bone is deeper than the skin by the compression of the finger pad.
     bone_rest = cases.depth_m + rest_force / PAD_STIFFNESS_N_PER_M
     spring_rest = bone_rest + rest_force / cases.stiffness_n_per_m
     bone, skin = bone_rest - RELEASE_M, cases.depth_m - RELEASE_M
@@ -159,7 +161,8 @@ def simulate_release(
     stiffness = (force(indented + 1e-4) - force(indented - 1e-4)) / 2e-4
     for step in range(steps):
         if step % STEPS_PER_PERIOD == 0:
-            # The camera sees the nail: the bone, less the pad's compression at rest.
+            # The marker is on the nail, which moves with the bone. Subtracting the pad's
+            # compression at rest gives the depth of the skin.
             sheet.sample(step, bone - (bone_rest - cases.depth_m))
         pushed = force(np.maximum(skin - sheet.advance(step), 0.0))
         compression = PAD_STIFFNESS_N_PER_M * (bone - skin)
@@ -168,7 +171,7 @@ def simulate_release(
         spring_n = cases.stiffness_n_per_m * (spring_rest - bone)
         speed = speed + step_s / cases.mass_kg * (spring_n - cases.damping_ns_per_m * speed - pad_n)
         bone, skin = bone + step_s * speed, skin + step_s * skin_speed
-        # Bounds keep a diverging case finite; it counts as unstable long before.
+        # Bounds keep diverging cases finite. Such a case counts as unstable long before.
         np.clip(bone, -0.5, 0.5, out=bone)
         np.clip(skin, -0.5, 0.5, out=skin)
         np.clip(speed, -50.0, 50.0, out=speed)

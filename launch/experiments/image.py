@@ -1,7 +1,9 @@
-"""Section VI of the paper: the image on an inclined sheet (Fig. 11) and a pushed one (Fig. 13).
+"""Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
-Each case has a label, which is in the renderer's frames and the simulated eye's images. The results
-are computed from the images in the bag.
+These are the experiments of Furukawa et al. 2007 ("the paper"), section VI, Figs. 11 and 13. A case
+is an angle or depth with a correction: the method that corrects the image for the sheet's shape.
+The label of a case is in the renderer's frames and in the simulated eye's images. The results are
+computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ REACH_S = 1.5
 def reach_path(
     scene: Scene, label: str, points: Sequence[tuple[float, float]], *, along_m: float = 0.0
 ) -> FingerPath:
-    """Make a path through points, each given as (angle around the cylinder, height above its side).
+    """Make a finger path through points (angle around the cylinder in rad, height above it in m).
 
     along_m: position along the cylinder's axis, from its centre.
     """
@@ -51,17 +53,17 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Make a path to a point above the cylinder, where the sheet is inclined by that angle."""
+    """Make a finger path to a point above the cylinder where the sheet is inclined by an angle."""
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Make a path that pushes the cylinder's side to that depth.
+    """Make a finger path that pushes the cylinder's side to a depth.
 
     along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front. Raises ExperimentError for a position out of reach.
+    front. Raises ExperimentError for a position outside the limits.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
@@ -79,8 +81,8 @@ class Series:
     """One of the two image experiments.
 
     key: result column of the varied value. name: format of a case's name with the value. path:
-    function that makes the finger's path. sizes: function that measures the cylinder's sizes in an
-    image, m. size_names: symbols of the sizes in the paper.
+    function that makes the finger path for a value. sizes: function that measures sizes of the
+    cylinder in an image, m. size_names: symbols of the sizes in the paper. values: default values.
     """
 
     key: str
@@ -91,7 +93,7 @@ class Series:
     values: tuple[float, ...]
 
     def label(self, value: float, correction: Correction) -> str:
-        """Return the label of a case's image."""
+        """Return the label of the image for a value and a correction."""
         return f"{self.name.format(value)}, {correction}"
 
 
@@ -107,7 +109,7 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 
 
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
-    """Make the pushes at a position on the cylinder's side; zeros are the centre of its front."""
+    """Make the push experiment at a position on the cylinder's side; 0, 0 is its front centre."""
     if not along_mm and not tilt_deg:
         return PUSH
     return replace(
@@ -118,27 +120,27 @@ def make_push_series(along_mm: float, tilt_deg: float) -> Series:
 
 
 RAMPS: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""Patterns for a dense error map."""
+"""Patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
-    """Return the label of a case's image of a pattern."""
+    """Return the label of the image of a pattern in the case `label`."""
     return f"{label}, {pattern}"
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of a case's images of a pattern that are drawn for each eye."""
+    """Return the label of the images of a pattern in a case that are drawn for each eye."""
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 
 def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
-    """Return the key of an image among those of `read_images`."""
+    """Return the key of an image in the result of `read_images`, from its label and viewpoint."""
     return label if viewpoint == "centre" else f"{label}, {viewpoint}"
 
 
 @dataclass(frozen=True, slots=True)
 class EyeImage:
-    """Image of the simulated eye from a bag."""
+    """Image that the simulated eye sees, with the image that it should see (`expected`)."""
 
     label: str
     correction: Correction
@@ -165,7 +167,10 @@ def read_images(bag: Path) -> dict[str, EyeImage]:
 def size_errors_mm(
     image: EyeImage, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
 ) -> list[float]:
-    """Return absolute differences between measured and expected sizes, as in the paper, mm."""
+    """Return the absolute differences (mm) of the cylinder's sizes in the seen and expected image.
+
+    sizes: function that measures the sizes. The paper uses the same measure.
+    """
     measured = np.array(sizes(image.seen, image.metres_per_px))
     expected = np.array(sizes(image.expected, image.metres_per_px))
     return [float(error) for error in np.abs(measured - expected) * 1e3]
@@ -177,13 +182,13 @@ def find_image(images: dict[str, EyeImage], label: str) -> EyeImage:
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Compute the errors at all visible points of a case, from its images of both ramps."""
+    """Compute the errors at all visible points of a case, from the images of both `RAMPS`."""
     x, y = (find_image(images, make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
 def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, ErrorMap]:
-    """Compute the errors of the left and of the right eye's image of a case."""
+    """Compute the errors at all visible points of a case for the left and for the right eye."""
 
     def errors_of(viewpoint: Viewpoint) -> ErrorMap:
         x, y = (
@@ -198,8 +203,8 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
     """Return the mean error of each eye's image, and of the disparity, mm; None without points.
 
-    The disparity error is the right eye's error minus the left eye's, across and up, where both
-    eyes see the object at the same position on the imaginary screen.
+    The disparity error is the right eye's error minus the left eye's, horizontal and vertical. It
+    is computed at screen positions at which both eyes see the object.
     """
     disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
     across_mm, up_mm = (
@@ -249,7 +254,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum error of a size for each correction, mm."""
+    """Return the mean and the maximum size error of each correction, mm."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),
@@ -266,7 +271,7 @@ def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, flo
 
 
 def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
-    """Return mean, 95 % quantile and maximum over all visible points, mm; None without points."""
+    """Return mean, 95 % quantile and maximum error of all visible points, mm; None without any."""
     sizes_mm = 1e3 * errors.sizes_m
     if len(sizes_mm) == 0:
         return dict.fromkeys(("map_mean_mm", "map_p95_mm", "map_max_mm"))

@@ -24,20 +24,20 @@ def estimate_lag_s(
     """Estimate the lag of `follower` behind `leader`, s; negative if it is ahead.
 
     times_s: (n,), increasing, not necessarily uniform. follower, leader: (n,) or (n, k), m, at
-    those times. leader_times_s: (m,), other times for the leader, which include the follower's
-    range.
+    those times. leader_times_s: (m,), times of the leader if they differ; they must cover the range
+    of `times_s`.
 
-    The lag maximizes the normalized cross-correlation over all axes. The leader is shifted by a
-    cubic spline against the part of the follower that all shifts within +-max_lag_s cover. A
-    parabola through the best shift and its neighbours refines it. Mean and linear trend are removed
-    from both, since a lag of uniform motion equals an offset. If the lag differs between slow and
-    fast parts, larger motions dominate. The standard error for ten seconds at 60 Hz with 0.5 mm of
-    motion per axis is 0.6 ms with white noise of 0.1 mm, 1.9 ms with 0.3 mm.
+    The lag maximizes the normalized cross-correlation over all axes. The leader is interpolated by
+    a cubic spline and shifted. Only those samples of the follower count that the leader covers at
+    all shifts within +-max_lag_s. A parabola through the best shift and its neighbours refines the
+    result. Mean and linear trend are removed from both motions, since in uniform motion a lag
+    cannot be distinguished from an offset. If slow and fast parts have different lags, larger
+    motions dominate. For ten seconds at 60 Hz and 0.5 mm of motion per axis, the standard error is
+    0.6 ms with white noise of 0.1 mm. It is 1.9 ms with 0.3 mm.
 
-    Returns None if the leader does not move besides its trend, the correlation is below
-    MIN_CORRELATION, or the best shift is at the end of the range. Raises ValueError for invalid
-    times, values that are not finite or differ in number, and durations up to four times
-    `max_lag_s`.
+    Returns None if the motion is only a linear trend, the correlation is below MIN_CORRELATION, or
+    the best shift is at the end of the range. Raises ValueError for invalid times, values that are
+    not finite or differ in number, and durations up to four times `max_lag_s`.
     """
     follower_rows, leader_rows = (_to_rows(values) for values in (follower, leader))
     leader_s = times_s if leader_times_s is None else leader_times_s
@@ -52,7 +52,7 @@ def estimate_lag_s(
     if not all(np.isfinite(values).all() for values in numbers):
         raise ValueError("times and values must be finite; remove unknown samples")
     if not ((np.diff(times_s) > 0.0).all() and (np.diff(leader_s) > 0.0).all()):
-        raise ValueError("times must increase")
+        raise ValueError("times of follower and leader must increase; sort the samples")
     if len(times_s) < 8 or times_s[-1] - times_s[0] <= 4.0 * max_lag_s:
         raise ValueError(
             f"{len(times_s)} samples; a lag of up to {max_lag_s:g} s requires at least 8 "

@@ -1,4 +1,4 @@
-"""Draw the image error at each visible point, per case and correction."""
+"""Draw maps of the image error at each visible point, for each case and correction."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MIN_MM, MAX_MM = 0.01, 10.0
 
 
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
-    """Draw one row per value of the series and one column per correction.
+    """Draw error maps, with one row per value of the series and one column per correction.
 
     Raises ExperimentError if an image of a case is missing.
     """
@@ -52,7 +52,7 @@ def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> 
 
 
 def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
-    """Return the rows and columns in which any map has values, or all if none has."""
+    """Return the ranges of rows and columns that contain all values of the maps, to crop them."""
     valid = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
     if not valid.any():
         return slice(None), slice(None)

@@ -1,9 +1,11 @@
-"""Evaluate an apparatus without a graph: fingertip, sheet, image and felt force at rest.
+"""Evaluate an apparatus without running the nodes.
 
-The nodes' methods get what the scene states, and the simulator's models get what is true. Only the
-rubber remembers a push in and out. Nothing else moves, so servo lag, delays, frame rate, tremor and
-backlash have no effect here; a graph measures those. Images have no noise. The references share no
-code with the methods: own camera, arms, membrane and eye.
+An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
+parameters of the scene, and the simulator's models those of the apparatus. The errors of fingertip,
+sheet, image and felt force are computed at rest. Only the force model of the rubber depends on
+time: it simulates a push in and out. So servo lag, delays, frame rate, tremor and backlash have no
+effect here; an experiment with running nodes measures those. Images have no noise. The references
+for the errors have their own models of camera, arms, membrane and eye, not those of the nodes.
 """
 
 from __future__ import annotations
@@ -51,20 +53,21 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 Floats = NDArray[np.float64]
 
 METRES_PER_PX = 0.0007
-"""Resolution of the paper's images."""
+"""Resolution of the images in Furukawa et al. 2007."""
 
 STROKE_RATIOS = (0.0, 0.5, 1.0)
-"""Positions of the finger around the object, over the length that a finger can stroke upwards."""
+"""Evaluated finger positions, as fractions of the upper half of the touchable arc of the object."""
 
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
-"""Depths of the pushes whose force is compared; limited to half and all of the scene's depth."""
+"""Depths of the pushes whose forces are compared. They are limited to half and to all of the push
+depth of the scene."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated one, and the force at which the finger
-turns back over the evaluated one."""
+"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
+which the finger reverses, to the evaluated force."""
 
 MIN_FORCE_N = 0.1
-"""Minimum force to which an error is related; nobody feels a fraction of a smaller one."""
+"""Minimum denominator of relative force errors. Relative errors of smaller forces are not felt."""
 
 MAX_IMAGE_DEPTH_M = 0.03
 RENDERER_SPACING_M = 0.0025
@@ -72,7 +75,7 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """Evaluated metrics, by their names in the results."""
+    """Names of the evaluated metrics in the results."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -85,14 +88,14 @@ ALL_METRICS = frozenset(Metric)
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations that the nodes of a graph use, beside the scene."""
+    """Calibrations of camera and sheet that the nodes use in addition to the scene."""
 
     stereo: StereoCalibration | None = None
     sheet: SheetCalibration | None = None
 
     @staticmethod
     def of(plan: ResolvedGraph) -> NodeCalibrations:
-        """Read the calibration files of the graph's triangulator and planner."""
+        """Read the calibration files that the plan's triangulator and planner use."""
         stereo: StereoCalibration | None = None
         sheet: SheetCalibration | None = None
         for node in plan.nodes.values():
@@ -106,12 +109,12 @@ class NodeCalibrations:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Errors of one apparatus; None where a metric was not evaluated.
+    """Errors of one apparatus; None for metrics that were not evaluated.
 
     fingertip_m: (n, 3), measured minus true fingertip. sheet_m: (n, 3), point of the object under
-    the true finger minus the sheet's contact point. image_m: (rows, columns, 2) per case, NaN where
-    nothing is seen. felt_n, expected_n: (k,), force of the true sheet, and what the planner's
-    model of the sheet gives for the same push.
+    the true finger minus the contact point of the sheet. image_m: one map (rows, columns, 2) of
+    image errors per case, NaN where the object is not visible. felt_n, expected_n: (k,), force of
+    the true sheet, and force that the planner's model of the sheet predicts for the same push.
     """
 
     fingertip_m: Floats | None = None
@@ -121,7 +124,11 @@ class Evaluation:
     expected_n: Floats | None = None
 
     def figures(self) -> dict[str, float | None]:
-        """Return the absolute errors: mean lengths, root mean square of the image, mean ratio."""
+        """Summarize the errors in one number per metric.
+
+        The image error is a root mean square, the force error a mean absolute relative error. The
+        others are mean lengths.
+        """
         return {
             Metric.SHEET: _mean_length_mm(self.sheet_m),
             Metric.IMAGE: None if self.image_m is None else _rms_mm(self.image_m),
@@ -130,9 +137,10 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return by how much another evaluation of the same cases differs, in the same units.
+        """Return the differences from another evaluation of the same cases, as in `figures`.
 
-        Differences are taken of each vector, pixel and push, so that common errors cancel.
+        Errors of single vectors, pixels and pushes are subtracted before averaging, so that errors
+        common to both evaluations cancel.
         """
         image = None
         if self.image_m is not None and other.image_m is not None:
@@ -166,7 +174,7 @@ def _mean_length_mm(vectors_m: Floats | None) -> float | None:
 
 
 def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
-    """Return the root mean square over all seen points of all maps; None if nothing is seen."""
+    """Return the root mean square over all visible points, mm; None if nothing is visible."""
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
@@ -174,7 +182,7 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A sheet in contact: pose (4, 4), and the finger's point on the undeformed object (3,)."""
+    """Sheet in contact: its pose (4, 4), and the touched point of the undeformed object (3,)."""
 
     world_from_sheet: Floats
     point: Floats
@@ -185,9 +193,9 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """Evaluate apparatuses of one scene.
+    """Evaluator of apparatuses of one scene.
 
-    Raises ExperimentError where the sheet or the arms have no solution.
+    Its methods raise ExperimentError if the equations of the sheet or the arms have no solution.
     """
 
     def __init__(self, scene: Scene, calibrations: NodeCalibrations | None = None) -> None:
@@ -212,7 +220,7 @@ class OfflineEvaluator:
     def evaluate(
         self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
     ) -> Evaluation:
-        """Evaluate the named metrics of an apparatus."""
+        """Evaluate the given metrics of an apparatus. Raises ExperimentError without a solution."""
         try:
             return self._evaluate(apparatus, metrics)
         except (NotConvergedError, ValueError) as error:
@@ -240,14 +248,17 @@ class OfflineEvaluator:
         return Evaluation(fingertip, sheet, image, felt, expected)
 
     def _touch(self, around_m: float) -> Contact:
-        """Return the sheet that has rolled from the front to a place around the object."""
+        """Return the sheet after rolling without slip from the object's front.
+
+        around_m: arc length to its new contact point.
+        """
         places = np.array([[0.0, around_m, 0.0], [0.0, around_m, 1e-3]])
         point, above = map_to_surface(self._scene, places)
         return self._lay_sheet(point, (above - point) / 1e-3, np.array([0.0, around_m, 0.0]))
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
-        """Return the sheet with a normal that touches `point` with its point `on_sheet_m`."""
+        """Return the sheet with the given normal whose point `on_sheet_m` touches `point`."""
         x_axis = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
         x_axis /= np.linalg.norm(x_axis)
         rotation = np.column_stack([x_axis, np.cross(normal, x_axis), normal])
@@ -256,10 +267,11 @@ class OfflineEvaluator:
     def _measure_fingertips(
         self, scene: Scene, apparatus: Apparatus, contacts: list[Contact]
     ) -> Floats:
-        """Return measured minus true fingertips (n, 3): the true rig, the nodes' triangulation.
+        """Return measured minus true fingertip positions (n, 3), one for each contact.
 
-        The finger strokes upwards at the scene's working speed, so that a wrong stamp and a skew
-        of the two exposures count.
+        Pixels are computed with the true camera, and triangulated with the nodes' calibration. The
+        finger strokes upwards at the scene's working speed. So wrong timestamps and different
+        exposure times of both cameras also cause errors.
         """
         camera = rig.make_true_camera(scene.camera)
         left_from_world = inverse(pose_matrix(camera.world_from_left))
@@ -285,14 +297,17 @@ class OfflineEvaluator:
             )
             if found is None:
                 raise ExperimentError(
-                    f"apparatus {apparatus.origin}: a fingertip at {contact.point} m cannot be "
-                    "triangulated; check the camera's offsets"
+                    f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "
+                    "triangulated; check the camera offsets in the apparatus"
                 )
             errors.append(found.point_world - contact.point)
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
-        """Return the edges of the sheet, behind the contact's plane by the sag of the middle."""
+        """Return the clamped edges (4, 4) that bring the sheet into contact.
+
+        They are moved back by the sag at the sheet's centre, so that its centre touches the plane.
+        """
         sheet = self._scene.sheet
         distance_m = sheet.width_m * self._stretch_ratio
         sag_m = compute_sag_m(
@@ -309,7 +324,10 @@ class OfflineEvaluator:
     def _sheet_error(
         self, arms: ArmPair, surface: SheetSurface, contact: Contact, tip_error: Floats
     ) -> Floats:
-        """Return the point under the true finger minus the sheet's contact point, (3,), world."""
+        """Return the object point under the true finger minus the sheet's contact point (3,), m.
+
+        The arms place the sheet for the measured finger. The result is in the world frame.
+        """
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
         believed = apply(self._world_from_object, foot.point)
@@ -344,9 +362,9 @@ class OfflineEvaluator:
     def _compare_forces(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the felt forces (k,) and those of the planner's model at the same pushes, N.
+        """Return the felt forces (k,) and the forces (k,) of the planner's model, N.
 
-        Each push has two: while the finger moves in, and while it moves out.
+        Each push contributes two forces: while the finger moves in, and while it moves out.
         """
         contact = self._touch(0.0)
         left, right = arms.hold(self._edges(contact))
@@ -378,7 +396,7 @@ class OfflineEvaluator:
     def _compare_images(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, ...]:
-        """Return the error maps of a tilted and of a pushed sheet."""
+        """Return the image error maps of a tilted sheet and of a pushed sheet."""
         tilted, upright = self._touch(self._places_m[-1]), self._touch(0.0)
         depth_m = min(MAX_IMAGE_DEPTH_M, self._scene.working_range.push_depth_m)
         tip = upright.point - depth_m * upright.normal
@@ -421,10 +439,10 @@ class OfflineEvaluator:
         return self._correct_parallax(errors, eye)
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
-        """Return the errors against the object as the true eye should see it.
+        """Return the errors relative to what the true eye should see.
 
-        The drawn positions are those that the eye of the scene sees on the screen plane. Another
-        eye should see the same points of the object elsewhere on it.
+        The expected positions on the screen plane are computed for the eye of the scene. From the
+        true eye position, the same object points should appear elsewhere on that plane.
         """
         believed_eye = self._scene.eyes.centre_world_m
         if np.array_equal(eye, believed_eye):
@@ -445,9 +463,10 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return (rows, columns, 2) m: by how much points of the object move on the screen plane.
+        """Return the shift of object points on the screen plane for another eye position, m.
 
-        Rows and columns are those of the image of the scene's eye; NaN where it sees no object.
+        Shape (rows, columns, 2), for the pixels of `_object_points`; NaN where the scene's eye sees
+        no object.
         """
         on_screen, points = self._object_points
         to_screen = eye[2] / (eye[2] - points[..., 2:])
@@ -455,10 +474,10 @@ class OfflineEvaluator:
 
     @cached_property
     def _object_points(self) -> tuple[Floats, Floats]:
-        """Return what the scene's eye sees at each pixel of the measuring camera.
+        """Return where the ray of each pixel of the measuring camera meets screen plane and object.
 
-        That is the point on the screen plane (rows, columns, 2), and that of the object behind it
-        (rows, columns, 3), NaN where there is none.
+        The measuring camera is at the scene's eye position. Returns points on the screen plane
+        (rows, columns, 2) and on the object (rows, columns, 3); NaN where the ray misses it.
         """
         size = round(2.0 * HALF_WINDOW_M / METRES_PER_PX)
         rays = eye_rays(
@@ -478,9 +497,9 @@ class OfflineEvaluator:
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the force of the rubber over that of an elastic sheet (2,), moving in and out.
+    """Return the ratios (2,) of the rubber's force to that of an elastic sheet, for in and out.
 
-    The elastic force rises to `TURNING_RATIO` of the evaluated one and falls again, linearly.
+    The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
     """
     history = ForceHistory.of(apparatus)
     if history is None:
@@ -492,7 +511,7 @@ def compute_history_ratios(apparatus: Apparatus) -> Floats:
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
-    """Return the metrics whose errors exceed the scene's tolerances."""
+    """Return the names of the metrics whose errors exceed the scene's tolerances."""
     limits = metric_tolerances(scene)
     return [
         metric.value
@@ -502,7 +521,7 @@ def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
 
 
 def metric_tolerances(scene: Scene) -> dict[Metric, float]:
-    """Return the scene's tolerance of each metric, in the metric's unit."""
+    """Return the scene's tolerances by metric, in the unit of the metric."""
     given = scene.tolerances
     return {
         Metric.SHEET: 1e3 * given.sheet_position_m,

@@ -1,4 +1,4 @@
-"""Draw the figures of the demo and of the experiments."""
+"""Draw the figures of the demo and of the experiments into image files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EVENTS = (
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""Drawn part of the eye's image, as fractions of its size; the rest shows only dark sheet."""
+"""Drawn part of the eye's image, as fractions of its size. The rest shows only the dark sheet."""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -36,7 +36,7 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw one row per case: the eye's image for each correction, and the expected image."""
+    """Draw one row per case: what the eye sees with each image correction, and should see."""
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -64,7 +64,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -
 
 
 def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Return left, top, width and height of the non-black part; None if all pixels are black."""
+    """Return the bounding box of all non-black pixels (left, top, width, height), or None."""
     ys, xs = np.nonzero(image.max(axis=2) > MAX_BLACK)
     if len(xs) == 0:
         return None
@@ -72,7 +72,9 @@ def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | No
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Draw position and angle errors over time, one column per stroke, with the paper's mean."""
+    """Draw position and angle errors over time, one column per stroke, with the mean error of the
+    same stroke in Furukawa et al. 2007.
+    """
     figure = Figure(figsize=(5.5 * len(errors), 6), layout="constrained")
     axes = figure.subplots(2, len(errors), squeeze=False)
     for column, (seconds, stroke) in enumerate(errors.items()):
@@ -105,7 +107,7 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
 
 
 def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the latency from exposure to each event: median and 1-99 %."""
+    """Draw the median and the range from 1 to 99 % of the latency from exposure to each event."""
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -119,14 +121,17 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
     axes.invert_yaxis()
     longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
     axes.set_xlim(0, 1.25 * longest_ms)
-    axes.set_xlabel("time since the middle of the exposure, ms: 1-99 % (bar), median (line)")
+    axes.set_xlabel("time since the centre of the exposure, ms: 1-99 % (bar), median (line)")
     axes.set_title("Latency")
     axes.grid(visible=True, axis="x", alpha=0.2)
     figure.savefig(path, dpi=110)
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Draw object and rendered force over depth, one panel per position, with the JND."""
+    """Draw the object's and the rendered force over depth, one panel per position.
+
+    Bands show the just-noticeable difference (JND) of forces.
+    """
     positions = list(dict.fromkeys(row["place"] for row in result["rows"]))
     figure = Figure(figsize=(4.2 * len(positions), 4.4), layout="constrained")
     panels = figure.subplots(1, len(positions), squeeze=False, sharey=True)[0]
@@ -193,7 +198,7 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
         shown = panel.imshow(grid, vmin=0.0, vmax=1.0, cmap="RdYlGn", origin="lower", aspect="auto")
         panel.set_xticks(range(len(objects)), [f"{1e-3 * one:.3g}" for one in objects])
         panel.set_yticks(range(len(delays)), [f"{one:.0f}" for one in delays])
-        panel.set_xlabel("object's Young's modulus, kPa")
+        panel.set_xlabel("Young's modulus of the object, kPa")
         panel.set_title(f"loop: {kind}")
     panels[0].set_ylabel("delay, ms")
     figure.colorbar(shown, ax=panels, label="fraction of hands that are stable")
@@ -226,9 +231,10 @@ MIN_SHOWN_RATIO = 1e-3
 
 
 def draw_sensitivity(result: dict[str, Any], path: Path) -> None:
-    """Draw the effects of the most important parameters, over the scene's tolerances.
+    """Draw the effects of the most important parameters relative to the scene's tolerances.
 
-    A dot is the larger effect of plus and minus one sigma, the line ends at that of three.
+    A dot is the larger effect of deviations by plus and minus one standard deviation (sigma). The
+    line ends at the larger effect of three sigma.
     """
     shown = result["ranking"][:SHOWN_PARAMETERS]
     figure = Figure(figsize=(9, 1.4 + 0.32 * max(len(shown), 3)), layout="constrained")
@@ -260,6 +266,6 @@ def draw_sensitivity(result: dict[str, Any], path: Path) -> None:
     axis.set_xscale("log")
     axis.set_yticks(range(len(shown)), [one["parameter"] for one in shown], fontsize=7)
     axis.invert_yaxis()
-    axis.set_xlabel("effect over the scene's tolerance: dot 1 σ, end of line 3 σ")
+    axis.set_xlabel("effect / tolerance of the scene: dot 1 σ, end of line 3 σ")
     axis.legend(fontsize=7, loc="lower right")
     figure.savefig(path, dpi=110)

@@ -1,4 +1,4 @@
-"""Choose free ports for the simulated arms, so that several graphs run on one computer."""
+"""Choose free TCP ports for the simulated arms, so that several graphs can run on one computer."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ LOOPBACK = "127.0.0.1"
 
 
 def choose_ports(launch_file: Path) -> list[str]:
-    """Return settings that give the simulated arms and their bridges free ports.
+    """Return launch settings that give the simulated arms and their bridges free TCP ports.
 
-    A graph without simulated arms has none.
+    For a graph without simulated arms, the list is empty.
     """
     nodes = load_graph(launch_file).nodes.values()
     simulators = [one for one in nodes if issubclass(node_class(one.type), node_class("twin_arms"))]
@@ -32,7 +32,7 @@ def choose_ports(launch_file: Path) -> list[str]:
 
 
 def _find_free_ports(count: int) -> list[int]:
-    """Return distinct TCP ports of loopback that are free now."""
+    """Return different TCP ports that are free now on the loopback interface."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for one in sockets:

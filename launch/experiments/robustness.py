@@ -1,4 +1,7 @@
-"""Evaluate drawn apparatuses: many laboratories that differ from their scene file at random."""
+"""Evaluate the system with many random apparatuses (true parameters of the simulated hardware).
+
+Each represents a laboratory whose hardware differs at random from its scene file.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Parse "A-B" or "A" into seeds, both ends included.  Raises ExperimentError."""
+    """Parse "A-B" (both ends included) or "A" into random seeds. Raises ExperimentError."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise ExperimentError(f'--seeds "{text}": expected A-B, such as 0-9, or one whole number')
@@ -40,7 +43,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the draw in the form of the option --apparatus."""
+    """Return the value of the option --apparatus for the random apparatus with a seed."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 
@@ -58,7 +61,7 @@ def run_robustness(
     scheduler: str | None = None,
     keep_bags: bool = False,
 ) -> dict[str, Any]:
-    """Run one trial per seed, and return rows and summary of `experiment robustness --json`."""
+    """Run one trial per seed; return the results of `experiment robustness --json`."""
     plan = load_graph(launch_file, settings=settings)
     require_scene(plan)
     common = {
@@ -111,9 +114,9 @@ def run_robustness(
 
 
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    """Return median, 95 % quantile and worst value of each metric, and the seed of the worst.
+    """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
 
-    A metric without values has None.
+    For a metric without values they are None.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

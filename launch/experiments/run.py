@@ -1,4 +1,8 @@
-"""Run an experiment: start the graph with a recorder, run a procedure, and stop the graph."""
+"""Run an experiment: start the graph with a recorder, run a procedure, and stop the graph.
+
+A graph is the set of nodes (processes) and topics that a launch file describes. A procedure is a
+coroutine that controls the running graph by a `Driver`.
+"""
 
 from __future__ import annotations
 
@@ -38,19 +42,19 @@ def new_folder(name: str, parent: Path = RUNS) -> Path:
 
 
 def require_scene(plan: ResolvedGraph) -> Scene:
-    """Return the graph's scene.  Raises ExperimentError for a graph without one."""
+    """Return the scene of a planned graph. Raises ExperimentError if it has none."""
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(
-            f'{plan.launch_file}: missing key "scene", which an experiment requires'
+            f'{plan.launch_file}: missing key "scene", which an experiment requires; add the key'
         )
     return scene
 
 
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start the plan's graph, run the procedure on it and stop it.
+    """Start the graph of a plan, run the procedure on it, and stop the graph.
 
-    Raises the procedure's errors, and NodeFailedError when a node fails permanently.
+    Raises the errors of the procedure, and NodeFailedError if a node fails permanently.
     """
     scene = require_scene(plan)
     async with RunningGraph(plan) as graph:
@@ -66,12 +70,12 @@ async def _run_procedure(
     progress("waiting for the soft body and the arms")
     await driver.wait_ready()
     await procedure(driver, scene)
-    # Let the messages caused by the last action arrive at the recorder.
+    # Wait until messages caused by the last action have arrived at the recorder.
     await asyncio.sleep(DELIVERY_S)
 
 
 async def _run_while_graph_runs(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
-    """Await `work` while the graph runs; if the graph ends first, raise the reason."""
+    """Await `work` while the graph runs. If the graph ends first, raise the reason as an error."""
     task = asyncio.create_task(work)
     end = asyncio.create_task(graph.wait())
     try:
@@ -99,9 +103,9 @@ def run_experiment(
     needed: Collection[str] = (),
     without: Collection[Feature] = (),
 ) -> None:
-    """Run a procedure on a launch file's graph, and record it to `bag`.
+    """Run a procedure on the graph of a launch file, and record all topics to `bag`.
 
-    apparatus, needed, without: as of `load_graph`.
+    settings, apparatus, needed, without: arguments for `load_graph`.
     """
     plan = load_graph(
         launch_file,
@@ -121,7 +125,7 @@ def run_experiment(
 
 
 async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
-    """Await `work`; SIGINT and SIGTERM cancel it and raise ExperimentError."""
+    """Await `work`. On SIGINT or SIGTERM, cancel it and raise ExperimentError."""
     task = asyncio.create_task(work)
     with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
         try:
@@ -131,7 +135,10 @@ async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Make the setting "parameter=value" for each node of a type or of a class derived from it."""
+    """Return `setting` ("parameter=value") for each node of a type, with the node's name.
+
+    Nodes of derived types are included.
+    """
     base = node_class(node_type)
     return [
         f"{node.name}.{setting}"
@@ -143,7 +150,7 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
 def make_stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
-    """Make a procedure that strokes once for each duration, or follows `path`."""
+    """Make a procedure that moves the finger: one stroke per duration (s), or `path` if given."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         if path is not None:
@@ -167,10 +174,10 @@ def make_image_procedure(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> Procedure:
-    """Make a procedure that images each case with each correction.
+    """Make a procedure that takes an image of each case with each correction.
 
-    with_maps: also image the coordinate ramps, for dense error maps. with_eyes: also
-    image for each eye separately.
+    with_maps: also take images of coordinate ramps, for errors at all visible points. with_eyes:
+    also take images for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -192,7 +199,7 @@ def make_image_procedure(
 
 
 def chain_procedures(*procedures: Procedure) -> Procedure:
-    """Make a procedure that runs others in sequence on the same graph."""
+    """Make a procedure that runs several procedures in sequence on the same graph."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for each in procedures:

@@ -1,4 +1,8 @@
-"""Measure the effect of each tolerance of the apparatus alone."""
+"""Measure how much the uncertainty of each single apparatus parameter affects the system's errors.
+
+The apparatus is the set of true parameters of the simulated hardware. Sigma is the standard
+deviation of a parameter in the tolerance table.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +38,11 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 
 
 class EvaluationKind(StrEnum):
-    """Method by which a row was evaluated.
+    """Method by which the effect of a parameter was evaluated.
 
-    offline: at rest, without a graph. graph: in motion. not_measured: only motion shows it, and no
-    graph ran. not_simulated: no simulator node uses it.
+    offline: at rest, without running nodes. graph: in motion, with running nodes. not_measured: the
+    effect occurs only in motion, and no graph was run. not_simulated: no simulator node uses the
+    parameter.
     """
 
     OFFLINE = "offline"
@@ -68,9 +73,10 @@ TIMING = frozenset(
         "projector.latency_offset_s",
     }
 )
-"""Parameters without effect at rest, or on a noise-free image of a marker's centre.
+"""Parameters without effect at rest, or on a noise-free image of the marker.
 
-Stroke and fingertip of a graph show the effect of all but those of eyes and projector.
+Errors of sheet and fingertip in a running graph show their effects, except for those of eyes and
+projector.
 """
 
 AFFECTED: dict[str, frozenset[Metric]] = {
@@ -81,11 +87,11 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""Metrics on which a section of the apparatus has an effect at rest; on the others it has none."""
+"""Metrics that each section of the apparatus affects at rest."""
 
 
 def select_parameters(names: Sequence[str]) -> list[str]:
-    """Check names of rows of the table and remove duplicates; no name selects all."""
+    """Check parameter names and remove duplicates; without names, return all of the table."""
     selected = list(dict.fromkeys(names)) or list(TOLERANCES)
     for name in selected:
         if name not in TOLERANCES:
@@ -96,7 +102,7 @@ def select_parameters(names: Sequence[str]) -> list[str]:
 
 
 def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:
-    """Return how a parameter is evaluated."""
+    """Return the method by which the effect of a parameter is evaluated."""
     if parameter in NOT_SIMULATED:
         return EvaluationKind.NOT_SIMULATED
     if parameter not in TIMING:
@@ -119,7 +125,11 @@ def run_sensitivity(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Evaluate each parameter alone; return the results of `experiment sensitivity --json`."""
+    """Evaluate deviations of single parameters; return `experiment sensitivity --json` results.
+
+    folder: for the rows of finished trials. with_graph: also run the graph for parameters whose
+    effect occurs only in motion. seconds: duration of a stroke.
+    """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
     common = {
@@ -184,10 +194,10 @@ def _stroke_trial(common: dict[str, Any], apparatus_file: Path) -> dict[str, Any
 
 
 def _make_rows(parameter: str, evaluation: EvaluationKind, found: dict[str, Row]) -> list[Row]:
-    """Return a row per sigma; a metric without value is None.
+    """Return the results of a parameter, one row per deviation; a metric without value is None.
 
-    Offline, an effect is the change of each vector, pixel and push. In a graph it is the mean error
-    minus that of the nominal apparatus.
+    Without a graph, an effect is the mean change of single vectors, pixels and pushes. With a graph
+    it is the mean error minus the mean error with the nominal apparatus.
     """
     rows = []
     for sigma in SIGMAS:
@@ -213,9 +223,9 @@ def _make_rows(parameter: str, evaluation: EvaluationKind, found: dict[str, Row]
 
 
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
-    """Return the measured parameters by their worst effect at one sigma, largest first.
+    """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
 
-    share: that effect over the scene's tolerance of the metric.
+    share: ratio of that effect to the scene's tolerance of the metric. The largest is first.
     """
     limits = metric_tolerances(scene)
     ranked = []

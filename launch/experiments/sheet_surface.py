@@ -1,6 +1,6 @@
-"""Compute the surface of the sheet between its edges: their plane, and the sag by its weight.
+"""Compute the surface of the unloaded sheet: the plane between its edges, and the sag by weight.
 
-The sag is that of the simulator's membrane, which shares no code with the nodes' model of it.
+The sag is computed with the simulator's membrane, which shares no code with the nodes' sag model.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 Floats = NDArray[np.float64]
 
 CELLS = 8
-"""Elements per side: the sag at the usable height then differs by 0.3 % from that of 32."""
+"""Membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""Vertical components of the normal at which the membrane is solved; 0 has no sag."""
+"""Vertical components of the sheet normal at which the membrane is solved; at 0 there is no sag."""
 
 STRETCH_MARGIN = 0.005
-"""Stretch ratio beyond the scene's range that the table covers; further values are clipped."""
+"""Extension of the table beyond the scene's range of stretch ratios; further values are clipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPlanes:
-    """Planes at several times: points (n, 3) m, unit normals and x axes (n, 3), distances of the
-    clamped edges (n,) m. The points are between the edges' centres at first.
+    """Planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between the
+    clamped edges (n,) m. For planes through the edges, the points are midway between both edges.
     """
 
     points: Floats
@@ -46,7 +46,7 @@ class SheetPlanes:
 
 
 class SagTable:
-    """Sag of an unpushed sheet over stretch, lean and position, from solutions of the membrane."""
+    """Table of the unloaded sheet's sag over stretch, tilt and position, solved by the membrane."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -63,9 +63,10 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag along the normal (n,) m, and its slopes along x and y (n,).
+        """Return the sag along the normal (n,) m, and its derivatives along x and y (n,).
 
-        leans: vertical component of the normal. x_m, y_m: position from the centre.
+        distances_m: between the edges. leans: vertical component of the sheet normal. x_m, y_m:
+        position relative to the sheet's centre.
         """
         stretches = np.clip(distances_m / self._width_m, *self._range)
         by_stretch = _lagrange(self._stretches, stretches) / _compute_tension(stretches)
@@ -82,15 +83,15 @@ class SagTable:
 
 
 def _compute_tension(stretch: Floats) -> Floats:
-    """Return the tension of a uniaxially stretched neo-Hookean sheet, without unit.
+    """Return the normalized tension of a uniaxially stretched neo-Hookean sheet.
 
-    The sag times this hardly depends on the stretch, which makes the interpolation accurate.
+    The product of sag and tension hardly depends on the stretch, so it is interpolated accurately.
     """
     return stretch - stretch**-2
 
 
 def _lagrange(nodes: Floats, at: Floats) -> Floats:
-    """Return the Lagrange polynomials (nodes, n) at positions (n,)."""
+    """Return the values (nodes, n) of the Lagrange polynomials of `nodes` at positions (n,)."""
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes
@@ -99,7 +100,7 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
 
 
 def _solve_sag(rubber: TrueRubber, stretch: float, lean: float) -> RectBivariateSpline:
-    """Return the sag over the position across (0..1) and y (m) of a sheet that leans back."""
+    """Solve the sag of a tilted sheet over the position between the edges (0..1) and y (m)."""
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
     half_m = 0.5 * stretch * rubber.width_m
@@ -117,13 +118,13 @@ def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
 
 @dataclass(frozen=True, slots=True)
 class SheetSurface:
-    """Surface of a scene's unpushed sheet; table: None without weight."""
+    """Surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
 
     table: SagTable | None
 
     @classmethod
     def of(cls, scene: Scene, apparatus: Apparatus | None = None) -> Self:
-        """Return the surface of the true sheet; without an apparatus, of the scene's."""
+        """Return the surface of the true sheet in an apparatus, or of the sheet in the scene."""
         rubber = true_rubber(apply_apparatus(scene, apparatus).sheet, apparatus)
         if rubber.density_kg_per_m3 == 0.0:
             return cls(None)
@@ -131,9 +132,9 @@ class SheetSurface:
         return cls(_cached_table(rubber, max(low - STRETCH_MARGIN, 1.01), high + STRETCH_MARGIN))
 
     def find_tangent_planes(self, planes: SheetPlanes, points: Floats, up: Floats) -> SheetPlanes:
-        """Return the planes that touch the sheet below or above given points (n, 3).
+        """Return the tangent planes of the sheet at the projections of points (n, 3) onto it.
 
-        planes: through the edges. up: unit vector (3,) against gravity, in the same frame.
+        planes: planes through the edges. up: unit vector (3,) against gravity, in the same frame.
         """
         if self.table is None:
             return planes

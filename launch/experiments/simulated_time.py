@@ -1,12 +1,12 @@
-"""Follow a finger in simulated time: tracking, planning and both arms without a graph.
+"""Follow a finger in simulated time: tracking, planning and both arms without running nodes.
 
-The nodes' methods run at the times at which their nodes would run them: an exposure, its image, its
-target, and the period of the arms. Nothing waits and no computer is busy, so that results depend on
-the methods alone and repeat exactly. Left out are images, the path check before the first motion,
-the synchronization of the two arms and every stop; the soft body applies no force, so that the
-sheet keeps its stretch.
+The nodes' methods are called at the simulated times at which the nodes would call them: at the
+exposure, when its image arrives, when its target takes effect, and in each arm cycle. Results do
+not depend on the load of the computer and repeat exactly. Not simulated are images, the path check
+before the first motion, the synchronization of the arms, and stops. The soft body applies no force,
+so that the sheet keeps its stretch.
 
-The truth is the simulator's: camera, servos, flange compliance, and the surface of the sheet.
+The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
 
 from __future__ import annotations
@@ -59,29 +59,30 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 Floats = NDArray[np.float64]
 
 CYCLE_S = 0.0071
-"""Period of the arms' commands."""
+"""Period of the commands to the arms."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
-"""Time of the read-out, unless the apparatus states it; from there until the target is published;
-and from the target to the command that it causes."""
+"""Time to read out the camera, unless the apparatus states it; from there to the published target;
+and from the target to the arm command that it causes."""
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
 SERVO_LAG_S = 0.025
-"""Lag of the simulated arms, unless the apparatus states it."""
+"""Servo lag of the simulated arms, unless the apparatus states it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
-"""Parameters of the bridges."""
+"""Parameters of the arm bridges."""
 
 SETTLING_S = 2.0
-"""Time in which the finger rests where the path begins, and the sheet reaches it."""
+"""Time for which the finger rests at the start of the path, until the sheet has reached it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """Differences between runs: tracking method, seed, parameters of the planner by name.
+    """Settings of a run.
 
-    lag_known: whether the bridges know the lag of the arms, as a reference for measured lags.
+    tracking: method. planner: parameters of the planner by name. lag_known: whether the bridges
+    know the true servo lag of the arms, as a reference for runs in which they measure it.
     """
 
     tracking: str = "adaptive"
@@ -91,7 +92,7 @@ class LoopSettings:
 
 
 class MeasuredFinger:
-    """Measure and track the finger like the triangulator, with noisy pixels."""
+    """Simulated camera with pixel noise, and the tracker of the triangulator."""
 
     def __init__(self, scene: Scene, settings: LoopSettings) -> None:
         self._camera, self._geometry = scene.camera, StereoGeometry.of(scene.camera, None)
@@ -104,7 +105,7 @@ class MeasuredFinger:
         self._horizons_s = np.arange(0.0, PREDICTION_S + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
 
     def predict_path(self, at_ns: int, position_world: Floats) -> Floats:
-        """Return the path (n, 3) that is predicted from an exposure of the finger (3,)."""
+        """Return the predicted finger path (n, 3), given the true position (3,) at an exposure."""
         in_left = apply(self._left_from_world, position_world)
         in_right = apply(self._camera.right_from_left, in_left)
         pixels = [
@@ -126,7 +127,7 @@ class MeasuredFinger:
 
 
 class SimulatedArm:
-    """One arm: the methods of its bridge, and its true servo."""
+    """Arm with the methods of its bridge and the simulator's servo."""
 
     def __init__(
         self, scene: Scene, side: Side, truth: ArmTruth, sheet: SheetMotion, *, lag_known: bool
@@ -149,11 +150,11 @@ class SimulatedArm:
 
     @property
     def lag_s(self) -> float:
-        """Return the lag that the bridge has measured, or knows."""
+        """Return the servo lag that the bridge has measured or was given, s."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     def advance(self, until_s: float) -> Floats:
-        """Advance the servo, and return the true joints (6,)."""
+        """Advance the servo to a time, and return the true joint angles (6,), rad."""
         while self._pending and self._pending[0][0] <= until_s:
             due_s, joints_rad = self._pending.popleft()
             self._run_servo(due_s)
@@ -167,7 +168,7 @@ class SimulatedArm:
             self._now_s = until_s
 
     def command(self, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float) -> None:
-        """Send the command of one cycle, which covers `step_s`."""
+        """Send the command of one arm cycle to the servo; the cycle lasts `step_s`."""
         goal = extrapolate_goal(
             target, now_s - valid_at_s + self.lag_s, 0.0, max_extrapolation_s=MAX_EXTRAPOLATION_S
         )
@@ -201,7 +202,7 @@ class SimulatedArm:
 
 
 class SimulatedSheet:
-    """Both arms and the sheet between them, by the simulator."""
+    """Simulated arms with the sheet between them."""
 
     def __init__(
         self, scene: Scene, apparatus: Apparatus, sheet: SheetMotion, *, lag_known: bool
@@ -216,7 +217,7 @@ class SimulatedSheet:
         self.rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
 
     def record(self, now_s: float) -> None:
-        """Add the true edges at a time, to which the servos advance."""
+        """Advance the servos to a time, and record the true edges of the sheet."""
         flanges = [
             model.world_from_base @ forward(arm.advance(now_s))
             for model, arm in zip(self._models, self.arms, strict=True)
@@ -234,9 +235,9 @@ def follow_in_simulated_time(
     apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> dict[str, Any]:
-    """Return how well the sheet follows a finger path; see `FollowedFinger.figures`.
+    """Simulate the sheet for a finger path; return its errors as `FollowedFinger.figures` does.
 
-    servo_lag_ms: as measured by both bridges at the end.
+    servo_lag_ms: servo lags that the two bridges have measured at the end.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)

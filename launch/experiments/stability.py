@@ -1,14 +1,15 @@
 """Evaluate whether a hand that touches the sheet is stable: `flexsheet experiment stability`.
 
-Two simulations, in the time domain and without a graph:
+The sheet's offset (its depth) depends on the finger depth; the slope is the ratio of their changes.
+Two simulations run in the time domain, without running nodes:
 
-- boundary: the critical slope of the sheet's offset for drawn hands and loops, compared with the
-  prediction by the eigenvalues of the sampled loop (`nodes.models.hand_loop`).
-- map: the planner's own offset for objects of several stiffnesses, with every drawn hand at
-  several delays and depths, with and without the bounds of the loop.
+- boundary: the critical slope, above which a random hand is not stable, compared with the
+  prediction by the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
+- map: the offset that the planner uses for objects of several stiffnesses, with each random hand at
+  several delays and depths, with and without the planner's stability bounds.
 
-Hands are drawn from the ranges of the literature with a seed of their own, so the planner's bounds
-were not made for them.
+The random hands are sampled from the ranges in the literature with a separate seed. So the bounds
+are tested with other hands than those from which they were derived.
 """
 
 from __future__ import annotations
@@ -48,30 +49,30 @@ HAND_RANGES = {
     "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
     "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
 }
-"""Ranges of mass (kg), stiffness (N/m) and damping ratio; sources in `nodes.models.hand_loop`."""
+"""Ranges of mass (kg), stiffness (N/m) and damping ratio. Sources: see `nodes.models.hand_loop`."""
 
 DELAYS_S = (0.01, 0.03, 0.05, 0.07, 0.1)
 RATES_HZ = (30.0, 60.0, 120.0)
 OBJECT_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 DEPTH_FRACTIONS = (0.25, 0.6, 0.95)
 GAINS = (1.0, 1.25, 1.5, 2.0, 3.0)
-"""Factors of the sheet's motion with which the margin is measured."""
+"""Factors by which the sheet's motion is increased to measure the gain margin."""
 
 LINEAR_STIFFNESS_N_PER_M, LINEAR_DEPTH_M = 100.0, 0.02
 MAX_BOUNDARY_SLOPE = 1.5
-"""Critical slopes above are not compared: the finger loses contact with the sheet there."""
+"""Maximum compared critical slope. Above it, the finger loses contact with the sheet."""
 
 SLOPES = 32
 FILTERS = ((0.0, False), (0.0, True), (0.08, False))
-"""Filter of the depth (s) and whether the depth is predicted over the delay."""
+"""Time constant of the depth filter (s), and whether the depth is predicted over the delay."""
 
 
 @dataclass(frozen=True, slots=True)
 class StabilitySettings:
     """Extent of the experiment.
 
-    hands: drawn per group, with the seed. rates_hz: of the camera, for the boundary.
-    object_ratios: stiffness of the objects over that of the scene's.
+    hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
+    rates for the boundary. object_ratios: ratios of object stiffness to that of the scene's object.
     """
 
     hands: int = 4
@@ -82,7 +83,7 @@ class StabilitySettings:
 
 
 def draw_hands(count: int, seed: int) -> list[Hand]:
-    """Draw `count` hands from each group, log-uniform in mass and stiffness."""
+    """Sample `count` random hands from each group, log-uniform in mass and stiffness."""
     rng = np.random.default_rng(seed)
     hands = []
     for masses, stiffnesses, dampings in HAND_RANGES.values():
@@ -96,7 +97,7 @@ def draw_hands(count: int, seed: int) -> list[Hand]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Hand in a loop, released at a depth."""
+    """Hand in a control loop, released near an equilibrium depth."""
 
     hand: Hand
     loop: SampledLoop
@@ -104,7 +105,7 @@ class Trial:
 
 
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
-    """Return every trial with every gain (trials first)."""
+    """Return the cases of each trial with every gain; cases of one trial are consecutive."""
 
     def repeat(values: Iterable[float]) -> Floats:
         return np.repeat(np.fromiter(values, dtype=np.float64), len(gains))
@@ -122,9 +123,9 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 
 
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
-    """Return the smallest slope (n,) at which a simulated hand is not stable; NaN above 1.5.
+    """Return the smallest slope (n,) of the offset at which a hand is not stable; NaN above 1.5.
 
-    All trials have the same period.  The sheet is linear.
+    The slope is simulated for a linear sheet. All trials must have the same period.
     """
     slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
     motion = simulate_release(
@@ -137,17 +138,17 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
     for number, row in enumerate(motion.decays.reshape(len(trials), -1)):
         unstable = np.flatnonzero(~row)
         if len(unstable) and unstable[0] > 0:
-            # The boundary lies between two slopes whose ratio is 1.13.
+            # Return the geometric mean of the last stable and first unstable slope (ratio 1.13).
             result[number] = float(np.sqrt(slopes[unstable[0]] * slopes[unstable[0] - 1]))
     return result
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return the simulated and the predicted critical slope of each hand and loop."""
+    """Return the simulated and the predicted critical slope of each hand and control loop."""
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):
-        progress(f"boundary at {rate_hz:g} Hz, {'advance' if towards else 'retreat'}")
+        progress(f"boundary at {rate_hz:g} Hz, sheet {'advance' if towards else 'retreat'}")
         trials = [
             Trial(
                 hand,
@@ -200,25 +201,25 @@ def measure_map(
     *,
     cache_dir: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a row for each object, hand, delay and kind of loop.
+    """Return a row for each object, hand, delay and kind of control loop.
 
-    Kinds: "bounded" as the planner runs; "unbounded" without bounds and filter; "predicted" without
-    them and with the depth predicted over the delay.
+    Kinds: "bounded" is the planner's loop; "unbounded" has no stability bounds and no depth filter;
+    "predicted" is like "unbounded", but predicts the depth over the delay.
     """
     material = scene.object.material
     if material is None:
         raise ExperimentError(
-            f"scene {scene.name}: the object is rigid; give a scene with object.material"
+            f'scene "{scene.name}": the object is rigid; give a scene with the key object.material'
         )
     hands = draw_hands(settings.hands, settings.seed + 1)
     table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     period_s = 1.0 / scene.camera.rate_hz
     rows: list[dict[str, Any]] = []
     for ratio in settings.object_ratios:
-        # At equal Poisson ratio the force is proportional to the modulus.
+        # At equal Poisson's ratio, the force is proportional to Young's modulus.
         scaled = ObjectCurve.from_rows(curve * np.array([1.0, ratio]))
         object_pa = ratio * material.young_modulus_pa
-        progress(f"object of {object_pa:.3g} Pa")
+        progress(f"object with Young's modulus {object_pa:.3g} Pa")
         for delay_s in settings.delays_s:
             fitted = _fit(scene, model, scaled, table.at_delay(delay_s))
             filter_s, suffices = fitted.choose_filter_s()
@@ -255,7 +256,7 @@ def _fit(
 def _simulate_pushes(
     fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop]
 ) -> list[dict[str, Any]]:
-    """Return a row for each hand and loop; it is stable if it is so at every depth."""
+    """Return a row for each hand and control loop; stable means stable at every depth."""
     indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
     forces_n = fitted.model.evaluate(
         fitted.stretch_ratio,
@@ -267,7 +268,7 @@ def _simulate_pushes(
     offsets_m = fitted.normal_offset_m(depths_m)
 
     def offset(at_m: Floats) -> Floats:
-        # Beyond the last depth the sheet moves with the finger.
+        # Beyond the last tabulated depth, the sheet moves as far as the finger.
         beyond = np.maximum(at_m - depths_m[-1], 0.0)
         return np.asarray(np.interp(at_m, depths_m, offsets_m) + beyond)
 
@@ -309,7 +310,7 @@ def stability_result(
     *,
     cache_dir: Path | None = None,
 ) -> dict[str, Any]:
-    """Return the result of `flexsheet experiment stability --json`."""
+    """Run both simulations; return the result of `flexsheet experiment stability --json`."""
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress, cache_dir=cache_dir)
     errors = np.abs([row["error_percent"] for row in boundary])

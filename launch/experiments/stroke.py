@@ -1,4 +1,10 @@
-"""Section V of the paper: stroke the virtual cylinder and measure the sheet's error (Table I)."""
+"""Stroke the virtual cylinder and measure the error of the sheet.
+
+This is the experiment of section V and Table I of Furukawa et al. 2007 ("the paper"). D is the
+point of the object nearest to the finger, D' the contact point that the sheet presents instead.
+Errors (Fig. 9): delta d is the distance from D to D', delta theta the angle between the normals.
+"Light" is the time at which the projector shows an image.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +51,7 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""Mean and standard deviation, by duration of the stroke (s)."""
+"""Errors in Table I of the paper: mean and standard deviation, by duration of the stroke (s)."""
 
 
 NO_VALUES: Floats = np.empty(0)
@@ -53,10 +59,10 @@ NO_VALUES: Floats = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """Contents of drawn frames, by the middle of their display time, ns.
+    """Contents that the renderer drew, each with the time at the centre of its display, ns.
 
-    fingertip: rows (3,), drawn finger.  sheet: rows (6,), centre and normal of the sheet.
-    deformation_ages: rows (1,), age of the finger that deforms the drawn object, s.
+    fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
+    deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
     """
 
     fingertip: list[tuple[int, Floats]]
@@ -64,7 +70,7 @@ class DrawnFrames:
     deformation_ages: list[tuple[int, Floats]]
 
     def add(self, frame: Frame) -> None:
-        """Add the contents of a frame that was displayed."""
+        """Add the contents of a frame; ignore a frame that was not displayed."""
         if not frame.light_ns:
             return
         pose = frame.world_from_sheet
@@ -76,9 +82,9 @@ class DrawnFrames:
             self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
-        """Return the contents at the true time of light, `late_ns` after the stated one.
+        """Return the contents at the true display times, `late_ns` after the recorded ones.
 
-        The stated age of the drawn deformation increases by the same time.
+        The ages of the drawn deformation increase by the same time.
         """
         late_s = np.array([late_ns * 1e-9])
         return DrawnFrames(
@@ -89,12 +95,15 @@ class DrawnFrames:
 
 
 def stroke_label(seconds: float) -> str:
-    """Return the label of a stroke of that duration (s)."""
+    """Return the label of the finger path of a stroke with a duration in s."""
     return f"stroke {seconds:g} s"
 
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
-    """Make a path: approach, touch, dwell, stroke over 60 degrees at constant speed, lift."""
+    """Make the finger path of the experiment.
+
+    The finger approaches, touches, dwells, strokes over 60 degrees at constant speed, and lifts.
+    """
     radius = require_cylinder(scene).radius_m
     world_from_object = object_pose(scene)
     stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
@@ -127,45 +136,49 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
 
 
 def stroke_window_s(seconds: float) -> tuple[float, float]:
-    """Return the start and end of the stroke in the path's time, s."""
+    """Return the start and end of the stroke, s from the start of the finger path."""
     begin = APPROACH_S + DWELL_S
     return begin, begin + seconds
 
 
 def object_pose(scene: Scene) -> Floats:
-    """Return world_from_object (4, 4) of a scene."""
+    """Return the pose of a scene's object as the matrix world_from_object (4, 4)."""
     pose = scene.object.world_from_object
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """Samples of a motion: times (n,) ns, values (n, k)."""
+    """Sampled motion: times (n,) in ns, and k values at each time (n, k)."""
 
     times_ns: NDArray[np.int64]
     values: Floats
 
     def interpolate(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Interpolate values (m, k) linearly at other times.
+        """Interpolate linearly at times (m,) ns; return values (m, k).
 
-        Times are taken from the first sample, so that floats resolve nanoseconds after a long
-        uptime.
+        Times are converted to floats relative to the first sample. Floats of the time since the
+        computer's start could not resolve nanoseconds.
         """
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
         return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
 
     def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask (m,) of times within the samples."""
+        """Return a mask (m,) that is true for times between the first and the last sample."""
         inside: NDArray[np.bool_] = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
         return inside
 
 
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
-    """Sort samples (time, value) and drop repeated times; ExperimentError for fewer than two."""
+    """Make a motion from samples (time in ns, value): sort them and drop repeated times.
+
+    Raises ExperimentError for fewer than two samples. name: what they are, for the error.
+    """
     if len(samples) < 2:
         raise ExperimentError(
-            f"the bag contains {len(samples)} samples of {name}, at least 2 are required"
+            f"the bag contains {len(samples)} samples of {name}, at least 2 are required; "
+            "record the experiment again"
         )
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([value for _, value in samples])
@@ -175,13 +188,14 @@ def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
 
 @dataclass(frozen=True, slots=True)
 class StrokeRecording:
-    """Data of an experiment from a bag.
+    """Data of an experiment, read from a bag.
 
-    Edges are rows (9,): centre of the clamped edge, its y axis and its z axis, in the world.
-    delays_s: from the middle of an exposure to each event that it caused, by event. drops: number
-    of lost or refused messages, except those that a `latest` reader skipped.
-    apparatus: where the truth came from. surface, true_surface: of the unpushed sheet by the scene,
-    and the true one.
+    fingertip, measured, finger: filtered, measured and true position of the fingertip.
+    measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
+    y axis and z axis of an edge in the world frame. delays_s: delays from the centre of an exposure
+    to the events that it caused, by event. drops: number of lost or refused messages, except those
+    that a `latest` reader skipped. apparatus: origin of the true parameters of the simulated
+    hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
     """
 
     scene: Scene
@@ -199,13 +213,13 @@ class StrokeRecording:
     true_surface: SheetSurface | None = None
 
     def arm_delays_s(self) -> Floats:
-        """Return the delays (n,) from exposure to the written command, of both arms, s."""
+        """Return the delays (n,) from exposure to the sent command, for both arms together, s."""
         both = [self.delays_s.get(f"{side} arm command", NO_VALUES) for side in ("left", "right")]
         return np.concatenate(both)
 
 
 def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
-    """Group delays by (event, exposure) into arrays (n,) by event."""
+    """Collect delays, given by (event, exposure), in one array (n,) for each event."""
     events: dict[str, list[float]] = {}
     for (event, _), delay_s in delays.items():
         events.setdefault(event, []).append(delay_s)
@@ -213,13 +227,13 @@ def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
 
 
 def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
-    """Return centre, y axis and z axis of an edge as a row (9,)."""
+    """Return the centre, y axis and z axis of a clamped edge as a row (9,)."""
     edge = world_from_flange @ flange_from_edge
     return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
 
 
 def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
-    """Return the events of a frame with their times, ns."""
+    """Return when a frame was begun, drawn and (if it was) displayed, as (event, time in ns)."""
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
     events = [("frame begun", begun_ns), ("frame drawn", drawn_ns)]
@@ -227,7 +241,7 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
 
 
 def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
-    """Return the latency events of a message as (event, exposure ns, time ns)."""
+    """Return the events for latency measurements in a message: (event, exposure ns, time ns)."""
     exposure_ns = header.source_ns
     match message:
         case Fingertip() if message.valid:
@@ -248,7 +262,10 @@ def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
 def _find_windows_ns(
     times_by_label: dict[str, list[tuple[int, float]]],
 ) -> dict[str, tuple[int, int]]:
-    """Return the start and last stamp of each path, from samples (stamp, time on the path)."""
+    """Return the start and end (ns) of each finger path.
+
+    times_by_label: samples (timestamp in ns, time since the start of the path in s).
+    """
     return {
         label: (samples[-1][0] - round(samples[-1][1] * 1e9), samples[-1][0])
         for label, samples in times_by_label.items()
@@ -256,7 +273,7 @@ def _find_windows_ns(
 
 
 def read_recording(bag: Path) -> StrokeRecording:
-    """Read the data for the stroke's results from a bag. Raises ExperimentError."""
+    """Read the data of a stroke from a bag. Raises ExperimentError if data is missing."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
@@ -298,13 +315,13 @@ def read_recording(bag: Path) -> StrokeRecording:
                 frames.add(message)
             case Status():
                 for port in message.inputs:
-                    # Counters restart with the node, so the last status of each start contains its
-                    # total.
+                    # A restarted node counts from zero, so the last status after each start
+                    # contains the total since that start.
                     losses[message.node, header.epoch, port.topic] = port.gaps + port.rejected
             case _:
                 pass
     if scene is None:
-        raise ExperimentError(f"{bag}: does not contain a scene; record the topic scene")
+        raise ExperimentError(f"{bag}: contains no scene; record the topic scene")
 
     def make_edges(key: str, arm: ArmSpec) -> SampledMotion:
         pose = arm.flange_from_edge
@@ -344,7 +361,7 @@ def compute_sheet_planes(
     world_from_object: Floats,
     times_ns: NDArray[np.int64],
 ) -> SheetPlanes:
-    """Return the planes through both edges, in the object's frame."""
+    """Return the plane through both clamped edges at each time (n,), in the object's frame."""
     object_from_world = inverse(world_from_object)
     left, right = (
         np.concatenate(
@@ -367,10 +384,10 @@ def compute_sheet_planes(
 
 
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
-    """Return the contact points D' (n, 3) of the sheet in the object's frame, and angles (n,).
+    """Return the contact points D' (n, 3) of a sheet on a cylinder, and their angles (n,).
 
-    D' is the plane's point nearest to the cylinder's axis at x = `x_m` (n,). The angle is that of
-    the plane's normal about the axis, rad.
+    D' is the point of the sheet's plane nearest to the point of the cylinder axis at x = `x_m`
+    (n,), in the object's frame. The angle is that of the plane's normal about the axis, rad.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -379,14 +396,16 @@ def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Flo
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""Minimum curvature; on a flatter surface a normal does not identify a point."""
+"""Minimum principal curvature, 1/m. A flatter surface has many points with nearly one normal."""
 
 
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
-    """Return the contact points D' (n, 3) near `foot` of planes through `centre` with `normal`.
+    """Return the contact points D' (n, 3) that a sheet presents, for an object of any shape.
 
-    D' is the surface point with the plane's normal, projected onto the plane. Along a flat
-    direction it is the foot itself. The error is of second order in the angle between the normals.
+    foot: points of the object nearest to the finger. centre, normal: (n, 3), point and normal of
+    the sheet's plane. D' is the surface point with the plane's normal, projected onto the plane.
+    Along a flat direction it stays at the foot. The error of this approximation is of second order
+    in the angle between the normals.
     """
     curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
     slopes = np.einsum("nki,ni->nk", directions, normal)
@@ -409,13 +428,13 @@ def sheet_errors(
     shape: Shape | None = None,
     surface: SheetSurface | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any object shape.
+    """Return the sheet's errors delta d (n,) m and delta theta (n,) rad at `times_ns`.
 
-    D is the object's point nearest to the finger. The sheet renders the undeformed surface, so the
-    push depth is not an error. normal_offset_m (n,): commanded depth of the sheet below that
-    surface. On a cylinder, delta theta is the angle about its axis, as in the paper; on other
-    shapes, the angle between the normals. shape: that of the scene, if already computed. surface:
-    of the unpushed sheet; None for a flat one.
+    finger, edges: motions of the fingertip and of both clamped edges. normal_offset_m (n,):
+    commanded depth of the sheet below the undeformed surface. The sheet renders that surface, so
+    the finger's push depth is not an error. On a cylinder, delta theta is the angle about its axis,
+    as in the paper; on other shapes it is the angle between the normals. shape: shape of the
+    scene's object, if already computed. surface: shape of the unloaded sheet; None if it is flat.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.interpolate(times_ns))
@@ -441,9 +460,10 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Smooth the measurements offline, as a lower bound for the error of causal methods.
+    """Smooth the measured positions from the first to the last of `times_ns`.
 
-    Fits one cubic smoothing spline per coordinate, with generalized cross-validation.
+    The smoother also uses later measurements, so its error estimates a lower bound for causal
+    filters. It fits a cubic smoothing spline per coordinate, by generalized cross-validation.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
@@ -453,7 +473,7 @@ def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> Sampl
 
 
 def summary(values: Floats, scale: float) -> dict[str, float]:
-    """Return mean, standard deviation and maximum of values (n,) times `scale`."""
+    """Return mean, standard deviation and maximum of values (n,), multiplied by `scale`."""
     scaled = values * scale
     return {
         "mean": float(scaled.mean()),
@@ -463,7 +483,7 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return the median and 99 % quantile of times (n,) s, in ms; None without values."""
+    """Return the median and 99 % quantile of durations (n,) s, in ms; None without values."""
     if len(values_s) == 0:
         return {"p50": None, "p99": None}
     return {
@@ -476,10 +496,11 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 class StrokeErrors:
     """Errors of a stroke over time, m and rad.
 
-    seconds: (n,) times of the measured errors since the start of the stroke: exposures with a valid
-    fingertip. true_seconds: (m,) times of the true errors: all exposures, since a sheet without a
-    fingertip also has an error. arcs_m: (m, 2) arc lengths around the object of the true sheet and
-    the true finger.
+    seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
+    with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,
+    since the sheet also has an error while no fingertip is found. smoother_m, fingertip_m: (n,),
+    errors of the offline smoother and of the fingertip. arcs_m: (m, 2), arc lengths around the
+    object to the true contact line and to the true finger.
     """
 
     seconds: Floats
@@ -494,7 +515,10 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """Return the start and end of a stroke, ns. Raises ExperimentError if it is not in the bag."""
+    """Return the start and end of a stroke of `seconds`, ns.
+
+    Raises ExperimentError if the bag does not contain it.
+    """
     windows = recording.windows_ns
     zero_ns, end_ns = find_recorded(windows, "finger path", stroke_label(seconds))
     begin_s, finish_s = stroke_window_s(seconds)
@@ -502,7 +526,10 @@ def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int
 
 
 def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
-    """Compute the errors at each exposure of a stroke. Raises ExperimentError if it is missing."""
+    """Compute the errors at each exposure of a stroke of `seconds`.
+
+    Raises ExperimentError if the recording does not contain it.
+    """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
     def select_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -517,7 +544,8 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
     if len(times) < 10:
         label = stroke_label(seconds)
         raise ExperimentError(
-            f'the bag contains {len(times)} fingertips of "{label}", at least 10 are required'
+            f'the bag contains {len(times)} valid fingertips during "{label}", at least 10 are '
+            "required; check the tracking, then record the experiment again"
         )
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(
@@ -556,7 +584,10 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return arc lengths (n, 2) m around the cylinder of contact line and points."""
+    """Return the arc lengths (n, 2) m around the cylinder to the sheet's contact line and `points`.
+
+    edges: motions of both clamped edges. points: (n, 3) m, in the world frame.
+    """
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
     planes = compute_sheet_planes(edges, world_from_object, times_ns)
@@ -568,7 +599,10 @@ def compute_arcs(
 def tangential_distance(
     scene: Scene, world_from_object: Floats, points: Floats, others: Floats
 ) -> Floats:
-    """Return the distances (n,) m between the cylinder points nearest to two sets of points."""
+    """Return the distances (n,) m between two sets of points (n, 3) projected on the cylinder.
+
+    Distances along the cylinder's axis are ignored.
+    """
     object_from_world = inverse(world_from_object)
     on_surface = []
     for array in (points, others):
@@ -580,11 +614,11 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """Return the lags of drawn contents at display, after prediction, ms; None if unknown.
+    """Return by how much the displayed image lags behind reality, ms; None if unknown.
 
-    fingertip, sheet: lag of the drawn marker and of the sheet's rotation about the object behind
-    the true ones, by cross-correlation. object: median age of the finger that deforms the drawn
-    object, less the solver's prediction horizon.
+    fingertip, sheet: lag of the drawn fingertip, and of the drawn rotation of the sheet about the
+    object, estimated by cross-correlation with the true motion. object: median age of the finger
+    measurement that deforms the drawn object, minus the solver's prediction horizon.
     """
     span = stroke_span_ns(recording, seconds)
     world_from_object = object_pose(recording.scene)
@@ -633,9 +667,9 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 def stroke_result(
     recording: StrokeRecording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
-    """Return the results of `experiment stroke --json`, in mm, degrees and ms.
+    """Return the results of one stroke for `experiment stroke --json`, in mm, degrees and ms.
 
-    lag_ms: lag of the true sheet behind the true finger, by cross-correlation.
+    lag_ms: lag of the true sheet behind the true finger, estimated by cross-correlation.
     """
     lag = estimate_lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {

@@ -1,4 +1,7 @@
-"""Report Table I with its uncertainty: repeated strokes, ablations, twice the radius."""
+"""Repeat the strokes of Table I of Furukawa et al. 2007, and report the errors with uncertainty.
+
+Optional variants switch off single methods (ablations), or use a cylinder of twice the radius.
+"""
 
 from __future__ import annotations
 
@@ -22,19 +25,20 @@ from flexsheet.messages.methods import TrackingMethod
 from flexsheet.messages.scene import Scene, require_cylinder
 
 FIRST_SEED = 4100
-"""Seed of the first stroke's finger and camera noise; no chart and no default has it."""
+"""Random seed of finger and camera noise in the first stroke. Charts and defaults use others."""
 
 CONFIDENCE = 0.95
 RATES_HZ = (15.0, 30.0, 60.0)
 RADIUS_FACTOR = 2.0
-"""The paper's angle and distance errors agree for a radius of 70.7 mm, twice that of its text."""
+"""Ratio of the radii. The angle and distance errors in the paper's table agree for a radius of
+70.7 mm, which is twice the radius in its text."""
 
 ERRORS = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One configuration of the experiment; `settings` override parameters of the launch file."""
+    """Variant of the experiment. settings: override parameters of the launch file."""
 
     name: str
     launch_file: Path
@@ -45,9 +49,9 @@ class Variant:
 def make_variants(
     launch_file: Path, folder: Path, *, apparatus: str | None, ablations: bool, radii: bool
 ) -> list[Variant]:
-    """Return the configurations to measure, the given one first.
+    """Return the variants to measure, the given configuration first.
 
-    Scene, launch and apparatus files of the others are written into the folder.
+    Scene, launch and apparatus files of the other variants are written into the folder.
     """
     scene = require_scene(load_graph(launch_file))
     variants = [Variant("as configured", launch_file, apparatus=apparatus)]
@@ -57,7 +61,7 @@ def make_variants(
         radius_m = RADIUS_FACTOR * require_cylinder(scene).radius_m
         larger = write_radius_variant(launch_file, folder, radius_m)
         name = f"radius {1e3 * radius_m:.1f} mm"
-        # An apparatus belongs to one object, so the larger one is measured without differences.
+        # The apparatus file belongs to the given object, so this variant has the nominal one.
         variants.append(Variant(name, larger))
     return variants
 
@@ -87,9 +91,9 @@ def _make_ablations(
 
 
 def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
-    """Write the launch file with a cylinder of another radius, whose front is at the same place.
+    """Write a copy of a launch file, with a cylinder of another radius whose front does not move.
 
-    Return the launch file. Files that it names are given by absolute paths.
+    Return the path of the copy. Relative paths in it become absolute.
     """
     yaml = YAML()
     launch = yaml.load(launch_file.read_text())
@@ -127,7 +131,7 @@ def run_stroke_table(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Stroke several times per variant, each with another seed; return the JSON result."""
+    """Run several strokes of each variant, each with another seed; return the result for JSON."""
     common = {
         "experiment": "stroke",
         "seconds": seconds,
@@ -175,10 +179,10 @@ def _trial_name(variant: Variant, number: int) -> str:
 
 
 def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return the errors over repeated strokes, latency and drops; failed strokes are counted.
+    """Summarize errors, latency and lost messages of repeated strokes; count failed strokes.
 
-    mean: of the strokes' means. std: mean of their standard deviations. max: largest. interval:
-    half the width of the confidence interval of the mean; None for fewer than two strokes.
+    mean: mean of the means of the strokes. std: mean of their standard deviations. max: largest
+    error. interval: half the width of the mean's confidence interval; None below two strokes.
     """
     good = [row for row in rows if "error" not in row]
     result: dict[str, Any] = {
@@ -198,7 +202,7 @@ def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Return mean, std and max over strokes, and half the confidence interval of the mean."""
+    """Summarize the errors of strokes as `summarize_strokes` describes."""
     means = np.array([one["mean"] for one in strokes])
     interval = None
     if len(means) > 1:

@@ -1,6 +1,6 @@
 """Run the trials of a sweep as separate processes, and continue an interrupted sweep.
 
-Each trial is one process that prints its row as JSON. The folder of a sweep contains `sweep.json`
+Each trial is one process that prints its result, a row, as JSON. A sweep's folder has `sweep.json`
 with its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run
 on this computer or on the workers of a `dask.distributed` scheduler, which must find the launch
 file and the apparatus files under the same paths.
@@ -34,13 +34,13 @@ SETTINGS_FILE = "sweep.json"
 TRIAL_MODULE = "flexsheet.launch.experiments.trial"
 POLL_S = 0.2
 END_S = 20.0
-"""Time in which a stopped trial must end its graph."""
+"""Time in which the process of a stopped trial must end the nodes that it started."""
 
 MAX_ERROR_CHARACTERS = 600
 
 
 class TrialError(ExperimentError):
-    """Raised in the parent process for a trial without a row."""
+    """Raised in the parent process if a trial ended without a result."""
 
     code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."
@@ -49,7 +49,7 @@ class TrialError(ExperimentError):
 def describe_graph(
     plan: ResolvedGraph, launch_file: Path, settings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return what identifies the graph of a sweep, so that only the same graph continues it."""
+    """Return the properties of a sweep's graph that must be equal for the sweep to be continued."""
     return {
         "launch_file": str(launch_file.resolve()),
         "settings": list(settings),
@@ -61,7 +61,7 @@ def describe_graph(
 def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a sweep, or check that it contains a sweep with the same settings.
 
-    Raises ExperimentError that names the first setting that differs.
+    Raises ExperimentError, which names the first setting that differs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SETTINGS_FILE
@@ -73,7 +73,7 @@ def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
     for key in sorted({*wanted, *found}):
         if found.get(key) != wanted.get(key):
             raise ExperimentError(
-                f"{file}: {key} is {found.get(key)!r}, and this sweep has {wanted.get(key)!r}; "
+                f"{file}: {key} is {found.get(key)!r}, but this sweep has {wanted.get(key)!r}; "
                 "give another --output, or the same options to continue"
             )
 
@@ -82,14 +82,14 @@ def _read_json(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text())
     except (OSError, ValueError) as error:
-        raise ExperimentError(f"{file}: cannot be read: {error}; delete it") from error
+        raise ExperimentError(f"{file}: cannot be read: {error}; delete the file") from error
     if not isinstance(content, dict):
-        raise ExperimentError(f"{file}: contains no JSON object; delete it")
+        raise ExperimentError(f"{file}: contains no JSON object; delete the file")
     return content
 
 
 def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
-    """Return the finished rows of a sweep by name; failed trials count as not finished."""
+    """Return the rows of the finished trials by name; failed trials count as not finished."""
     rows = {
         name: _read_json(folder / f"{name}.json") for name in names if _row_exists(folder, name)
     }
@@ -161,9 +161,9 @@ def _interruptible() -> Iterator[None]:
 
 @contextmanager
 def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
-    """Yield an executor; leaving the context stops running trials after an error."""
+    """Yield an executor for trials. If the context ends with an error, stop the running trials."""
     if scheduler is not None:
-        # Importing distributed takes half a second.
+        # Import only when needed, since importing distributed takes half a second.
         from flexsheet.nodes.fem_solver.dask_executor import connect_workers
 
         with connect_workers(scheduler) as executor:
@@ -192,7 +192,7 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # Ctrl-C must reach the sweep first, which then ends its trials.
+        # Ctrl-C must reach only the sweep, which then ends its trials in order.
         start_new_session=True,
     )
     given: str | None = json.dumps(trial)
@@ -219,7 +219,7 @@ def _end(process: subprocess.Popen[str]) -> None:
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(timeout=END_S)
-    # Its workers would keep its pipes open, and outlast it.
+    # End the whole process group. Its child processes would continue and keep the pipes open.
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()

@@ -1,8 +1,8 @@
 """Run one configuration of the graph, and measure its speed and all of its errors.
 
 The finger strokes around the object, pushes its front and rests for two images. Processor time and
-latency are those of the stroke. Every error is computed from the bag and the simulator's truth by
-the code of the other experiments.
+latency are measured during the stroke. All errors are computed from the bag, relative to the
+simulator's ground truth, by the code of the other experiments.
 """
 
 from __future__ import annotations
@@ -39,36 +39,36 @@ Times = NDArray[np.int64]
 
 STROKE = "system stroke"
 TOUCH_M = 0.001
-"""Depth of the stroke, so that drift and tremor do not end the contact."""
+"""Push depth during the stroke. It keeps the finger in contact despite drift and tremor."""
 
 STROKED_RATIO = 0.9
-"""Fraction of the touchable length that is stroked."""
+"""Fraction of the touchable arc length of the object that is stroked."""
 
 SAMPLE_S = 0.05
 APPROACH_S = 1.0
 HOVER_M = 0.03
 TILTED, PUSHED = "system tilt", "system push"
 PUSH_RATIO = 0.5
-"""Depth of the imaged push over the scene's push depth."""
+"""Ratio of the push depth during an image to the push depth of the scene."""
 
 METRES_PER_PX = 0.0014
-"""Resolution of the images; the error map interpolates the drawn codes."""
+"""Resolution of the images; the error map interpolates between the drawn coordinates."""
 
 DELAY_TOPICS = ("twin/apparatus", "arm_left", "arm_right", "frame")
 
 STAGES = ("fingertip", "planner and arms", "geometry of the arms")
-"""Stages whose errors add up to the sheet's error: measured minus true finger, sheet by the arms'
-own joints minus measured finger, and true sheet minus that sheet."""
+"""Stages whose errors add up to the sheet's error: measured minus true finger; sheet computed from
+the arms' measured joints minus measured finger; true sheet minus that computed sheet."""
 
 
 @dataclass(slots=True)
 class CpuUse:
-    """Processor cores that the processes of a graph use, by node."""
+    """Average number of processor cores that the processes of a graph use, by node name."""
 
     cores: dict[str, float] = field(default_factory=dict)
 
     async def measure(self, driver: Driver, path: FingerPath) -> None:
-        """Follow a path, and measure the cores used from its start to its end."""
+        """Move the finger along a path, and measure the processor use during this time."""
         before, begin_s = read_cpu_s(driver.pids()), time.monotonic()
         await driver.follow(path)
         after, passed_s = read_cpu_s(driver.pids()), time.monotonic() - begin_s
@@ -80,9 +80,10 @@ class CpuUse:
 
 
 def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
-    """Return the processor time (s) of each process, with its ended children.
+    """Return the processor time (s) of each process, including its ended child processes.
 
-    Nodes that share a process have one entry with all of their names, joined by "+".
+    pids: process id of each node. Nodes that share a process have one common entry, whose key is
+    their names joined by "+".
     """
     names: dict[int, list[str]] = {}
     for name, pid in pids.items():
@@ -99,7 +100,7 @@ def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
 
 
 def make_stroke(scene: Scene, seconds: float) -> FingerPath:
-    """Make a stroke to and fro around the object, at most at the scene's speed."""
+    """Make a finger path that strokes back and forth around the object, up to the scene's speed."""
     half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
     times = np.arange(0.0, seconds, SAMPLE_S)
     arcs = half_m * np.sin(scene.working_range.speed_m_per_s / half_m * times)
@@ -117,7 +118,7 @@ def make_stroke(scene: Scene, seconds: float) -> FingerPath:
 
 
 def scene_speed(scene: Scene) -> float:
-    """Return the speed of a finger that leaves the object, m/s."""
+    """Return the speed at which the finger moves away from the object, m/s."""
     return max(scene.working_range.speed_m_per_s, compliance.PUSH_M_PER_S)
 
 
@@ -134,7 +135,7 @@ def _make_rest(scene: Scene, label: str, place: Sequence[float]) -> FingerPath:
 
 
 def list_image_paths(scene: Scene) -> list[FingerPath]:
-    """Return the paths to the sheets that are imaged: tilted, and pushed."""
+    """Return the finger paths for the two images: of a tilted sheet, and of a pushed sheet."""
     arc_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
     depth_m = PUSH_RATIO * scene.working_range.push_depth_m
     return [
@@ -144,7 +145,7 @@ def list_image_paths(scene: Scene) -> list[FingerPath]:
 
 
 def has_node(plan: ResolvedGraph, node_type: str) -> bool:
-    """Return whether the graph contains a node of that type or of a derived one."""
+    """Return whether the graph contains a node of that type or of a type derived from it."""
     base = node_class(node_type)
     return any(issubclass(node_class(node.type), base) for node in plan.nodes.values())
 
@@ -167,7 +168,10 @@ def run_system(
     *,
     apparatus: str | None = None,
 ) -> dict[str, Any]:
-    """Run the graph once; return its speed and errors. See `evaluate_system` for the keys."""
+    """Run the graph once; return its processor use, and the results of `evaluate_system`.
+
+    seconds: duration of the stroke. apparatus: file with true parameters of the simulated hardware.
+    """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     has_images = has_node(plan, "renderer") and has_node(plan, "twin_eye")
     has_forces = has_node(plan, "fem_solver")
@@ -198,11 +202,11 @@ def run_system(
 
 
 def evaluate_system(bag: Path, *, has_images: bool, has_forces: bool) -> dict[str, Any]:
-    """Return latencies and errors from a bag; None for what the graph does not present.
+    """Compute latencies and errors from a bag; None for images or forces that it lacks.
 
-    Latencies have p50, p95 and p99. Errors have mean, p95 and max: of the sheet and the fingertip
-    over the stroke, of the image over all seen points, of the force over the depths. budget: share
-    of each stage of `STAGES` in the sheet's mean square error.
+    Latencies have quantiles p50, p95 and p99. Errors have mean, p95 and max: of sheet and fingertip
+    over the stroke, of the image over all visible points, of the force over the depths. budget:
+    share of each stage of `STAGES` in the sheet's mean square error.
     """
     recording = stroke.read_recording(bag)
     begin_ns, end_ns = recording.windows_ns[STROKE]
@@ -231,9 +235,10 @@ def evaluate_system(bag: Path, *, has_images: bool, has_forces: bool) -> dict[st
 
 
 def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats]:
-    """Return the delays from exposures in a window to the commands of both arms, and to the light.
+    """Return the delays from exposures in a window to arm commands, and to displayed images, s.
 
-    The first effect of an exposure counts. Light is late by the true projector's latency.
+    Only the first effect of each exposure counts. The display time includes the true latency of
+    the projector beyond the latency that the renderer assumes.
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}
@@ -253,7 +258,7 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
 
 
 def read_offsets(bag: Path) -> stroke.SampledMotion:
-    """Read the commanded depth (n, 1) of the sheet below the undeformed surface, m."""
+    """Read from a bag the commanded depth (n, 1) of the sheet below the undeformed surface, m."""
     rows = [
         (message.valid_at_ns, np.array([message.normal_offset_m]))
         for _, message, _, _ in BagReader(bag, topics=["sheet_target"])
@@ -265,10 +270,10 @@ def read_offsets(bag: Path) -> stroke.SampledMotion:
 def split_sheet_error(
     recording: stroke.StrokeRecording, offsets: stroke.SampledMotion, times_ns: Times
 ) -> Floats:
-    """Return the sheet's error as a sum of the errors of `STAGES`, (3, n, 3) m, object's frame.
+    """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
 
-    The whole error is the object's point under the true finger, lowered by the commanded offset,
-    minus the contact point of the true sheet.
+    The total is the object point under the true finger, lowered by the commanded offset, minus the
+    contact point of the true sheet. Vectors are in the object's frame.
     """
     world_from_object = stroke.object_pose(recording.scene)
     object_from_world = inverse(world_from_object)
@@ -308,7 +313,7 @@ def _read_force_errors(bag: Path) -> Floats:
 
 
 def _iterate_force_errors(bag: Path) -> Iterator[float]:
-    """Yield the absolute error of the force at each depth of the push, percent."""
+    """Yield the absolute relative force error at each depth of the push, percent."""
     recorded = compliance.read_bag(bag)
     reference = compliance.ForceReference(recorded)
     press = compliance.make_presses(recorded.scene)[0]

@@ -1,4 +1,4 @@
-"""Run one trial of a sweep: read its description as JSON from stdin, and print its row.
+"""Run one trial of a sweep: read its description as JSON from stdin, and print its result row.
 
 python -m flexsheet.launch.experiments.trial
 """
@@ -41,7 +41,7 @@ Row = dict[str, Any]
 
 @contextmanager
 def _bag_of(trial: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the path of the trial's bag; without `bag` it is deleted afterwards."""
+    """Yield the path of the trial's bag. If the trial names none, it is deleted afterwards."""
     if trial.get("bag"):
         yield Path(trial["bag"])
         return
@@ -54,7 +54,9 @@ def _tell(text: str) -> None:
 
 
 def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
-    """Stroke once in a separate graph, and return the stroke's results with the flags."""
+    """Run one stroke in a separate graph; return its results with the causes of error that nodes
+    suspected.
+    """
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:
@@ -70,12 +72,12 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
 
 
 def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the results of one stroke; `apparatus` as of `--apparatus`, or None."""
+    """Run one stroke; return its results. The trial's `apparatus` is a value of `--apparatus`."""
     return run_stroke(trial, trial.get("apparatus"))
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the errors of a drawn apparatus: sheet and fingertip in motion, the others at rest."""
+    """Return the errors of a random apparatus: of sheet and finger in motion, others at rest."""
     plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
     scene, apparatus = require_scene(plan), plan.apparatus_message()
     assert apparatus is not None
@@ -102,7 +104,7 @@ def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the effects of one parameter at each of its sigmas, at rest and without a graph."""
+    """Return the effects of deviations of one apparatus parameter, at rest and without a graph."""
     plan = load_graph(Path(trial["launch_file"]))
     scene = require_scene(plan)
     evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
@@ -124,7 +126,7 @@ def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_system_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the speed and the errors of one configuration of the graph."""
+    """Run one configuration of the graph; return its speed and its errors."""
     launch_file = Path(trial["launch_file"])
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     settings = [*choose_ports(launch_file), *coarse, *trial["settings"]]
@@ -148,7 +150,7 @@ KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
 
 
 def main() -> int:
-    """Run the trial that stdin describes; its row is the last line of stdout."""
+    """Run the trial that stdin describes; print its result row as the last line of stdout."""
     logs_on_stderr()
     trial = json.load(sys.stdin)
     try:

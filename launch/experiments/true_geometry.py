@@ -1,6 +1,6 @@
-"""Compute where the true arms hold the sheet's edges for the poses that the nodes command.
+"""Compute the true poses of the sheet's edges for the poses that the nodes command.
 
-Only the simulator's arms are used, so that nothing is shared with the nodes' kinematics.
+Kinematics are those of the simulated arms, which share no code with the nodes' kinematics.
 """
 
 from __future__ import annotations
@@ -23,12 +23,15 @@ Floats = NDArray[np.float64]
 
 
 def pose_matrix(pose: Pose) -> Floats:
-    """Return the matrix (4, 4) of a pose."""
+    """Return a pose as a homogeneous matrix (4, 4)."""
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
-    """Return world_from_edge (4, 4) of the left and right edge of a flat sheet."""
+    """Return world_from_edge (4, 4) of the left and the right edge of a flat sheet.
+
+    distance_m: distance between the edges.
+    """
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     half = 0.5 * distance_m * rotation[:, 0]
     return transform(rotation, centre - half), transform(rotation, centre + half)
@@ -36,7 +39,7 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """Frames of one arm: world_from_base and edge_from_flange, (4, 4)."""
+    """Geometry of one arm: pose of its base, and pose of the clamped edge on its flange, (4, 4)."""
 
     world_from_base: Floats
     flange_from_edge: Floats
@@ -46,13 +49,13 @@ class ArmModel:
         return cls(pose_matrix(arm.world_from_base), pose_matrix(arm.flange_from_edge))
 
     def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
-        """Return the joints (6,) that hold the edge there; ValueError if it is out of reach."""
+        """Return the joint angles (6,), rad, for a pose of the edge; ValueError if out of reach."""
         flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
         return solve_inverse_kinematics(flange, guess_rad)
 
 
 class ArmPair:
-    """Assumed geometry of both arms from the scene, and their true geometry."""
+    """Both arms, with the geometry that the scene assumes and their true geometry."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
         true_scene = apply_apparatus(scene, apparatus)
@@ -67,7 +70,7 @@ class ArmPair:
         self._guesses = [START_GUESS_RAD, START_GUESS_RAD]
 
     def hold(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """Return the true poses (4, 4) of edges that are commanded at `edges`, at rest.
+        """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
 
         The pull of the sheet displaces the flanges. Backlash and servo lag are not included.
         """

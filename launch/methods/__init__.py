@@ -1,1 +1,1 @@
-"""Speed against accuracy of method families: measurement, charts, and choice for a scene."""
+"""Measure speed and accuracy of interchangeable methods, draw charts, and choose for a scene."""

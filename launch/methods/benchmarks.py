@@ -1,4 +1,7 @@
-"""Method families whose reference is the simulator; only launch may import both."""
+"""Method families whose errors are measured against the simulator.
+
+They are in `launch`, because only `launch` may import the methods and the simulator.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ RESTING = ("hold",)
 
 
 def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
-    """Make motions of the simulated finger: gestures, and the paper's stroke on a cylinder."""
+    """Make the true finger motions of the tracking benchmark: gestures, and a cylinder's stroke."""
     paths: dict[str, FingerPath] = {}
     if isinstance(scene.object.geometry, Cylinder):
         paths["stroke"] = stroke_path(scene, 10.0)
@@ -42,7 +45,7 @@ def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
 
 
 def _make_motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
-    """Make a finger motion with drift and tremor from the path's first point on."""
+    """Make a finger motion with drift and tremor that begins at the first point of a path."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
         0.0,
@@ -65,6 +68,6 @@ SHEET_FORCE = sheet_force_family(
     compute_true_force, lambda scene: force_table.load_or_compute(scene, None)
 )
 SHEET_LAWS = sheet_force_family(compute_true_force, None)
-"""Methods without a long computation."""
+"""Family of sheet force methods that need no long computation."""
 SHEET_SHAPE = sheet_shape_family(simulate_points)
 QUICK_SHAPE = sheet_shape_family(simulate_points, solved=False)

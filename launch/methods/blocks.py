@@ -1,9 +1,9 @@
-"""Plan and evaluate randomised blocks: paired ratios, bootstrap over blocks, front with a margin.
+"""Plan measurements of several configurations in randomised blocks, and evaluate them.
 
-A block contains every configuration once, in random order, so slow changes of the machine affect
-all of them alike. One configuration, the control, runs twice in a block: the ratio of its two runs
-(A/A) shows which differences are noise. Runs within a block are dependent, so intervals resample
-whole blocks (Kalibera and Jones, ISMM 2013).
+A block contains every configuration once, in random order, so that slow changes of the machine
+affect all of them alike. One configuration, the control, runs twice in each block; the ratio of its
+two runs shows which differences are noise. Runs in a block are not independent, so confidence
+intervals are found by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 20261123
-"""Seed of the bootstrap, so that equal data give equal intervals."""
+"""Fixed random seed of the bootstrap, so that equal data give equal intervals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Estimate with the limits of its 95 % confidence interval."""
+    """Estimated value with the limits of its 95 % confidence interval."""
 
     value: float
     low: float
@@ -35,15 +35,16 @@ class Interval:
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return a random order of the names for each block."""
+    """Return the configuration names in another random order for each block."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
 
 def bootstrap_median(values: Floats) -> Interval | None:
-    """Return the median over blocks (n,) with its interval; None without finite values.
+    """Return the median of values (n,), one per block, with its confidence interval.
 
-    NaN marks a failed run. One block has no interval: its limits are infinite.
+    NaN marks a failed run. None without finite values. If only one block has a value, the limits
+    are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -58,9 +59,9 @@ def bootstrap_median(values: Floats) -> Interval | None:
 
 
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
-    """Return the median ratio of positive values (n,) to those of the control in the same block.
+    """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    Uses logarithms, so that a ratio and its inverse have the same weight.
+    It is computed from logarithms, so that a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))
@@ -71,7 +72,7 @@ def compare_paired(values: Floats, control: Floats) -> Interval | None:
 
 
 def attribute_error(parts: Floats) -> Floats:
-    """Return the fraction (k,) of a mean square error that each of its summands causes.
+    """Return the fractions (k,) of a mean square error that k parts of the error cause.
 
     parts: (k, n, d), error vectors that add up to the whole error. The fractions add up to one. A
     part that compensates others has a negative fraction.
@@ -84,10 +85,10 @@ def attribute_error(parts: Floats) -> Floats:
 
 
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
-    """Return the names that no other point dominates, in the given order.
+    """Return the names of the points on the Pareto front: those that no other point dominates.
 
-    points: costs of each point, smaller is better. A point dominates another if it is better in one
-    cost by more than both intervals, and in no cost worse by more than both intervals.
+    points: costs of each point, smaller is better. A point dominates another if one of its costs is
+    lower and none is higher. Costs with overlapping confidence intervals count as equal.
     """
     return [
         name

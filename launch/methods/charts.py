@@ -1,4 +1,7 @@
-"""Measure speed and accuracy of a method family on this machine and a scene, and draw charts."""
+"""Measure speed and accuracy of the methods of a family for a scene, and draw charts of them.
+
+A family contains interchangeable methods for one task. Results hold for the measuring machine.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ FAMILIES: dict[str, str] = {
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Method families by their name on the command line, as `module:NAME`."""
+"""Location `module:NAME` of each method family, by its name on the command line."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0
@@ -45,14 +48,14 @@ TITLE_WIDTH = 95
 
 
 class UnknownFamilyError(FlexsheetError, KeyError):
-    """Raised for an unknown family name."""
+    """Raised if the user names a method family that does not exist."""
 
     code = "unknown-family"
     remedy = "Use one of the names that the error lists (`flexsheet chart --help`)."
 
 
 def find_family(name: str) -> Family:
-    """Return the family of that name. Raises UnknownFamilyError."""
+    """Return the method family with a name. Raises UnknownFamilyError."""
     if name not in FAMILIES:
         near = get_close_matches(name, FAMILIES, n=1)
         hint = (
@@ -63,7 +66,7 @@ def find_family(name: str) -> Family:
 
 
 def load_family(path: str) -> Family:
-    """Import the family at `module:NAME`."""
+    """Import the method family at the location `module:NAME`."""
     module_name, _, attribute = path.partition(":")
     family = getattr(import_module(module_name), attribute)
     assert isinstance(family, Family)
@@ -71,7 +74,7 @@ def load_family(path: str) -> Family:
 
 
 def git_commit() -> str | None:
-    """Return the commit of this code, or None if unknown."""
+    """Return the git commit of this code, or None if it is unknown."""
     commit: str | None = json.loads(read_git_state(ROOT))["commit"]
     return commit
 
@@ -84,9 +87,9 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     select: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure all selected trials of the family, and report the progress.
+    """Measure all selected trials (a method and a case) of the family, and report the progress.
 
-    Measures each trial before requesting the next, since a family may then release its data.
+    Each trial is measured before the next is requested, since a family may then release its data.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
@@ -100,7 +103,7 @@ def measure_family(
 
 
 def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Make a function of (done, total) that periodically reports progress and remaining time."""
+    """Make a function of (done, total) that regularly reports the progress and remaining time."""
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
@@ -115,7 +118,7 @@ def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[in
 
 
 def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """Return the result that `chart FAMILY --json` prints."""
+    """Return the result of a measured family as `flexsheet chart FAMILY --json` prints it."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -134,8 +137,8 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error over time on logarithmic axes, with a line along the Pareto front of each case.
 
-    A family with a `sweep_key` also gets diagrams of errors and extra metrics over that key, with a
-    band of the reference's uncertainty.
+    If the family has a `sweep_key`, a property that varies over the cases, also draw errors and
+    extra metrics over it. A band shows the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 
@@ -161,7 +164,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     """Draw error over time, with the tolerance as a dashed line.
 
-    Draws errors below 1e-4 of the tolerance, which are rounding errors, at that value.
+    Errors below 1e-4 of the tolerance are rounding errors; they are drawn at that value.
     """
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     min_error = 1e-4 * result["tolerance"]
@@ -211,7 +214,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     """Draw a metric over the sweep key, one line per method.
 
-    Markers out of range are hollow; the reference's uncertainty is grey.
+    Markers of cases outside the method's range are hollow. The reference's uncertainty is grey.
     """
     key, points = result["sweep_key"], result["points"]
 
@@ -265,12 +268,12 @@ def _is_finite(value: float | None) -> bool:
 
 
 def _has_reference(point: dict[str, Any]) -> bool:
-    """Return whether the reference determined the point's error."""
+    """Return whether the error of a point is known, that is, a reference was available."""
     return _is_finite(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the distinct cases of points, in order."""
+    """Return the cases of the points, each once, in order."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -288,7 +291,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the charts of a folder: those of `FAMILIES` in their order, then those of benchmarks."""
+    """Read the chart results in a folder: those of `FAMILIES` in order, then other benchmarks."""
     order = list(FAMILIES)
     paths = sorted(
         folder.glob("*.json"),
@@ -314,7 +317,7 @@ def write_overview(folder: Path) -> Path:
 
 
 def render_overview(folder: Path, link_prefix: str = "") -> str:
-    """Return a section for each chart in the folder.
+    """Return Markdown text with a section for each chart in the folder.
 
     link_prefix: path from the page to the folder, with a slash at its end.
     """
@@ -339,7 +342,7 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each method's maximum median time, maximum error and number of cases in range."""
+    """Return each method's largest median time, its largest error and number of cases in range."""
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):

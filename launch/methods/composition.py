@@ -1,9 +1,10 @@
-"""Compose methods of all families: add their errors along the chain, and confirm with the graph.
+"""Find the cheapest combination of one method per family that meets all tolerances of the system.
 
-Each metric of the system is a sum over stages. Independent spreads add as squares: the noise of the
-marker, the tracking at the time of use, and what no table contains (planner, servo, calibration).
-Signed errors of force models add. Delays add. The prediction from the tables decides which
-configuration runs next; a run of the graph decides whether it is accepted.
+The error of each system metric is predicted from the measured errors of the stages. Independent
+random errors (spreads) add as squares: marker noise, tracking error at the time of use, and errors
+that no measurement of a method contains (planner, servo, calibration). Signed errors of force
+models and delays (biases) add linearly. The prediction decides which combination is run next in the
+graph. The errors in this run decide whether it is accepted.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ MAX_RUNS = 4
 """Maximum number of configurations that are run through the graph."""
 
 P95_OVER_RMS = 1.614
-"""95 % quantile over root mean square of the length of an isotropic Gaussian error in space."""
+"""Ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
 
 
 class SystemMetric(StrEnum):
-    """Name a figure of the system with a tolerance, as in `chart system --json`; 95 % values."""
+    """Names of the system's 95 % errors and latencies that have a tolerance, as in the results."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -39,11 +40,11 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 
 @dataclass(frozen=True, slots=True)
 class StageOption:
-    """One method of a stage.
+    """Method that can be chosen for a stage.
 
-    cores: processor time per second. spreads, biases: 95 % errors that it adds to metrics, or the
-    delay (ms). given: methods of other stages that its figures belong to. in_range: whether the
-    method's stated range contains the scene's.
+    cores: processor time per second. spreads, biases: 95 % errors or delays (ms) that it adds to
+    metrics. given: methods of other stages for which these values were measured. in_range: whether
+    the method's stated range contains the scene's working range.
     """
 
     method: str
@@ -60,12 +61,12 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Parts of the metrics that no table contains, learned from runs of the graph."""
+    """Parts of the metrics that the methods do not explain, learned from runs of the graph."""
 
     parts: Figures = field(default_factory=dict)
 
     def learn(self, predicted: Figures, measured: Figures) -> Unexplained:
-        """Return the parts after a run that was predicted without them."""
+        """Return the parts updated from a run, whose metrics were predicted without such parts."""
         parts = dict(self.parts)
         for metric, value in measured.items():
             known = predicted.get(metric, 0.0)
@@ -76,7 +77,7 @@ class Unexplained:
 
 
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
-    """Return the metrics of a combination: spreads add as squares, biases linearly."""
+    """Predict the metrics of a combination: spreads add as squares, biases linearly."""
     squares: dict[SystemMetric, float] = {}
     sums: dict[SystemMetric, float] = {}
     for option in combination.values():
@@ -94,7 +95,7 @@ def predict(combination: Combination, unexplained: Unexplained | None = None) ->
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error that each stage adds to a metric, without those that add none."""
+    """Return the error that each stage adds to a metric; stages that add none are left out."""
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -103,7 +104,7 @@ def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
 
 
 def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combination]:
-    """Return all combinations whose options belong together, the cheapest first."""
+    """Return all combinations whose options agree with each other (see `given`), cheapest first."""
     combinations = [
         dict(zip(stages, options, strict=True)) for options in product(*stages.values())
     ]
@@ -126,7 +127,7 @@ def cost(combination: Combination) -> float:
 
 
 def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
-    """Return each exceeded metric with its value over its tolerance."""
+    """Return the ratio of value to tolerance for each metric that exceeds its tolerance."""
     return {
         metric: figures[metric] / limit
         for metric, limit in tolerances.items()
@@ -136,7 +137,7 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 
 @dataclass(frozen=True, slots=True)
 class GraphRun:
-    """One combination that ran through the graph. measured: 95 % values."""
+    """Run of one combination in the graph. measured: 95 % values."""
 
     methods: Mapping[str, str]
     cores: float
@@ -147,9 +148,9 @@ class GraphRun:
 
 @dataclass(frozen=True, slots=True)
 class Composition:
-    """Result of the composition.
+    """Result of the search.
 
-    chosen: accepted combination, or the one with the smallest excess. runs: in order.
+    chosen: accepted combination, or the one that exceeds the tolerances least. runs: all runs.
     """
 
     chosen: Combination
@@ -167,7 +168,7 @@ class Composition:
         return not self.last.exceeded and all(one.in_range for one in self.chosen.values())
 
     def report(self) -> dict[str, Any]:
-        """Return the report of `tune --json`."""
+        """Return the result as `flexsheet tune --json` prints it."""
         return {
             "accepted": self.accepted,
             "tolerances": {metric.value: limit for metric, limit in self.tolerances.items()},
@@ -177,7 +178,7 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return the verdict, and a sentence for each tolerance that is not met."""
+        """Return the result in one sentence, and a sentence for each tolerance that is not met."""
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
@@ -202,7 +203,7 @@ class Composition:
 
 
 def name_methods(combination: Combination) -> dict[str, str]:
-    """Return the method of each stage."""
+    """Return the name of the method of each stage."""
     return {stage: option.method for stage, option in combination.items()}
 
 
@@ -216,9 +217,9 @@ def compose(
 ) -> Composition:
     """Find the cheapest combination that meets all tolerances in a run of the graph.
 
-    Proposes the cheapest combination whose predicted metrics leave the margin. If its run exceeds a
-    tolerance, the difference from the prediction applies to all combinations, and the next one is
-    proposed. Without a promising combination, the one with the smallest excess runs.
+    Runs the cheapest combination whose predicted metrics keep the margin. If its run exceeds a
+    tolerance, corrects all predictions by the difference, and runs the next combination. If no
+    prediction is within the tolerances, runs the combination that exceeds them least.
     """
     combinations = list_combinations(stages)
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
@@ -265,7 +266,7 @@ def _predicted_excess(one: Combination, unexplained: Unexplained, limits: Figure
 
 
 def _miss(one: Combination, unexplained: Unexplained, limits: Figures) -> tuple[int, float, float]:
-    """Return a sort key for combinations that are not promising; range comes first."""
+    """Return a key that sorts combinations by their excess, those with methods in range first."""
     outside = sum(not option.in_range for option in one.values())
     worst = max(excess(predict(one, unexplained), limits).values(), default=0.0)
     return outside, worst, cost(one)

@@ -1,4 +1,4 @@
-"""Name the configurations of the graph that `flexsheet chart system` compares."""
+"""Define the configurations of the graph that `flexsheet chart system` compares."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "sheet_shape": ("renderer", "sheet_shape"),
     "correction": ("renderer", "correction"),
 }
-"""Node type and parameter that selects the method of each key of `Methods`."""
+"""Node type, and its parameter that selects the method, for each key of `Methods`."""
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
@@ -44,7 +44,7 @@ NODE_DEFAULTS = Methods(
     correction="two_pass",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
 )
-"""Methods of the nodes without a choice in the scene, as in docs/tune.md."""
+"""Methods that the nodes use if the scene contains no choice, as in docs/tune.md."""
 
 PAPER = Methods(
     marker="moments",
@@ -55,13 +55,14 @@ PAPER = Methods(
     correction="four_triangles",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
 )
-"""Methods of the paper: no filter, linear FEM, four triangles (sections III and IV)."""
+"""Methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles."""
 
 PAPER_PARAMETERS = (
     ("planner", "prediction_horizon_s=0"),
     ("planner", "compliance_mode=stiffness"),
 )
-"""The paper does not compensate the delay, and varies the stretch only (V-C, III-B)."""
+"""Parameters for the same paper, which does not compensate the delay (section V-C), and renders
+stiffness by the sheet's stretch only (section III-B)."""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -73,14 +74,14 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Methods of all nodes, with further parameters as (node type, "parameter=value")."""
+    """Methods of all nodes, with further parameters given as (node type, "parameter=value")."""
 
     name: str
     methods: Methods
     parameters: tuple[tuple[str, str], ...] = ()
 
     def settings(self, graph: ResolvedGraph) -> list[str]:
-        """Return the settings "node.parameter=value" for the nodes of a graph."""
+        """Return the settings "node.parameter=value" that apply this configuration to a graph."""
         chosen = list(self.parameters)
         for key, (node_type, parameter) in NODE_PARAMETERS.items():
             method = getattr(self.methods, key)
@@ -98,7 +99,7 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute the tables that the methods need, so that no run computes them."""
+        """Compute and cache the tables that the methods need, so that no run has to."""
         if self.methods.sheet_shape == "reduced_order":
             precompute_deflection_shapes(scene, None, progress)
         if self.methods.sheet_force == "table":
@@ -109,10 +110,10 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest methods whose stated range contains the scene's working range.
+    """Return the cheapest method of each family whose range contains the scene's working range.
 
-    Their errors do not matter. Where no method's range is sufficient, the one with the largest
-    range is chosen.
+    Errors are not considered. If no method of a family has a sufficient range, the one with the
+    largest range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
@@ -143,7 +144,7 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return the scene's methods, and the nodes' defaults where it has no choice."""
+    """Return the methods that the scene names, and the nodes' default methods for the others."""
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 
@@ -151,13 +152,16 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""Configuration that runs twice in each block."""
+"""Configuration with which the others are compared; it runs twice in each block."""
 
 CONTROL_AGAIN = "tuned, again"
 
 
 def list_configurations(scene: Scene) -> list[Configuration]:
-    """Return the compared configurations of a scene; without choices, tuned is the default."""
+    """Return the compared configurations for a scene.
+
+    If the scene names no methods, "tuned" equals "default".
+    """
     tuned = choose_tuned(scene)
     found = [
         Configuration("paper", PAPER, PAPER_PARAMETERS),
@@ -170,7 +174,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with these names, or all; the control is always among them.
+    """Return the configurations with these names (all without names), always with the control.
 
     Raises ExperimentError for an unknown name.
     """
@@ -182,7 +186,7 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file with another scene; files are named by absolute paths."""
+    """Write a copy of a launch file with another scene; relative paths become absolute."""
     yaml = YAML()
     launch = yaml.load(launch_file.read_text())
     launch["scene"] = str(scene_file.resolve())

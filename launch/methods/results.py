@@ -11,11 +11,11 @@ from typing import Any
 CPU_INFO = Path("/proc/cpuinfo")
 
 MAX_LOAD_PER_CORE = 0.5
-"""Maximum load per core at which timings are reliable."""
+"""Maximum load average per core at which timings are reliable."""
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Return a value with None for NaN and infinity, which JSON does not support."""
+    """Replace NaN and infinity, which JSON does not support, by None in nested values."""
     if isinstance(value, dict):
         return {key: replace_non_finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -35,7 +35,7 @@ def machine_name() -> str:
 
 
 def describe_load() -> str | None:
-    """Return a warning if other processes load the machine, else None."""
+    """Return a warning if other processes load the machine so that timings are wrong, else None."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return None

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, DARK_INK = "#1f2328", "#e6edf3"
-"""Colours of axes and text on white and on black."""
+"""Colours of axes and text on light and on dark pages."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""Colours that are distinct with colour vision deficiency, on white and black (Okabe and Ito)."""
+"""Colours that people with colour vision deficiency can distinguish (after Okabe and Ito)."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,
@@ -33,7 +33,7 @@ _STYLE: dict[Any, Any] = {
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
-    # A fixed salt makes equal figures equal in bytes.
+    # With a fixed salt, equal figures give equal files.
     "svg.hashsalt": "flexsheet",
 }
 
@@ -48,7 +48,7 @@ _DARK = f"""<style>
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Set a figure style with colours that `save_svg` can replace on dark pages."""
+    """Set a figure style whose colours `save_svg` can replace on dark pages."""
     import matplotlib as mpl
     from matplotlib.rcsetup import cycler
 
@@ -58,7 +58,7 @@ def page_style() -> Iterator[None]:
 
 
 def render_svg(figure: Figure) -> str:
-    """Return the figure as SVG with a transparent background, and light ink on dark pages."""
+    """Return the figure as SVG text. Background is transparent; text is light on dark pages."""
     text = StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     head, tag, rest = text.getvalue().partition("<defs>")
@@ -66,5 +66,5 @@ def render_svg(figure: Figure) -> str:
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """Write the figure as SVG; see `render_svg`."""
+    """Write a figure to an SVG file for light and dark pages; see `render_svg`."""
     write_file(path, render_svg(figure))

@@ -1,8 +1,9 @@
-"""Measure whole configurations of the running graph: speed against accuracy of the system.
+"""Measure speed and accuracy of the whole system for several configurations of its methods.
 
-Every trial is a process of its own that starts the graph, see `experiments/system_run.py`. Blocks
-alternate between the nominal apparatus and random ones. Errors are the 95 % values of a run; their
-spread is the interval of the median over blocks.
+Each trial is a separate process that starts the graph, see `experiments/system_run.py`. A block
+contains all configurations. Blocks alternate between the nominal apparatus (true parameters of the
+simulated hardware) and random ones. Errors are 95 % values of a run. Results are medians over
+blocks with their confidence intervals.
 """
 
 from __future__ import annotations
@@ -46,22 +47,26 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 FIRST_SEED = 100
-"""Seed of the first random apparatus: smaller ones are for development."""
+"""Seed of the first random apparatus; smaller seeds are for development."""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""Seed of the finger in the first block; no chart of a family has it."""
+"""Random seed of the finger in the first block; charts of single families do not use it."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
 QUANTILES = ("p50", "p95", "p99")
 COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
-"""Speeds that are compared with the control in the same block."""
+"""Keys of the speed values that are compared with the control configuration in the same block."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneTrials:
-    """Trials of one scene: descriptions for the sweep by name, with block and configuration."""
+    """Trials of one scene.
+
+    trials: description of each trial for the sweep, by name. places: block and configuration of
+    each trial. common: settings that all trials share.
+    """
 
     file: Path
     scene: Scene
@@ -72,7 +77,7 @@ class SceneTrials:
 
 
 def choose_apparatus(block: int, apparatuses: int) -> str | None:
-    """Return the apparatus of a block: every other block is nominal, the others are random."""
+    """Return the apparatus of a block: None (nominal) in every other block, else a random one."""
     if apparatuses == 0 or block % 2 == 0:
         return None
     seed = FIRST_SEED + (block // 2) % apparatuses
@@ -120,7 +125,7 @@ def plan_trials(
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
-    """Return the settings that give all runs of a block the same random finger."""
+    """Return settings that give the finger the same random motion in all runs of a block."""
     finger = node_class("twin_finger")
     return [
         f"{node.name}.seed={FINGER_SEED + block}"
@@ -138,7 +143,7 @@ def plan_configuration(
     seconds: float,
     launch_file: Path = DEMO_FILE,
 ) -> SceneTrials:
-    """Describe runs of one configuration on the nominal apparatus."""
+    """Describe the trials of one configuration with the nominal apparatus."""
     folder.mkdir(parents=True, exist_ok=True)
     launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
@@ -166,7 +171,10 @@ def plan_configuration(
 
 
 def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
-    """Compute the tables that the methods need, and run the trials that have no row yet."""
+    """Run the trials that have no result yet; return all results by trial name.
+
+    Tables that the methods need are computed before, so that they do not affect the measurement.
+    """
     for one in planned.configurations:
         one.prepare(planned.scene, progress)
     return run_sweep(folder, planned.common, planned.trials, progress)
@@ -183,7 +191,10 @@ def run_system_chart(
     launch_file: Path = DEMO_FILE,
     configurations: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Measure all scenes; return the result of `chart system --json`."""
+    """Measure the configurations for all scenes; return the result of `chart system --json`.
+
+    blocks: per scene. seconds: duration of the stroke. apparatuses: number of random ones.
+    """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
     for number, file in enumerate(scene_files, start=1):
@@ -209,7 +220,9 @@ def run_system_chart(
         ]
         points += summarize_scene(planned, rows)
     if not points:
-        raise ExperimentError(f"all trials failed; see {folder}; the last: {failed[-1]['error']}")
+        raise ExperimentError(
+            f"all trials failed; see {folder}; the last error: {failed[-1]['error']}"
+        )
     return {
         "points": points,
         "front": [
@@ -229,7 +242,7 @@ def run_system_chart(
 
 
 def read_value(row: Row, key: str) -> float:
-    """Return a figure of a row, such as "sheet_mm.p95"; NaN if it has none."""
+    """Return the value at a key of a row, such as "sheet_mm.p95"; NaN if the row lacks it."""
     found: Any = row
     for part in key.split("."):
         found = None if found is None else found.get(part)
@@ -237,7 +250,7 @@ def read_value(row: Row, key: str) -> float:
 
 
 def list_tolerances(scene: Scene) -> dict[str, float]:
-    """Return the scene's tolerance of each figure, by its key in a row of a trial."""
+    """Return the scene's tolerances, by the keys of the values in the row of a trial."""
     limits = {f"{metric.value}.p95": limit for metric, limit in metric_tolerances(scene).items()}
     return limits | {
         "exposure_to_arm_ms.p95": 1e3 * scene.tolerances.latency_s,
@@ -246,7 +259,7 @@ def list_tolerances(scene: Scene) -> dict[str, float]:
 
 
 def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
-    """Return a point for each configuration of a scene; those without a good run are missing."""
+    """Summarize each configuration of a scene in a point; omit those without a successful run."""
     found: dict[str, dict[int, Row]] = {}
     for name, row in rows.items():
         block, configuration = planned.places[name]
@@ -267,10 +280,10 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 def summarize_configuration(
     scene: Scene, name: str, rows: Mapping[str, Mapping[int, Row]], nominal: set[int]
 ) -> dict[str, Any]:
-    """Return the point of one configuration, from rows by configuration and block.
+    """Summarize one configuration in a point of the chart. rows: by configuration and block.
 
-    Absolute figures are medians over the blocks of the nominal apparatus, or over all if none has a
-    row. Ratios to the control are over all blocks in which both have a row.
+    Absolute values are medians over the blocks with the nominal apparatus; if all of these failed,
+    over all blocks. Ratios to the control use all blocks in which both have a row.
     """
     own, control = rows[name], rows.get(CONTROL, {})
     blocks = sorted(set(own) & nominal) or sorted(own)
@@ -336,12 +349,12 @@ def summarize_configuration(
 
 
 def upper_limit(one: Interval) -> float:
-    """Return the upper limit of an interval; its value where one block gave no interval."""
+    """Return the upper limit of an interval, or its value if it is infinite (a single block)."""
     return one.high if np.isfinite(one.high) else one.value
 
 
 def scale(one: Interval, factor: float) -> Interval:
-    """Return an interval in another unit."""
+    """Multiply an interval by a factor, for another unit."""
     return Interval(one.value * factor, one.low * factor, one.high * factor)
 
 
@@ -360,7 +373,7 @@ def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def worst_ratio(point: Mapping[str, Any]) -> Interval:
-    """Return the largest error of a point over its tolerance; latencies do not count."""
+    """Return the largest ratio of an error of a point to its tolerance; latencies do not count."""
     ratios = [
         Interval(**one)
         for key, one in point["tolerance_ratios"].items()
@@ -370,9 +383,10 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 
 
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the configurations of a scene that no other one dominates.
+    """Return the configurations of a scene on the Pareto front, which no other one dominates.
 
-    Costs are the exposure to arm latency, the processor cores, and the worst error over tolerance.
+    Costs are the latency from exposure to arm, the processor cores, and the worst error relative to
+    its tolerance.
     """
     costs = {}
     for point in points:

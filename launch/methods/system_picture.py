@@ -1,4 +1,4 @@
-"""Draw the chart of the system: speed across, error over tolerance up, and the error budget."""
+"""Draw the chart of `flexsheet chart system`: error over speed, and the error budget."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ NAMES = {
     "fingertip_mm": "fingertip",
 }
 MIN_RATIO = 0.03
-"""Smallest drawn error over tolerance."""
+"""Minimum of the drawn ratios of error to tolerance."""
 
 ROW_HEIGHT = 4.2
 
 
 def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
-    """Draw one row per scene: speed against error, and each error of each configuration.
+    """Draw one row per scene: worst error over latency, and all errors of each configuration.
 
-    A filled point meets all tolerances, a cross fails one. Bars are 95 % intervals.
+    Filled points meet all tolerances, crosses do not. Bars are 95 % confidence intervals.
     """
     from matplotlib.figure import Figure
 
@@ -55,7 +55,7 @@ def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
 def _draw_front(
     axes: Axes, scene: str, points: Sequence[Mapping[str, Any]], front: set[str]
 ) -> None:
-    """Draw the worst error over its tolerance, over the latency from exposure to arm."""
+    """Draw the worst ratio of error to tolerance against the latency from exposure to arm."""
     corners = []
     for colour, point in zip(COLOURS, points, strict=False):
         name, latency = point["configuration"], point["exposure_to_arm_ms"]
@@ -94,7 +94,7 @@ def _draw_front(
 
 
 def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the scene's tolerance of the latency to the arm."""
+    """Return the scene's maximum latency from exposure to arm command, ms; None if unknown."""
     key = "exposure_to_arm_ms.p95"
     for point in points:
         if key in point["spread"] and point["tolerance_ratios"][key]["value"] > 0.0:
@@ -109,14 +109,14 @@ def _failing(point: Mapping[str, Any]) -> str:
 
 
 def _bars(one: Interval, y: float) -> list[list[float]] | None:
-    """Return the lengths of the error bars down and up; None without an interval."""
+    """Return the lengths of the error bars below and above y; None without a finite interval."""
     if not np.isfinite([one.low, one.high]).all():
         return None
     return [[max(y - max(one.low, MIN_RATIO), 0.0)], [max(one.high - y, 0.0)]]
 
 
 def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
-    """Draw every error over its tolerance; the sheet's bar is divided into its stages."""
+    """Draw the ratio of each error to its tolerance; the sheet's bar is divided into stages."""
     width = 0.8 / max(len(points), 1)
     for number, (colour, point) in enumerate(zip(COLOURS, points, strict=False)):
         for column, key in enumerate(ERRORS):

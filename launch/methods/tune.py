@@ -1,8 +1,9 @@
-"""Measure methods for a scene, choose the fastest sufficient ones, and write them into the scene.
+"""Choose the fastest sufficient method of each family for a scene, and write it into the scene.
 
-Each family is measured on this machine over the scene's working range. A method is sufficient if
-its stated range contains the working range and its maximum error keeps a margin to the scene's
-tolerance. Without a sufficient method, the nearest miss is chosen and reported.
+A family contains interchangeable methods for one task. The methods are measured on this machine
+over the scene's working range. A method is sufficient if its stated range contains the working
+range, and its maximum error keeps a margin to the scene's tolerance. If no method is sufficient,
+the one closest to it is chosen and reported.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""Fraction of a tolerance reserved for errors outside the measurements."""
+"""Fraction of a tolerance that is reserved for errors in cases that are not measured."""
 TIE_RATIO = 1.1
-"""Maximum ratio to the fastest time at which a method counts as equally fast.
+"""Maximum ratio of a method's time to the fastest time at which both count as equally fast.
 
-Of equally fast methods the most accurate is chosen.
+Of equally fast methods, the most accurate one is chosen.
 """
 
 Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
@@ -53,7 +54,7 @@ Setting = str | dict[str, Any]
 
 
 class UnknownTunableError(FlexsheetError, KeyError):
-    """Raised for a family that scenes cannot choose methods of."""
+    """Raised for the name of a family whose method cannot be chosen in a scene."""
 
     code = "unknown-tunable"
     remedy = "Use one of the names that the error lists (docs/tune.md)."
@@ -61,11 +62,12 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """Method family that a scene can choose from.
+    """Method family whose method can be chosen in a scene.
 
-    key: in a scene's `methods`. families: as `module:NAME`, in the order of measurement. Later ones
-    take minutes to prepare and are measured only if no earlier method is sufficient. settings:
-    value in the scene for each method, by the method's name in the chart.
+    key: its key in the scene's `methods`. families: its parts as `module:NAME`, in the order of
+    measurement. Later parts take minutes to prepare and are measured only if no earlier method is
+    sufficient. settings: value to write into the scene for each method, by the method's name in
+    the family's chart.
     """
 
     name: str
@@ -75,7 +77,7 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the settings for all names of a literal type of `messages.methods`."""
+    """Return the settings for all method names of a `Literal` type in `messages.methods`."""
     return {name: name for name in get_args(methods)}
 
 
@@ -144,17 +146,18 @@ TUNABLES = (
         },
     ),
 )
-"""Families in the order of tuning, since the correction depends on the chosen sheet shape."""
+"""All tunable families in the order of tuning. The sheet shape precedes the image correction,
+whose settings depend on it."""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""Names of the two-pass correction in the chart, by sheet shape."""
+"""Names of the two-pass image correction in its chart, by method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str]) -> list[Tunable]:
-    """Return the tunables with these names, or all of them, in the order of `TUNABLES`."""
+    """Return the tunable families with these names (all without names), in tuning order."""
     known = [one.name for one in TUNABLES]
     for name in names:
         if name not in known:
@@ -166,10 +169,10 @@ def find_tunables(names: Sequence[str]) -> list[Tunable]:
 class MethodEvaluation:
     """Evaluation of one method over a scene's working range.
 
-    median_s: median over the cases of the time per call. slowest_s: maximum over the cases. error:
-    maximum within the method's range, at `worst_case`; infinite without a reference. outside: cases
-    out of the method's range. wrong: cases with an error above the tolerance less its margin, or
-    without a reference. points: measurements of the cases.
+    median_s, slowest_s: median and maximum of the time per call over the cases. error: maximum
+    error within the method's stated range, found at `worst_case`; infinite if no reference is
+    known. outside: cases outside the method's stated range. wrong: cases without a reference, or
+    with an error above the tolerance minus its margin. points: measurements of all cases.
     """
 
     method: str
@@ -194,7 +197,7 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Chosen method of a family, with the evaluations of all methods."""
+    """Choice of one method of a family, with the evaluations of all its measured methods."""
 
     family: str
     key: str
@@ -209,11 +212,11 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Return the remaining fraction of the tolerance; negative if it is exceeded."""
+        """Return the fraction of the tolerance that remains; negative if the error exceeds it."""
         return 1.0 - self.chosen.error / self.tolerance
 
     def explain(self) -> str:
-        """Return the reason for the choice in one sentence."""
+        """Return one sentence for the user that gives the reason for the choice."""
         one, unit = self.chosen, self.unit
         allowed = f"{_format(self.tolerance)} {unit}"
         took = format_duration(one.median_s)
@@ -231,7 +234,7 @@ class Choice:
         return f"{self.family}: {left}; {rest}"
 
     def _describe_fault(self, one: MethodEvaluation) -> str:
-        """Return the reason why a method is not sufficient."""
+        """Return the reason why a method is not sufficient, as a part of a sentence."""
         parts = []
         if one.wrong:
             error = f"{_format(one.error)} {self.unit} at {_format_case(one.worst_case)}"
@@ -243,7 +246,7 @@ class Choice:
         return " and ".join(parts)
 
     def report(self) -> dict[str, Any]:
-        """Return the report of `--json`."""
+        """Return the choice as `flexsheet tune --json` prints it."""
         return {
             "family": self.family,
             "key": self.key,
@@ -279,7 +282,10 @@ def evaluate_methods(
     tolerance: float,
     margin: float = MARGIN,
 ) -> list[MethodEvaluation]:
-    """Evaluate each method of `settings` over the cases within the scene."""
+    """Evaluate each method of `settings` over the measured cases in the scene's working range.
+
+    tolerance, margin: maximum error, and the fraction of it that must remain.
+    """
     allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
         own = [point for point in points if point.method == method and point.in_scene]
@@ -307,7 +313,7 @@ def evaluate_methods(
 
 
 def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
-    """Return the fastest method that meets the tolerance everywhere, else the nearest miss."""
+    """Return the fastest sufficient method; if there is none, the one closest to sufficient."""
     sufficient = [one for one in evaluations if one.meets]
     if not sufficient:
         return min(evaluations, key=_miss_key)
@@ -317,7 +323,7 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key for insufficient methods; cases out of range come first."""
+    """Return a key that sorts insufficient methods, first by their number of cases out of range."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -329,10 +335,10 @@ def tune(
     measure: Measure | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure and choose for each family in order.
+    """Measure the methods of each family in order, and choose one of each.
 
-    measure: replaces the measurement in tests. Raises the errors of a family that does not support
-    the scene's shape, mesh or sheet.
+    measure: function that replaces the measurement in tests. Passes on the errors of families that
+    do not support the scene's shape, mesh or sheet.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -355,12 +361,12 @@ def tune(
 
 
 def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
-    """Return the choice of a family; None if it was not tuned."""
+    """Return the choice for a family; None if that family was not tuned."""
     return next((one for one in choices if one.family == family), None)
 
 
 def _load_tracking(path: str, *, noise_px: float) -> Family:
-    """Return the tracking family with the noise of the chosen marker method."""
+    """Load the tracking family for measurement noise equal to the chosen marker method's error."""
     from flexsheet.launch.methods.benchmarks import make_finger_motions
     from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 
@@ -423,10 +429,10 @@ METHODS = "methods"
 def insert_choices(
     text: str, choices: Sequence[Choice], *, today: str, machine: str, commit: str | None
 ) -> str:
-    """Return a scene file's text with these choices in its `methods`.
+    """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
-    All other text is unchanged, including the methods of other families. A `methods` mapping on one
-    line is expanded to several lines.
+    All other text is unchanged, including the methods of other families. If `methods` is a mapping
+    on one line, it is expanded to several lines.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -466,11 +472,11 @@ def _make_line(choice: Choice, indent: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Position of `methods` in a scene file's lines.
+    """Block `methods` of a scene file, with the indices of its lines.
 
-    start: first line, including the generated comment above. end: line after the block; both are
-    the file's end without a block. header: the line `methods:`, if it can be reused. parts: each
-    family's key and lines in order; comments have an empty key.
+    start: first line, including the generated comment above it. end: line after the block. If the
+    file has no such block, both are the end of the file. header: the line `methods:`, if it can be
+    reused. parts: key and lines of each family, in order; comments have an empty key.
     """
 
     start: int
@@ -520,13 +526,13 @@ def _format_flow(item: Any) -> str:
 
 
 FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
-"""Keys of a scene file whose values are paths relative to it."""
+"""Keys of a scene file whose values are paths relative to the file's folder."""
 
 
 def relocate_paths(text: str, source: Path, target: Path) -> str:
-    """Return a scene file's text with its relative paths adapted to the target's folder.
+    """Return the text of a scene file with its relative paths adapted to the target's folder.
 
-    Raises BadInputError for a path that cannot be replaced.
+    Raises BadInputError if a path in the text cannot be replaced.
     """
     here, there = source.absolute().parent.resolve(), target.resolve().parent
     if here == there or source.resolve() == target.resolve():
@@ -553,7 +559,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """Raise BadInputError if the target cannot be written; for a check before the measurement."""
+    """Check before a long measurement that the target can be written; else raise BadInputError."""
     relocate_paths(_read(source), source, target)
     try:
         if target.is_dir():
@@ -584,10 +590,10 @@ def _draft_path(target: Path) -> Path:
 
 
 def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
-    """Write the choices into a scene file or a copy of it, atomically.
+    """Write the choices into a scene file or into a copy of it, atomically.
 
-    Preserves a symbolic link and writes its target. Raises BadInputError if the result would be
-    another scene, or the target cannot be written.
+    If the file is a symbolic link, the file that it points to is written. Raises BadInputError if
+    other parts of the scene would change, or the target cannot be written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
@@ -597,7 +603,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
         commit=git_commit(),
     )
     before = load_scene(source)
-    # Put the draft into the target's folder, since a scene's paths are relative to its own.
+    # Write the draft to the target's folder, since paths in a scene are relative to its folder.
     path = target.resolve()
     draft = _draft_path(path)
     try:
@@ -606,7 +612,10 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
             problem = Problem(
-                str(source), (METHODS,), "would change with the choices", "edit the file manually"
+                str(source),
+                (METHODS,),
+                "inserting the choices would change other parts of the scene",
+                "edit the file manually",
             )
             raise BadInputError([problem])
         shutil.copymode(path if path.exists() else source, draft)
@@ -618,7 +627,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
 
 
 def _load_draft(draft: Path, source: Path) -> Scene:
-    """Load the draft; attribute its problems to the source file."""
+    """Load the draft; report problems as problems of the source file, which users know."""
     try:
         return load_scene(draft)
     except BadInputError as error:

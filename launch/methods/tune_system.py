@@ -1,4 +1,4 @@
-"""Tune a scene as a whole: compose the measured methods, and run proposals through the graph."""
+"""Choose methods with which the whole system meets its tolerances, as runs of the graph confirm."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from flexsheet.nodes.methods import Point, Trial
 from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 
 RENDERED_HZ = 15.0
-"""Frames per second of the renderer, in `launch/demo.yaml`."""
+"""Frame rate of the renderer in `launch/demo.yaml`."""
 
 IMAGES = 2
-"""Images per exposure, each of which is searched for the marker."""
+"""Number of images per exposure in which the marker is searched."""
 
 STROKE_S = 10.0
 LEAD = "lead_ms"
@@ -51,7 +51,7 @@ MeasureTracking = Callable[[Scene, float], Sequence[MethodEvaluation]]
 
 
 def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
-    """Return all tolerances of a scene, in the units of the metrics."""
+    """Return the scene's tolerance of each system metric, in the unit of the metric."""
     limits = {SystemMetric(one.value): limit for one, limit in metric_tolerances(scene).items()}
     return limits | {
         SystemMetric.SKIN: 1e3 * scene.tolerances.skin_m,
@@ -61,7 +61,7 @@ def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
 
 
 def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
-    """Measure the tracking methods with the noise of a marker method."""
+    """Measure the tracking methods with marker noise of `noise_px` (pixels)."""
     from flexsheet.launch.methods.benchmarks import make_finger_motions
 
     family = make_tracking_family(make_finger_motions, noise_px)
@@ -77,11 +77,11 @@ def _is_in_scene(trial: Trial) -> bool:
 def make_stages(
     scene: Scene, choices: Sequence[Choice], measure: MeasureTracking = measure_tracking
 ) -> dict[str, list[StageOption]]:
-    """Return the options of each tuned family, with the metrics that they affect.
+    """Return the methods of each tuned family, with the errors that they add to system metrics.
 
-    Tracking is measured with the noise of each marker method. Its error at the exposure is that of
-    the fingertip, and at the longest horizon that of the sheet. The correction was measured with
-    the chosen sheet shape only.
+    Tracking is measured with the noise of each marker method. Its error at the exposure counts for
+    the fingertip, and its error at the longest prediction horizon for the sheet. The image
+    correction was measured with the chosen sheet shape only.
     """
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
@@ -135,7 +135,7 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest absolute value over the points in range; 0 without a value."""
+    """Return the largest absolute value over the points in the method's range; 0 without any."""
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
 
@@ -179,7 +179,7 @@ def _error(point: Point) -> float:
 
 
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Return the choices with the methods of a composition."""
+    """Replace the chosen method in each choice by that of `methods`; return the new choices."""
     return [
         replace(
             choice,
@@ -190,7 +190,7 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 
 
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
-    """Return the scene's methods with the choices; defaults where there is none."""
+    """Return the methods of the choices; for other families those of the scene or the defaults."""
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
 
@@ -205,10 +205,10 @@ def tune_system(
     runs: int,
     measure: MeasureTracking = measure_tracking,
 ) -> tuple[Composition, list[Choice]]:
-    """Compose the measured methods; return the composition, and the choices that it makes.
+    """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
-    runs: strokes of each proposal; the largest 95 % value counts. Raises ExperimentError if no run
-    of a proposal succeeds.
+    Return the search result, and the choices for the scene. runs: number of runs per combination,
+    of which the largest 95 % value counts. Raises ExperimentError if all runs of one fail.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")
@@ -232,14 +232,16 @@ def run_proposal(
     *,
     runs: int,
 ) -> Figures:
-    """Run a configuration through the graph; return the largest 95 % value of each metric."""
+    """Run a configuration in the graph `runs` times; return each metric's largest 95 % value."""
     planned = plan_configuration(scene_file, configuration, folder, runs=runs, seconds=STROKE_S)
     configuration.prepare(planned.scene, progress)
     rows = run_sweep(folder, planned.common, planned.trials, progress)
     good = [row for row in rows.values() if "error" not in row]
     if not good:
         last: Any = next(iter(rows.values()))
-        raise ExperimentError(f"no run of the graph succeeded; see {folder}; {last['error']}")
+        raise ExperimentError(
+            f"no run of the graph succeeded; see {folder}; the last error: {last['error']}"
+        )
     figures = {
         metric: max(read_value(row, f"{metric.value}.p95") for row in good)
         for metric in SystemMetric

@@ -1,1 +1,1 @@
-"""Mesh and texture files of a scene's object."""
+"""Read the mesh and texture files of a scene's object."""

@@ -34,38 +34,38 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""Shape names of scene files, in which a mesh is a file instead of arrays."""
+"""Shape names that scene files may contain. There a mesh is given as a file, not as arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
-"""Plausible extents of an object; others are probably in another unit."""
+"""Plausible extents of an object. Other extents probably result from a wrong unit."""
 MAX_COORDINATE = 1e9
-"""Maximum coordinate in a mesh file, in its unit; larger ones overflow in later computations."""
+"""Maximum coordinate in a mesh file, in its unit. Larger ones cause overflows in computations."""
 
 MAX_CUTTING_RATIO = 0.01
-"""Maximum number of intersecting triangle pairs over the number of triangles.
+"""Maximum ratio of the number of intersecting triangle pairs to the number of triangles.
 
-The smooth surface bridges fewer; a mesh with more is not one solid.
+Up to this ratio, the smooth surface bridges the intersections. A mesh with more is not one solid.
 """
 
 
 class MeshFile(LimitedModel):
-    """Geometry of an object as a mesh file."""
+    """Geometry of an object in a scene file that refers to a mesh file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     shape: Literal["mesh_file"] = "mesh_file"
-    file: str = Field(description="STL or OBJ file, relative to the scene file")
+    file: str = Field(description="path of the STL or OBJ file, relative to the scene file")
     metres_per_unit: Annotated[
-        Positive, Field(description="unit of the file, m: 0.001 for millimetres")
+        Positive, Field(description="unit of length in the mesh file, m: 0.001 for millimetres")
     ]
     smoothing_m: Positive | None = Field(
-        default=None, description="smoothing length, m; null: hide the facets"
+        default=None, description="length over which the surface is smoothed, m; null: hide facets"
     )
 
 
 def make_scene(document: Document) -> Scene:
-    """Make the scene of a scene file, including its mesh. Raises BadInputError."""
+    """Make the scene from a parsed scene file, including its mesh. Raises BadInputError."""
     name = _find_shape_name(document)
     if name is not None and name not in SHAPE_NAMES:
         what = f'unknown shape "{name}"'
@@ -85,7 +85,7 @@ def make_scene(document: Document) -> Scene:
 
 
 def _find_shape_name(document: Document) -> Any:
-    """Return the document's shape name, or None without one."""
+    """Return the name of the object's shape in a scene file, or None without one."""
     value: Any = document.values
     for key in (*GEOMETRY, "shape"):
         value = value.get(key) if isinstance(value, dict) else None
@@ -109,7 +109,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     check_mesh(vertices, triangles)
     crossings = count_intersections(vertices, triangles)
     if crossings > MAX_CUTTING_RATIO * len(triangles):
-        raise MeshError(f"{crossings} pairs of triangles intersect; repair the mesh")
+        raise MeshError(f"{crossings} pairs of triangles intersect in the mesh; repair it")
     if crossings:
         repairs.append(f"{crossings} intersecting pairs of triangles bridged")
     if smoothing_m is None:
@@ -129,23 +129,26 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
 
 
 def _load_trimesh(path: Path) -> Any:
-    """Read a file as an unchanged `trimesh.Trimesh`. Raises MeshError."""
+    """Read a mesh file as a `trimesh.Trimesh`, without changes. Raises MeshError."""
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"unsupported mesh format; convert the file to {' or '.join(SUFFIXES)}")
     try:
         size = path.stat().st_size
     except OSError as error:
-        raise MeshError(f"cannot be read at {path}: {error.strerror}; check the path") from error
+        raise MeshError(
+            f"the mesh file {path} cannot be read: {error.strerror}; check the path"
+        ) from error
     if size > MAX_BYTES:
         raise MeshError(
-            f"file size {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB; decimate the mesh"
+            f"the file has {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are allowed; decimate "
+            "the mesh"
         )
-    # Import late, because only scenes with a mesh need it.
+    # Import only when needed, because only scenes with a mesh use trimesh.
     import trimesh
 
     try:
         mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
-    # Invalid files raise errors of many types.
+    # trimesh raises errors of many types for invalid files.
     except Exception as error:
         raise MeshError(f"invalid mesh file: {error}; export it again") from error
     faces = np.asarray(getattr(mesh, "faces", ()))
@@ -155,26 +158,33 @@ def _load_trimesh(path: Path) -> Any:
 
 
 def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
-    """Raise MeshError for arrays that trimesh accepts although they are not a mesh."""
+    """Raise MeshError for invalid arrays that trimesh accepts."""
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
-        raise MeshError("expected triangles of 3D points; triangulate the mesh")
+        raise MeshError("the faces are not triangles of 3D points; triangulate the mesh")
     if not (np.abs(vertices) < MAX_COORDINATE).all():
         raise MeshError(
-            f"a vertex coordinate is not finite or exceeds {MAX_COORDINATE:g}; export it again"
+            f"a vertex coordinate is not finite or exceeds {MAX_COORDINATE:g}; export the mesh "
+            "again"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("a triangle contains the index of a missing vertex; export it again")
+        raise MeshError("a triangle refers to a missing vertex; export the mesh again")
 
 
 def _repair(
     mesh: Any, metres_per_unit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
-    """Return vertices (v, 3), m, triangles (t, 3) and the repairs. Raises MeshError if empty."""
+    """Return vertices (v, 3), m, triangles (t, 3) and descriptions of the repairs.
+
+    Raises MeshError if no valid triangle remains, or if there are too many.
+    """
     repairs = []
     if not len(getattr(mesh, "faces", ())):
-        raise MeshError("does not contain triangles; export a triangle mesh")
+        raise MeshError("the mesh contains no triangles; export a triangle mesh")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
-        raise MeshError(f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES}; decimate the mesh")
+        raise MeshError(
+            f"the mesh has {len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are allowed; "
+            "decimate the mesh"
+        )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     for what, keep in (
         ("degenerate", ~find_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces))),
@@ -186,7 +196,7 @@ def _repair(
             mesh.update_faces(kept)
             repairs.append(f"{dropped} {what} triangles removed")
     if not len(mesh.faces):
-        raise MeshError("all triangles are degenerate; export the mesh again")
+        raise MeshError("all triangles of the mesh are degenerate; export the mesh again")
     mesh.remove_unreferenced_vertices()
     vertices = np.array(mesh.vertices, dtype=np.float64) * metres_per_unit
     before = np.array(mesh.faces, dtype=np.int64)

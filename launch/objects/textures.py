@@ -23,18 +23,18 @@ APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""Maximum width and height; the projector has fewer pixels."""
+"""Maximum width and height of a texture image. The projector has fewer pixels."""
 
 
 class TextureError(FlexsheetError, ValueError):
-    """Raised for a file that cannot be used as a texture."""
+    """Raised if a file cannot be used as the texture of an object."""
 
     code = "texture"
     remedy = "Use a PNG or JPEG file, and a mesh with texture coordinates."
 
 
 def load_image(document: Document) -> None:
-    """Replace `image_file` in a scene's document by the image. Raises BadInputError."""
+    """Replace the key `image_file` in a parsed scene file by the image. Raises BadInputError."""
     value: Any = document.values
     for key in APPEARANCE:
         value = value.get(key) if isinstance(value, dict) else None
@@ -43,23 +43,25 @@ def load_image(document: Document) -> None:
     name, where = value.pop(IMAGE_FILE), (*APPEARANCE, IMAGE_FILE)
     try:
         if value.get("texture") != "image":
-            raise TextureError("requires texture: image; set it, or remove image_file")
+            raise TextureError("image_file requires texture: image; set it, or remove image_file")
         if not isinstance(name, str):
-            raise TextureError("expected a file name")
+            raise TextureError("expected a file name; give the name of a PNG or JPEG file")
         value["image"] = read_image(document.path.parent / name)
     except TextureError as error:
         raise BadInputError([document.problem(where, f'"{name}": {error}')]) from error
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Read an image (height, width, 3) in RGB order. Raises TextureError."""
+    """Read an image file as RGB array (height, width, 3). Raises TextureError."""
     if path.suffix.lower() not in SUFFIXES:
         raise TextureError(f"unsupported image format; convert the file to {' or '.join(SUFFIXES)}")
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise TextureError(f"cannot be read at {path}: {error.strerror}; check the path") from error
-    # Import late, because only scenes with an image need it.
+        raise TextureError(
+            f"the image file {path} cannot be read: {error.strerror}; check the path"
+        ) from error
+    # Import only when needed, because only scenes with an image use OpenCV.
     import cv2
 
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
@@ -68,6 +70,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if max(image.shape) > MAX_SIDE_PX:
         height, width = image.shape[:2]
         raise TextureError(
-            f"{width}x{height} pixels, at most {MAX_SIDE_PX} per side; reduce the image"
+            f"the image has {width}x{height} pixels, at most {MAX_SIDE_PX} per side are allowed; "
+            "reduce its size"
         )
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Select images of a session: some at regular intervals, and those at bookmarks."""
+"""Select images of a session for the report: some at regular intervals, and those at bookmarks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BOOKMARK_SHOTS = 40
-"""Number of shots at bookmarks that are stored; further ones are counted."""
+"""Maximum number of stored shots (image sets) at bookmarks; further ones are only counted."""
 
 MAX_WIDTH_PX = 420
 QUALITY = 82
@@ -18,7 +18,7 @@ QUALITY = 82
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """JPEG images of one time, each with its title; marked: label of its bookmark."""
+    """JPEG images taken at one time, each with a title. marked: label of a bookmark, or empty."""
 
     seconds: float
     title: str
@@ -30,8 +30,8 @@ class Shot:
 class Album:
     """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
-    bookmarks: (seconds, label), in order. count: number of shots. left_out: number of shots at
-    bookmarks beyond the first `MAX_BOOKMARK_SHOTS`.
+    bookmarks: (seconds, label), in order. count: number of all shots in the session. left_out:
+    number of shots at bookmarks that are not stored.
     """
 
     limit: int
@@ -45,7 +45,7 @@ class Album:
     def add(
         self, seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]]
     ) -> None:
-        """Add a shot; encode its images only if it is stored."""
+        """Take a shot into account; encode and store its images only if it is selected."""
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._at_bookmarks) >= MAX_BOOKMARK_SHOTS:
@@ -60,7 +60,7 @@ class Album:
         self.count += 1
 
     def shots(self) -> list[Shot]:
-        """Return the stored shots in the order of time."""
+        """Return the selected shots in the order of their times."""
         return sorted((*self._regular, *self._at_bookmarks), key=lambda shot: shot.seconds)
 
 
@@ -71,7 +71,7 @@ def _shot(
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Encode an image (h, w) grey or (h, w, 3) RGB as JPEG, at most `MAX_WIDTH_PX` wide."""
+    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG, reduced to at most `MAX_WIDTH_PX`."""
     height, width = image.shape[:2]
     if width > MAX_WIDTH_PX:
         size = (MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1))

@@ -1,4 +1,4 @@
-"""Draw the charts of the report as SVG for light and dark pages, each with a text."""
+"""Draw the charts of the bag report as SVG for light and dark pages, each with a description."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""Hatches that distinguish faults without colours."""
+"""Hatches that distinguish states for readers who cannot see the colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -42,7 +42,7 @@ EVENTS = ("fingertip", "sheet target", *ARM_EVENTS, "soft body", "frame drawn")
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart. svg: image. text: description of its content. caption: how to read it."""
+    """Chart. svg: image. text: description of its content. caption: explanation for readers."""
 
     svg: str
     text: str
@@ -50,7 +50,7 @@ class Chart:
 
 
 def draw_charts(session: Session) -> dict[str, Chart]:
-    """Draw the charts for which the bag has data, by name."""
+    """Draw all charts for which the bag has data; return them by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -76,14 +76,14 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Set the axes to the time of the bag; call it after the lines are drawn."""
+    """Limit the x axis to the duration of the bag; call this after the lines are drawn."""
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Add markers to values without neighbours, which a line does not show."""
+    """Add markers to values between NaNs, which a line would not show."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         has_neighbour = np.zeros_like(known)
@@ -96,7 +96,7 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Draw strips of states over time, and events above them."""
+    """Draw the states of sheet, arms and tracker as strips over time, with events above them."""
     strips = [
         (name, states)
         for name, states in (
@@ -159,7 +159,7 @@ def timeline(session: Session) -> Chart | None:
 
 
 def sort_by_duration(states: States) -> list[tuple[str, float]]:
-    """Return the states and their durations in s, the longest first."""
+    """Return the states and their total durations in s, the longest first."""
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
@@ -169,10 +169,10 @@ def find_intervals(
 ) -> Iterator[tuple[str, float, float]]:
     """Yield the intervals of constant state: (state, start s, end s).
 
-    lasting: an interval ends at the next state, not at a gap without messages.
+    lasting: whether a state continues until the next state, also through gaps without messages.
     """
     width_s = grid.duration_s / grid.count
-    # Messages that are rarer than the grid's intervals leave gaps, which are bridged.
+    # Bridge short gaps, which occur if messages are rarer than intervals of the grid.
     max_gap = max(int(0.5 / width_s), 1)
     codes = states.codes.tolist()
     begin, code, last = 0, States.NOTHING, -1
@@ -191,7 +191,7 @@ def find_intervals(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Draw the median and 99 % quantile of each latency after the exposure over time."""
+    """Draw the median and 99 % quantile of the latency from exposure to each event, over time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -224,13 +224,13 @@ def latencies(session: Session) -> Chart | None:
         "Latency from the exposure to each step over the whole bag, median and 99 %: "
         + "; ".join(texts)
         + ".",
-        "Time from the middle of the exposure until the message is sent, the command is written "
-        "or the frame is drawn.",
+        "Time from the centre of the exposure until the message or the arm command is sent, or "
+        "the frame is drawn.",
     )
 
 
 def paths(session: Session) -> Chart | None:
-    """Draw the paths of finger and sheet centre, from the front and from the side."""
+    """Draw the paths of the finger and of the sheet's centre, from the front and from the side."""
     finger, true = 1e3 * session.finger_path.points, 1e3 * session.true_path.points
     sheet = 1e3 * session.sheet_path.points
     known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
@@ -263,13 +263,13 @@ def paths(session: Session) -> Chart | None:
     )
     return Chart(
         render_svg(figure),
-        f"Paths of finger and sheet in the world: {spans}.",
+        f"Paths of finger and sheet in the world frame: {spans}.",
         "Positions in the world frame, whose origin is the centre of the virtual screen.",
     )
 
 
 def sheet_errors(session: Session) -> Chart | None:
-    """Draw the maximum position and angle errors of each interval in contact."""
+    """Draw the maximum position and angle errors of the sheet in each interval in contact."""
     errors = session.errors
     shown = [
         (name, label)
@@ -304,16 +304,16 @@ def sheet_errors(session: Session) -> Chart | None:
     ]
     return Chart(
         render_svg(figure),
-        "Errors of the sheet in contact, as the paper defines them; maximum: "
+        "Errors of the sheet in contact, as defined by Furukawa et al. 2007; maximum: "
         + ", ".join(worst)
         + ".",
-        f"Maximum of each {session.grid.duration_s / session.grid.count:.2g} s in contact, without "
-        "the commanded compliance of the sheet.",
+        f"Maximum of each {session.grid.duration_s / session.grid.count:.2g} s in contact. The "
+        "commanded depth of the sheet below the surface is not an error.",
     )
 
 
 def draw_joint_speeds(session: Session) -> Chart | None:
-    """Draw each joint's maximum speed in percent of its limit."""
+    """Draw the maximum speed of each joint in percent of its limit, over time."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
@@ -342,12 +342,12 @@ def draw_joint_speeds(session: Session) -> Chart | None:
     return Chart(
         render_svg(figure),
         f"Joint speeds in percent of their limits: {', '.join(texts)}.",
-        "Maximum of each interval, from the measured joints over 25 ms.",
+        "Maximum of each interval; speeds are averages of the measured joint angles over 25 ms.",
     )
 
 
 def forces(session: Session) -> Chart | None:
-    """Draw the edge forces, the force of the object and the push depth."""
+    """Draw the forces at the sheet's edges, the object's force and the push depth, over time."""
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None
@@ -368,7 +368,7 @@ def forces(session: Session) -> Chart | None:
     lower.plot(seconds, session.force.maximum, color=COLOURS[4], linestyle="--", label="force, N")
     lower.set_ylabel("push, mm; force, N")
     for axes in (upper, lower):
-        # The legend needs space above the lines.
+        # Leave space for the legend above the lines.
         axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])
         axes.legend(fontsize=8, ncols=3, loc="upper right")
         _over_time(axes, session)
@@ -376,6 +376,6 @@ def forces(session: Session) -> Chart | None:
     return Chart(
         render_svg(figure),
         f"Forces: {', '.join(texts)}.",
-        "Top: forces at the sheet's edges, from the bridges. Bottom: push depth of the finger, and "
-        "the object's force on it, from the solver.",
+        "Top: forces at the sheet's edges, reported by the arm bridges. Bottom: push depth of the "
+        "finger, and the object's force on it, computed by the soft-body solver.",
     )

@@ -1,4 +1,4 @@
-"""Find the problems of a recorded session, each with its section of the report."""
+"""Find the problems in a recorded session, for the first section of the bag report."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from flexsheet.messages.busy import BUSY_REMEDY
 Gravity = Literal["bad", "doubtful"]
 
 SLOW_RATIO = 0.5
-"""Fraction of a topic's minimum rate below which it counts as slow, as in the console."""
+"""Fraction of a topic's minimum rate below which the topic counts as slow, as in the console."""
 
 MAX_UNSEEN_RATIO = 0.05
 """Maximum fraction of images without a valid fingertip."""
 
 MAX_LIMIT_RATIO = 1.0
-"""Ratio to a limit above which a value is a finding."""
+"""Ratio of a value to its limit above which the value is reported as a problem."""
 
 ROUNDING = 1.02
-"""Tolerance of measured speeds and forces, as a ratio."""
+"""Factor by which measured speeds and forces may exceed their limits, because of rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFinding:
-    """A problem of a session.
+    """Problem found in a session.
 
-    gravity: "bad" for a failure, "doubtful" for something to check. section: id on the page.
+    gravity: "bad" for a failure, "doubtful" for something to check. section: id of the section of
+    the page with details.
     """
 
     gravity: Gravity
@@ -36,7 +37,7 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""Fraction of the time above which an overloaded computer is a fault."""
+"""Maximum fraction of the time in which a computer may be overloaded without being a failure."""
 
 CHECKED = (
     "overload of the computers; "
@@ -49,7 +50,10 @@ CHECKED = (
 
 
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
-    """Find all problems: overload first, as it causes most others, then failures."""
+    """Return all problems in the numbers of a session.
+
+    Overload is first, as it causes most other problems; failures follow.
+    """
     found = [
         *_check_bag(numbers),
         *_check_arms(numbers),
@@ -67,7 +71,7 @@ def _times(count: int) -> str:
 
 
 def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
-    """Report an overloaded computer. others: the other findings."""
+    """Report overloaded computers. others: other problems, which overload may have caused."""
     stopped = numbers["events"]["counts"].get("arm", 0)
     for host in numbers["hosts"].values():
         if not host["busy_fraction"]:
@@ -93,7 +97,7 @@ def _check_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         )
     if lost := int(bag["recording"].get("lost_messages", 0)):
         yield SessionFinding(
-            "bad", f"The recorder lost {lost} messages before this bag (a full disk).", "bag"
+            "bad", f"The recorder lost {lost} messages before this bag (disk full).", "bag"
         )
     unreadable = [
         f"{name} cannot be read: {topic['type']} has changed since the recording."
@@ -196,8 +200,8 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         if errors is not None:
             if errors["mean"] > most_mm:
                 text = (
-                    f"In contact the mean position error of the sheet to the {what} finger was "
-                    f"{errors['mean']:.3g} mm; the scene allows {most_mm:.3g} mm."
+                    f"In contact, the mean position error of the sheet relative to the {what} "
+                    f"finger was {errors['mean']:.3g} mm; the scene allows {most_mm:.3g} mm."
                 )
                 yield SessionFinding("doubtful", text, "sheet")
             break
@@ -227,5 +231,5 @@ def _check_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             yield SessionFinding("doubtful", text, "sheet")
     frames = numbers["frames"]
     if frames["late"]:
-        text = f"{frames['late']} of {frames['count']} frames were late by over half a period."
+        text = f"{frames['late']} of {frames['count']} frames were late by more than half a period."
         yield SessionFinding("doubtful", text, "latency")

@@ -1,4 +1,4 @@
-"""Measure how well the sheet followed the simulator's finger along one path."""
+"""Measure how well the sheet followed the simulated finger along one path."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 Floats = NDArray[np.float64]
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""Maximum height of the true finger above the undeformed object in contact.
+"""Maximum height of the true finger above the undeformed object that counts as contact.
 
-A fingertip's pad deforms by about this much."""
+The pad of a fingertip deforms by about this much."""
 
 
 class Sizes:
-    """Mean, 95 % quantile (to 2.3 %) and maximum of positive values that are not stored."""
+    """Mean, 95 % quantile (accurate to 2.3 %) and maximum of positive values.
+
+    The values are not stored.
+    """
 
     def __init__(self) -> None:
         self._moments, self._spread = RunningMoments(), Spread(Grid(0, 1.0, 1))
 
     def add(self, values: Floats) -> None:
-        """Add values (n,)."""
+        """Add values (n,) to the statistics."""
         self._moments.add(values)
         for value in values.tolist():
             self._spread.add(0, value)
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return the three figures times `scale`; None without a value."""
+        """Return mean, 95 % quantile and maximum times `scale`; None without a value."""
         found, p95 = self._moments.summary(scale), self._spread.quantile_s(0.95)
         if found is None or p95 is None:
             return None
@@ -38,9 +41,9 @@ class Sizes:
 
 
 class FollowedFinger:
-    """Accumulator of the errors of the true sheet against the true finger.
+    """Accumulator of the errors of the true sheet relative to the true finger.
 
-    A drop-out is an interval without following that overlaps contact.
+    A drop-out is an interval without following, during at least part of which there is contact.
     """
 
     def __init__(self) -> None:
@@ -52,10 +55,10 @@ class FollowedFinger:
     def add(
         self, delta_d_m: Floats, delta_theta_rad: Floats, heights_m: Floats, following: Any
     ) -> None:
-        """Add consecutive exposures (n,).
+        """Add the errors (n,) at consecutive exposures.
 
-        heights_m: height of the true finger above the undeformed object, negative below. following:
-        bool (n,), whether both arms follow a target that follows the finger.
+        heights_m: height of the true finger above the undeformed object, negative below it.
+        following: bool (n,), whether both arms follow a sheet target that follows the finger.
         """
         contact = heights_m <= MAX_CONTACT_HEIGHT_M
         self.exposures += len(contact)
@@ -71,10 +74,10 @@ class FollowedFinger:
                 self.drop_outs += 1
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures; None where the finger was never in contact.
+        """Return the summary of the errors; None for values that require contact without any.
 
-        contact_ratio: fraction of the exposures on the path. following_ratio: fraction of those in
-        contact.
+        contact_ratio: fraction of the exposures that are in contact. following_ratio: fraction of
+        the exposures in contact at which the arms follow.
         """
         return {
             "contact_ratio": self._in_contact / self.exposures if self.exposures else None,

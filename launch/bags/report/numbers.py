@@ -1,4 +1,4 @@
-"""Compute the numbers of a session as one JSON document, for `bag report --json` and the page."""
+"""Compute all numbers of the bag report, for `bag report --json` and the HTML page."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 DEGREES = float(np.degrees(1.0))
 
 METHODS = ("method", *Methods.model_fields)
-"""Names of parameters of nodes that select a method."""
+"""Names of node parameters that select a method."""
 
 
 def compute_numbers(session: Session) -> dict[str, Any]:
-    """Compute all figures; None where the bag does not contain the data."""
+    """Compute all numbers of the report; None where the bag lacks the data."""
     info, scene = session.info, session.scene
     return {
         "bag": {
@@ -200,7 +200,7 @@ def _node(session: Session, name: str, summary: NodeSummary) -> dict[str, Any]:
 
 
 def describe_methods(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
-    """Describe the methods that a node uses; `auto` selects those of the scene."""
+    """Describe the methods that a node uses; "auto" means the method named in the scene."""
     by_scene = scene.methods.model_dump() if scene is not None else {}
     by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")
     found = []

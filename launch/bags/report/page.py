@@ -1,4 +1,4 @@
-"""Render the report as one self-contained HTML file for screen and print."""
+"""Render the bag report as one self-contained HTML file for screen and print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
-"""Marks a file that a later report may overwrite."""
+"""Comment in a report file. It shows that a later report may overwrite the file."""
 
 COLOURS = {
     "light": {"ground": "#ffffff", "text": "#1f2328", "quiet": "#57606a", "line": "#d0d7de",
@@ -40,7 +40,7 @@ SECTIONS = {
 
 EVENTS_SHOWN = 60
 BRIEF_S = 0.02
-"""Shorter states are omitted from the page's table; the chart and --json contain them."""
+"""Minimum duration of states in the table of the page. Chart and --json contain all states."""
 
 _CSS = """
 * { box-sizing: border-box; }
@@ -88,7 +88,7 @@ pre { background: var(--panel); padding: .75rem; overflow-x: auto; }
 
 
 def render_page(session: Session) -> str:
-    """Render the report of a session as HTML."""
+    """Render the report of a recorded session as HTML."""
     numbers, charts = compute_numbers(session), draw_charts(session)
     name = Path(numbers["bag"]["path"]).name
     body = [
@@ -240,7 +240,7 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
     rows = []
     for name, one in numbers["topics"].items():
         expected = one["expected_hz"]
-        # The age of a message that is published once has no meaning.
+        # The age of messages that are published only once has no meaning.
         flows = expected is not None or (one["rate_hz"] or 0.0) > 1.0
         rows.append(
             (
@@ -258,9 +258,9 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
             )
         )
     yield table(
-        "Age: time since the source stamp at the readers, or at the recorder if there is no other "
-        "reader. Skipped: replaced by a newer message before it was read, by design. Lost: "
-        "between writer and readers. Missing: not in the bag.",
+        "Age: time from the source timestamp until the message is read, or recorded if there is no "
+        "other reader. Skipped: intentionally replaced by a newer message before it was read. "
+        "Lost: on the way from writer to readers. Missing: not in the bag. Refused: invalid.",
         ("topic", "messages", "Hz", "expected, Hz", "age, ms", "age 99 %, ms",
          "maximum gap, s", "skipped", "lost", "missing", "refused"),
         rows,
@@ -451,7 +451,7 @@ def _image(title: str, shot: Shot, name: str, jpeg: bytes) -> str:
 
 
 def figure(chart: Chart | None, missing: str) -> str:
-    """Render a chart with its caption, or the text `missing` without a chart."""
+    """Render a chart with its caption; if there is no chart, render the text `missing`."""
     if chart is None:
         return _missing(missing)
     data = b64encode(chart.svg.encode()).decode()
@@ -463,14 +463,14 @@ def figure(chart: Chart | None, missing: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Render a table: the first column contains row headers, numbers have three digits."""
+    """Render a table. The first column contains row headers; numbers have three digits."""
     body = []
     for first, *rest in rows:
         cells = "".join(_cell(value) for value in rest)
         body.append(f'<tr><th scope="row">{escape(_format(first))}</th>{cells}</tr>')
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     return (
-        # A wide table scrolls separately from the page; tabindex allows the keyboard.
+        # A wide table scrolls separately from the page; with tabindex, also by the keyboard.
         f'<div class="scroll" role="region" aria-label="{escape(caption, quote=True)}" '
         f'tabindex="0"><table><caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
@@ -484,7 +484,7 @@ def _cell(value: Any) -> str:
 
 
 def _format(value: Any) -> str:
-    """Format a value for display."""
+    """Format a value of a table cell for display."""
     match value:
         case None:
             return "–"

@@ -1,6 +1,6 @@
-"""Summarize measured quantities per interval of time.
+"""Summarize measured quantities in equal intervals of a bag's time.
 
-The memory does not depend on the duration of the bag.
+The required memory does not depend on the duration of the bag.
 """
 
 from __future__ import annotations
@@ -15,63 +15,63 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""Range and resolution of `Spread`; a bin is 2.3 % wide."""
+"""Range and resolution of the histogram in `Spread`; a bin is 2.3 % wide."""
 
 CELLS = 7 * CELLS_PER_DECADE
 MAX_STATE_AGE_S = 0.5
-"""Maximum time for which a state without a further message counts."""
+"""Maximum time for which a state is assumed to last without another message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Division of the time of a bag into equal intervals."""
+    """Division of a bag's duration into `count` equal intervals."""
 
     start_ns: int
     duration_s: float
     count: int
 
     def index(self, at_ns: int) -> int:
-        """Return the interval of a time; times outside belong to the first or the last one."""
+        """Return the index of a time's interval; times outside count to the first or the last."""
         fraction = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
         return min(max(int(fraction * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
-        """Return the centres (count,) of the intervals, s since the start of the bag."""
+        """Return the centre times (count,) of the intervals, s since the start of the bag."""
         middles = np.arange(self.count, dtype=np.float64) + 0.5
         return np.asarray(middles * (self.duration_s / self.count))
 
 
 class Range:
-    """Minimum and maximum of each interval; NaN without a value."""
+    """Minimum and maximum of a quantity in each interval; NaN without a value."""
 
     def __init__(self, grid: Grid) -> None:
         self.minimum = np.full(grid.count, np.nan)
         self.maximum = np.full(grid.count, np.nan)
 
     def add(self, index: int, value: float) -> None:
-        """Add a value to an interval."""
-        # A comparison with NaN is false.
+        """Add a value to the interval `index`."""
+        # The negated comparison is also true for NaN, the initial value.
         if not value >= self.minimum[index]:
             self.minimum[index] = value
         if not value <= self.maximum[index]:
             self.maximum[index] = value
 
     def overall(self) -> tuple[float, float] | None:
-        """Return minimum and maximum of all; None without a value."""
+        """Return minimum and maximum over all intervals; None without a value."""
         if np.isnan(self.maximum).all():
             return None
         return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
 
 
 class Spread:
-    """Logarithmic histogram of durations for each interval."""
+    """Distribution of durations (such as latencies) in each interval, as logarithmic histograms."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
         self.longest_s = 0.0
 
     def add(self, index: int, duration_s: float) -> None:
-        """Add a duration; a shorter one counts as `MIN_DURATION_S`."""
+        """Add a duration to an interval; shorter ones than `MIN_DURATION_S` count as this."""
         self.longest_s = max(self.longest_s, duration_s)
         cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
@@ -81,17 +81,17 @@ class Spread:
         return int(self.counts.sum())
 
     def quantile_s(self, fraction: float) -> float | None:
-        """Return a quantile of all durations, to 2.3 %; None without a value."""
+        """Return a quantile of all durations, accurate to 2.3 %; None without a value."""
         found = _quantiles(self.counts.sum(axis=0, keepdims=True), fraction)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
-        """Return the quantile of each interval, (count,); NaN without a value."""
+        """Return a quantile of the durations in each interval (count,); NaN without a value."""
         return _quantiles(self.counts, fraction)
 
 
 def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
-    """Return quantiles (n,) of rows (n, CELLS) of counts."""
+    """Return quantiles (n,) of n histograms, given as rows (n, CELLS) of counts."""
     sums = np.cumsum(counts, axis=1)
     rank = fraction * sums[:, -1:]
     cell = np.argmax(sums >= np.maximum(rank, 1), axis=1)
@@ -103,7 +103,7 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """Last point of each interval, (count, 3); NaN without a point."""
+    """Last position of a moving point in each interval (count, 3); NaN without a value."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -113,7 +113,7 @@ class PointSeries:
 
 
 class States:
-    """Most severe state of each interval, and total time in each state.
+    """Most severe state of a device in each interval, and total time in each state.
 
     order: the expected states, from the least to the most severe.
     """
@@ -129,7 +129,7 @@ class States:
         self._since_ns = 0
 
     def add(self, index: int, at_ns: int, state: str) -> bool:
-        """Set the state at `at_ns`; return whether it has changed."""
+        """Add the state reported at `at_ns`; return whether it differs from the previous state."""
         if state not in self.seconds:
             self.names.append(state)
             self.seconds[state] = 0.0
@@ -145,7 +145,7 @@ class States:
 
 @dataclass(slots=True)
 class RunningMoments:
-    """Mean, standard deviation and maximum of values that are not stored."""
+    """Mean, standard deviation and maximum of values, computed without storing the values."""
 
     count: int = 0
     total: float = 0.0
@@ -160,7 +160,7 @@ class RunningMoments:
             self.maximum = max(self.maximum, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return the three figures times `scale`; None without a value."""
+        """Return mean, standard deviation and maximum times `scale`; None without a value."""
         if not self.count:
             return None
         mean = self.total / self.count
@@ -170,7 +170,7 @@ class RunningMoments:
 
 @dataclass(slots=True)
 class Events:
-    """Events in order, at most `limit` of each kind, and the count of all."""
+    """Events in order of time: the first `limit` of each kind, and the count of all."""
 
     limit: int = 100
     stored: list[tuple[float, str, str]] = field(default_factory=list)

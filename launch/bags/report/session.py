@@ -1,4 +1,4 @@
-"""Read a bag once, from start to end, and summarize it for the report."""
+"""Read a bag once, from start to end, and summarize it for `flexsheet bag report`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 MIN_EARLIER_UPTIME_S = 10.0
 SILENT_PERIODS, MIN_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
-"""Interval over which speeds are averaged, because single stamps are irregular."""
+"""Interval over which speeds are averaged, because timestamps of single messages are irregular."""
 
 PHASES = ("wait", "approach", "contact", "hold")
 MODES = (
@@ -70,10 +70,10 @@ FAULTY = ("fault", "estop", "disconnected", "stopping")
 
 @dataclass(slots=True)
 class Flow:
-    """Regularity of a topic, and its missing sequence numbers.
+    """Regularity of a topic's messages, and its missing sequence numbers.
 
-    lost: messages missing from the writers' numbering. silences: intervals longer than ten of the
-    slowest expected period. age: time from the source stamp to the recorder.
+    age: time from the source timestamp to the recording. lost: number of missing sequence numbers.
+    silences: number of intervals without messages that exceed ten of the slowest expected periods.
     """
 
     age: Spread
@@ -89,7 +89,7 @@ class Flow:
 class PortTotals:
     """Counts of the messages that the readers of a topic skipped, lost and refused.
 
-    The counters contain earlier starts of a node. Counts from before the start of the bag are
+    Counters of all starts of a node are summed. Counts from before the start of the bag are
     subtracted.
     """
 
@@ -100,9 +100,9 @@ class PortTotals:
     refused: int = 0
 
     def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
-        """Add a reader's counters.
+        """Add the counters that a reader reports.
 
-        started_earlier: the node had been counting long before the start of the bag.
+        started_earlier: whether the node was running long before the start of the bag.
         """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
@@ -130,14 +130,14 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """Number of reports that a host is busy, and the worst of them."""
+    """Number of status reports of a host, of those in which it is busy, and the worst report."""
 
     reports: int = 0
     busy: int = 0
     worst: HostStatus | None = None
 
     def update(self, host: HostStatus) -> None:
-        """Add one report."""
+        """Add one status report of the host."""
         self.reports += 1
         if is_busy(host):
             self.busy += 1
@@ -151,7 +151,7 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSummary:
-    """Summary of a node's status messages."""
+    """Summary of the status messages of a node: processor use, memory, starts and errors."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -163,7 +163,7 @@ class NodeSummary:
     note: str = ""
 
     def add(self, status: Status, epoch: int) -> bool:
-        """Add a status message; return whether it contains a new error."""
+        """Add a status message of the node; return whether it contains a new error."""
         self.cpu.add(np.array([status.cpu_ratio]))
         self.resident_bytes = max(self.resident_bytes, status.resident_bytes)
         if epoch != self.epoch:
@@ -177,7 +177,7 @@ class NodeSummary:
 
 
 class Arm:
-    """Summary of one arm: modes, speeds and edge force."""
+    """Summary of one arm: its modes, speeds and the force at its edge of the sheet."""
 
     def __init__(self, grid: Grid, fine: Grid) -> None:
         self.modes = States(fine, MODES)
@@ -188,7 +188,7 @@ class Arm:
         self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
     def add(self, arm: ArmState, source_ns: int, index: int) -> None:
-        """Add a state whose joints were measured at `source_ns`."""
+        """Add an arm state, whose joints were measured at `source_ns`, to the interval `index`."""
         self.cycle.add(0, arm.cycle_s)
         if arm.edge_force_n is not None:
             self.edge_force.add(index, arm.edge_force_n)
@@ -211,7 +211,7 @@ class Arm:
 
 
 class Session:
-    """Summary of a bag. `scene`: the last one."""
+    """Summary of a bag. `scene` is the last recorded scene."""
 
     def __init__(
         self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
@@ -255,11 +255,11 @@ class Session:
         self._late_before: int | None = None
 
     def add(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
-        """Add one message of the bag."""
+        """Add one message of the bag to the summary. log_ns: time at which it was recorded."""
         self._add_flow(topic, header, log_ns)
         if isinstance(message, Clocks) and header.clock_id == self.clock_id:
             self._table.update(message)
-        # Durations inside a message use the writer's clock alone, so they need no conversion.
+        # Durations between timestamps of one clock need no conversion between hosts.
         seconds, index = self.seconds(log_ns), self.grid.index(log_ns)
         for event, exposure_ns, at_ns in list_events(message, header):
             if self._exposures.get(event) != exposure_ns:
@@ -388,7 +388,7 @@ class Session:
                     self.events.add(seconds, "scene", f'scene "{message.name}"')
             case EStop():
                 state = "engaged" if message.engaged else "released"
-                # A latched e-stop is published again for late subscribers.
+                # An unchanged e-stop may be published again for late subscribers; that is no event.
                 if self.estop.add(self.fine.index(log_ns), log_ns, state) or (
                     message.engaged and "estop" not in self.events.counts
                 ):
@@ -409,12 +409,15 @@ class Session:
 
 
 def add_correction(label: str, correction: str) -> str:
-    """Add the correction to the label of an image, unless it contains it."""
+    """Append the name of the image correction to an image's label, unless it contains that name."""
     return label if correction in label else ", ".join(filter(None, (label, correction)))
 
 
 def _list_silence_limits() -> dict[str, float]:
-    """Return the silence limit of topics with a rate and one writer."""
+    """Return the interval (s) from which each topic counts as silent, by topic.
+
+    Only topics with an expected rate and a single writer have one.
+    """
     return {
         topic.name: max(SILENT_PERIODS / topic.rate_hz[0], MIN_SILENCE_S)
         for topic in TOPICS.values()
@@ -426,7 +429,7 @@ SILENCE_LIMITS_S = _list_silence_limits()
 
 
 def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
-    """Read a bag, even an incomplete one; raise BagError if nothing can be read."""
+    """Read and summarize a bag, even an incomplete one. Raises BagError if nothing can be read."""
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}
@@ -449,7 +452,7 @@ def _read_plan(reader: BagReader) -> ResolvedGraph | None:
     try:
         return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except (BagError, ValidationError):
-        return None  # written by other code; the page reports that the plan is missing
+        return None  # from another version of flexsheet; the page reports that the plan is missing
 
 
 def _read_json(reader: BagReader, name: str) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""Compute the paper's sheet errors (its Fig. 9) at every exposure in contact.
+"""Compute the sheet errors of Furukawa et al. 2007 (Fig. 9) at every exposure in contact.
 
-The definitions are those of `launch.experiments.stroke`. They are applied in blocks, so the memory
-does not depend on the duration of the bag. Where the planner makes the sheet comply, the reference
-is the object's surface lowered by the commanded `normal_offset_m`. In the experiment's own strokes
-the reference is the surface itself, as in the paper.
+The errors are defined in `launch.experiments.stroke`. They are computed in blocks, so the memory
+does not depend on the duration of the bag. If the planner lowers the sheet to render compliance,
+errors are relative to the object's surface lowered by the commanded `normal_offset_m`. For strokes
+of the experiment, errors are relative to the surface itself, as in the paper.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ TOPICS_READ = (
     "arm_right",
     "twin/arms",
 )
-"""Topics needed for the errors against the true finger; a simulator's bag has them on one
-clock."""
+"""Topics needed for errors relative to the true finger. In a simulator's bag, their timestamps
+are on one clock."""
 
 SAME_RUN_NS = 1_000_000_000
 
 SILENT_NS = 100_000_000
-"""Maximum age of an arm's state; an arm with an older state does not follow."""
+"""Maximum age of an arm's last state; with an older state the arm counts as not following."""
 
 
 @dataclass(slots=True)
 class FingerRun:
-    """One run of the simulator's finger along a path.
+    """One motion of the simulated finger along a path.
 
     zero_ns: start of the path. done_ns: last exposure on the path. end_ns: last exposure that names
-    the path. stroke_s: moving time of a stroke of the experiment; None for another path. sums:
-    errors of that stroke, measured and true.
+    the path. stroke_s: duration of the stroke, for a stroke of the experiment, else None. sums:
+    errors of that stroke relative to the measured and the true finger.
     """
 
     label: str
@@ -77,7 +77,7 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """Return start and end of the stroke, ns; an empty interval for another path."""
+        """Return start and end of the stroke, ns; an empty interval if the path is no stroke."""
         if self.stroke_s is None:
             return self.zero_ns, self.zero_ns
         begin_s, finish_s = stroke_window_s(self.stroke_s)
@@ -85,13 +85,13 @@ class FingerRun:
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
 
     def figures(self) -> dict[str, Any]:
-        """Return how well the finger was followed; see `FollowedFinger.figures`."""
+        """Return how well the sheet followed the finger; see `FollowedFinger.figures`."""
         seconds = (self.done_ns - self.zero_ns) * 1e-9
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
 
 class MotionBuffer:
-    """Samples of a finger and of both sheet edges, until the errors can be computed."""
+    """Buffer for samples of a finger and of both sheet edges, until errors can be computed."""
 
     def __init__(self) -> None:
         self.finger: list[tuple[int, Floats]] = []
@@ -100,7 +100,10 @@ class MotionBuffer:
     def pop_complete(
         self,
     ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
-        """Return the motions and the times that all of them cover; later samples remain."""
+        """Return the motions, and the finger's times that both edges cover; keep later samples.
+
+        Returns None if there are too few samples.
+        """
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
         finger = make_motion(self.finger, "finger")
@@ -115,7 +118,7 @@ class MotionBuffer:
 
 
 class SheetErrors:
-    """Accumulator of sheet errors; add messages in order and call `finish` at the end."""
+    """Accumulator of sheet errors. Messages are added in order; `finish` is called at the end."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -136,7 +139,7 @@ class SheetErrors:
         self.runs: list[FingerRun] = []
 
     def add(self, message: Any, source_ns: int) -> None:
-        """Add a message; all stamps are of one clock."""
+        """Add a message; all source timestamps must be on one clock."""
         match message:
             case Scene():
                 self.finish()
@@ -186,7 +189,7 @@ class SheetErrors:
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
-        """Return 1 if both arms follow a target that follows the finger, else 0."""
+        """Return 1 if both arms follow the sheet target, and this follows the finger, else 0."""
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
         return float(both and not self._target_holds)
@@ -208,7 +211,7 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Compute the errors of all complete samples."""
+        """Compute the errors for all buffered samples that have both edges."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
             self.measured, self.true = MotionBuffer(), MotionBuffer()
@@ -217,7 +220,7 @@ class SheetErrors:
         for name, side in (("measured", self.measured), ("true", self.true)):
             complete = side.pop_complete()
             if complete is None:
-                # Without edges the buffer would grow without limit.
+                # If no edges are recorded, limit the size of the buffer.
                 del side.finger[:-BLOCK]
                 continue
             finger, edges, times_ns = complete
@@ -277,7 +280,7 @@ class SheetErrors:
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
     def _read_contact(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Floats]:
-        """Return whether the target was in contact (n,), and its normal offset (n,), m."""
+        """Return whether the sheet target was in contact (n,), and its normal offset (n,), m."""
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = make_motion(self._contact, "sheet_target")
@@ -287,7 +290,7 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return how well the finger was followed along each path of a bag, in order."""
+    """Return how well the sheet followed the finger on each path in a bag, in order."""
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         errors.add(message, header.source_ns)

@@ -1,4 +1,4 @@
-"""Write the report of a bag, and return its numbers."""
+"""Write the report of a bag as an HTML page, and return its numbers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 
 def default_output(bag: Path) -> Path:
-    """Return the default path of the page: that of the bag with the suffix .html."""
+    """Return the default path of the page: the path of the bag with the suffix .html."""
     return bag.with_suffix(".html")
 
 
 def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
-    """Read the bag, write its page to `output` (None: no page), and return the numbers.
+    """Read a bag, write its report page to `output` (None: no page), and return the numbers.
 
-    Raises BagError if the bag cannot be read, if the file cannot be written, or if the file exists
+    Raises BagError if the bag cannot be read, if the page cannot be written, or if `output` exists
     and is not a report.
     """
     if output is not None:
@@ -42,19 +42,19 @@ def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]
 
 
 def make_result(session: Session) -> dict[str, Any]:
-    """Return the numbers and the findings."""
+    """Return the numbers and the problems of a session for `bag report --json`."""
     numbers = compute_numbers(session)
     return {"findings": [asdict(one) for one in find_problems(numbers)], **numbers}
 
 
 def _draft_path(output: Path) -> Path:
-    """Return the temporary path of the page: readers see the old or the new page."""
+    """Return a temporary path for the page, so that readers never see an incomplete page."""
     path = output.resolve()
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def _check(output: Path) -> None:
-    """Raise BagError if the page cannot be written; checked before the bag is read."""
+    """Check before the bag is read that the page can be written; else raise BagError."""
     draft = _draft_path(output)
     try:
         draft.touch()
@@ -67,8 +67,8 @@ def _check(output: Path) -> None:
         raise _unwritable(output, error) from error
     if MARK not in head:
         raise BagError(
-            f"{output}: exists and is not a report, so it is not overwritten; name another file "
-            "with -o"
+            f"{output}: file exists and is not a report, so it is not overwritten; give another "
+            "file with -o"
         )
 
 
@@ -76,6 +76,6 @@ def _unwritable(output: Path, error: OSError) -> BagError:
     if error.errno in DISK_ERRORS:
         return BagError(str(make_write_error(output, error)))
     return BagError(
-        f"{output}: cannot be written: {error.strerror or error}; name a file in a writable "
+        f"{output}: cannot be written: {error.strerror or error}; give a file in a writable "
         "folder with -o"
     )
