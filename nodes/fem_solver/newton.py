@@ -7,9 +7,8 @@ Under a pressure equal to Young's modulus the penetration is about a hundredth o
 Newton's method with a line search minimises the sum of elastic and contact energy. An inverted
 element has infinite energy, so it is never accepted.
 
-Without friction the solution depends only on the position of the finger. With a sticking finger,
-tangential springs connect each contact point to where the finger first touched it, so the solution
-depends on the path of the finger.
+Without friction the solution depends only on the position of the finger. If the finger sticks, it
+also depends on the path: tangential springs connect each contact point to where it was touched.
 """
 
 from __future__ import annotations

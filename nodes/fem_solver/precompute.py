@@ -151,8 +151,8 @@ def compute(
     """Mesh the object, factor its stiffness and solve for one unit force per touchable node.
 
     checkpoints: store in which finished parts are kept, so that an interrupted computation can
-    continue. Raises SolidMeshError for a body without sufficient support, ValueError for an invalid
-    material or size, and MemoryError before any allocation if there is too little memory.
+    continue. Raises SolidMeshError for a body without sufficient support and ValueError for an
+    invalid material or size. Raises MemoryError, before any allocation, without enough memory.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -229,8 +229,8 @@ def _solve_unit_loads(
     """Solve for unit forces on the m contact nodes, in p directions at each.
 
     directions (m, p, 3): directions of the forces. get_part: function that loads the stored part
-    with an index, or computes and stores it. Returns the displacement of the s skin nodes under
-    each force (m p, 3 s), and of the contact nodes along each direction (m p, m p), m/N.
+    with an index, or computes and stores it. Returns displacements per force, m/N: those of the s
+    skin nodes (m p, 3 s), and those of the contact nodes along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each

@@ -1,7 +1,7 @@
 """Compute the response to pushes from a precomputed nonlinear table.
 
-For a push at every touchable node, at several depths, the table contains the force and the
-displacement of the whole skin (the surface of the body). Shape functions of the mesh interpolate
+For pushes at every touchable node to several depths, the table contains the force and the
+displacement of the skin (the surface of the body). Shape functions of the mesh interpolate
 between nodes, and cubics with a continuous slope between depths. The response is therefore a
 continuous function of the finger's position. One response reads 24 rows of the table: six nodes at
 four depths. (A proper orthogonal decomposition over depth would have to read more. It needs nine of

@@ -1,6 +1,6 @@
 """Mesh a solid cylinder with quadratic tetrahedra, graded towards the side that fingers touch.
 
-The mesh frame has its origin at the cylinder's centre, x along the axis and z away from the
+The mesh frame has its origin at the centre of the cylinder, x along the axis and z away from the
 support. A cross-section consists of concentric rings of points. It is triangulated (Delaunay) and
 extruded along x to prisms. Each prism is split into three tetrahedra according to the order of its
 vertex indices, so that neighbours use the same diagonal (Dompierre et al., "How to subdivide

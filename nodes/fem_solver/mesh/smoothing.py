@@ -1,9 +1,9 @@
 """Optimize the shape of tetrahedra while their boundary is moved to a surface.
 
 The objective is the sum of w^2 over all tetrahedra. w = (|A|^2 / 3)^(3/2) / det A is the inverse
-mean ratio, a measure of distortion, where the matrix A maps a regular tetrahedron to the actual
-one. It is 1 for a regular tetrahedron of any size and infinite for a flat one, so elements never
-become inverted (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp, "Tetrahedral mesh
+mean ratio, a measure of distortion. The matrix A maps a regular tetrahedron to the actual one. w is
+1 for a regular tetrahedron of any size and infinite for a flat one, so elements never become
+inverted (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp, "Tetrahedral mesh
 improvement via optimization of the element condition number", 2002). Springs along the surface
 normals pull the boundary corners to the surface, and the corners can slide along it. The stiffness
 of the springs increases in several rounds.

@@ -9,7 +9,7 @@ vertices. Jet i has a centre p_i, a unit normal n_i and a shape operator A_i (th
 normal along the surface). With d = x - p_i, the signed distance of a point x to second order is
 s_i(x) = n_i d + d A_i d / 2.
 2. Blending (partition of unity; Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
-f(x) = sum w_i s_i / sum w_i with the weights w_i = (1 - t_i)^4, where t_i = (d d + 3 (n_i d)^2) /
+f(x) = sum w_i s_i / sum w_i. The weights are w_i = (1 - t_i)^4 with t_i = (d d + 3 (n_i d)^2) /
 rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The region t_i < 1, in which a jet has weight,
 is its support.
 
@@ -419,10 +419,10 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the jets that have weight near a point (3,).
+        """Return the index of the jet nearest to a point (3,), and the k jets with weight near it.
 
-        Returns the index of the nearest jet, and of all k jets near the point their indices (k,),
-        centres (k, 3), normals (k, 3) and shape operators (k, 3, 3).
+        The latter are given as indices (k,), centres (k, 3), normals (k, 3) and shape operators
+        (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]

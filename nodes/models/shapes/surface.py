@@ -121,9 +121,8 @@ def tightest_curvature(shape_operator: Floats) -> float:
 def projection_jacobian(found: Nearest) -> Floats:
     """Return the derivative (..., 3, 3) of the nearest point with respect to the query.
 
-    It is (I + h W)^-1 P, where h is the height of the query, W the shape operator and P the
-    projection onto the tangent plane. Raises LinAlgError at a centre of curvature, where I + h W is
-    singular.
+    It is (I + h W)^-1 P with the height h of the query and the shape operator W. P projects onto
+    the tangent plane. Raises LinAlgError at a centre of curvature, where I + h W is singular.
     """
     normal, operator = found.normal, found.shape_operator
     tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
@@ -204,9 +203,9 @@ def descend(
     Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
     Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
     surface, and a part along the surface. The latter solves the reduced system with the Hessian of
-    the Lagrangian, I + lambda H, where H is the Hessian of f and lambda the multiplier. Its
-    eigenvalues are made positive, so that each step is a descent. stride_m: maximum step. rest_m:
-    step below which the method has converged.
+    the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). Its eigenvalues are made
+    positive, so that each step is a descent. stride_m: maximum step. rest_m: step below which the
+    method has converged.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)

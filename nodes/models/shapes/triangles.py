@@ -36,10 +36,10 @@ class MeshError(FlexsheetError, ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
 
-    The function checks array shapes, number of triangles, vertex indices, degenerate and repeated
-    triangles, holes, edges of more than two triangles, winding, parts that share a single vertex,
-    folded neighbours and orientation. It does not search for intersections of triangles that are
-    not neighbours, because that is slow; see `count_intersections`.
+    The errors found are wrong array shapes, size and vertex indices, degenerate and repeated
+    triangles, and holes. They also include edges of more than two triangles, inconsistent winding,
+    parts that share a single vertex, folded neighbours and wrong orientation. Intersections are not
+    searched, because that is slow; see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(
@@ -300,9 +300,9 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
-    A pair is counted if an edge of one triangle passes through the interior of the other, and no
-    end of that edge is a vertex of the other. Triangles that only touch, or overlap in one plane,
-    are not counted.
+    A pair is counted if an edge of one triangle passes through the interior of the other. The ends
+    of this edge must not be vertices of the other. Triangles that only touch, or overlap in one
+    plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
