@@ -119,7 +119,7 @@ class SoftBodyBenchmark:
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
-        """Return the surface point that is pushed."""
+        """Return the surface point that is pushed in all trials."""
         body = self.coarsest()
         found = body.shape.closest(body.front + SAMPLE_OFFSET_M)
         return SamplePoint(found.point, found.normal)

@@ -156,6 +156,6 @@ def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
 
 
 def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
-    """Return an array (size,) with values (k,) added at their indices (k,)."""
+    """Return an array (size,) of zeros to which values (k,) are added at their indices (k,)."""
     result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
     return result

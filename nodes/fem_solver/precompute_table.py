@@ -259,8 +259,9 @@ def solve_all(
                     snapshot = future.result()
                 except CancelledError as error:
                     raise LostWorkersError(
-                        "the worker processes that compute the soft body's table were lost; "
-                        "restart them and repeat the command, which continues from stored results"
+                        "the worker processes that solve snapshots for the soft body's table were "
+                        "lost; restart them and repeat the command, which continues from the "
+                        "finished snapshots"
                     ) from error
                 checkpoints.save(f"push-{number:04d}", encode_fields(snapshot))
                 solved[number] = snapshot

@@ -105,7 +105,7 @@ class MeshSpec:
 
 @dataclass(frozen=True, slots=True)
 class MeshBudget:
-    """Approximate number of nodes and memory of a mesh."""
+    """Approximate number of nodes of a mesh, and memory (bytes) that meshing needs."""
 
     nodes: int
     bytes: int
@@ -191,8 +191,8 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
         thickness = min(thickness, spec.geometry.width_m, spec.geometry.height_m)
     if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
-            f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the smallest "
-            f"extent of the object ({thickness:g} m); change it"
+            f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
+            f"minimum extent ({thickness:g} m); change it"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)

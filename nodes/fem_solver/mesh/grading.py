@@ -17,8 +17,8 @@ DEPTH_GROWTH = 0.35
 RAMP_RAD = 0.6
 """Angle beyond the touchable skin over which the element size increases."""
 EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
-"""Maximum longest edge of a tetrahedron over the required size: the diagonal of a square, plus 10 %
-for the distortion by maps."""
+"""Maximum ratio of the longest edge of a tetrahedron to the required size. It is that of the
+diagonal to the side of a square, plus 10 % for distortion by maps to curved surfaces."""
 
 
 @dataclass(frozen=True, slots=True)

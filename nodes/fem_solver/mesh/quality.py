@@ -1,4 +1,4 @@
-"""Compute quality measures of straight and curved tetrahedra."""
+"""Measure the quality of tetrahedra with straight or curved edges."""
 
 from __future__ import annotations
 

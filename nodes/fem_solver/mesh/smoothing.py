@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""Function from points (n, 3) to the nearest surface points and the outward normals there."""
+"""Function that maps points (n, 3) to the nearest surface points and outward normals there."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """Spring stiffness in each round, if the boundary is at first up to one element off the surface.
@@ -35,7 +35,7 @@ MIN_FINAL_RADIUS_RATIO = 0.15
 surface."""
 ROUND_STEPS = 20
 MEMORY = 8
-"""Number of steps and gradient changes that L-BFGS stores."""
+"""Number of previous steps and gradient changes that the L-BFGS method uses."""
 
 _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]

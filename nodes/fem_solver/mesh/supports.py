@@ -55,7 +55,7 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear."""
+    """Raise UnfitMeshError if all chosen points are collinear, so that the body could rotate."""
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:

@@ -108,7 +108,7 @@ def half_edges(triangles: Indices) -> Indices:
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Raise MeshError unless every edge occurs once in each direction."""
+    """Raise MeshError unless every edge has two triangles that use it in opposite directions."""
     run = half_edges(triangles)
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
