@@ -195,7 +195,7 @@ def test_files_that_are_no_meshes_are_rejected(tmp_path: Path) -> None:
 
 
 def test_too_long_a_smoothing_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match=r"smoothing_m: .*reduce it"):
+    with pytest.raises(MeshError, match=r"smoothing_m: .*reduce smoothing_m"):
         read_mesh(written(tmp_path, trimesh.creation.box((40, 40, 40))), 0.001, 0.2)
 
 

@@ -1,9 +1,10 @@
-"""Measure the soft body's methods for `flexsheet chart soft-body`: linear, table, Newton.
+"""Measure error and time of the soft-body methods for `flexsheet chart soft-body`.
 
-The references are full Newton solutions of one push on separate meshes. At each depth the
-reference is the finest mesh whose solution converged there. Its difference from the second finest
-is the reference uncertainty. Where no solution converged, the chart shows only the time and the
-maximum skin displacement.
+The methods are linear, nonlinear table, and Newton's method. They are compared with references:
+full Newton solutions of one push on separate, finer meshes. At each push depth the reference is the
+finest mesh whose solution converged there. The difference from the second finest mesh is taken as
+the uncertainty of the reference. Where no solution converged, the chart shows only the time and the
+maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations
@@ -48,19 +49,20 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""Skin spacings of the reference meshes, from the most to the least accurate. Focused meshes are
-fine only near the finger (finger radii); even meshes have one spacing everywhere (m)."""
+"""Distances between skin nodes of the reference meshes, from the most to the least accurate.
+Focused meshes are fine only near the finger (spacing in finger radii); even meshes have the same
+spacing everywhere (m)."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
 NEWTON_STEP_M = 1e-4
 SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
-"""Offset of the push from the point nearest to the user. The pushed point is not a node of any
-mesh, so no method has an advantage."""
+"""Offset of the pushed point from the point nearest to the user. It ensures that the pushed point
+is not a node of any mesh, which would favour a method."""
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
-"""Errors are evaluated farther than this from the push, in finger radii: the finger hides the
-rest."""
+"""Distance from the push, in finger radii, within which displacement errors are ignored, because
+the finger hides the skin there."""
 FORCE = "force_error_percent"
 MAX_DISPLACEMENT = "largest_move_mm"
 
@@ -77,10 +79,11 @@ class SkinSolution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyBenchmark:
-    """Benchmark of the soft-body methods for one push of a scene's object.
+    """Benchmark of the soft-body methods for one push of the object of a scene.
 
-    linear_m, table_m: skin spacings by method name. newton_m: depths of the full Newton method.
-    focused, even_m: skin spacings of the references, in finger radii and in metres.
+    depths_m: push depths. linear_m, table_m: skin spacing (m) for each name of a linear or table
+    method. newton_m: depths at which full Newton solutions are timed. focused: skin spacings of the
+    focused reference meshes, in finger radii. even_m: skin spacings of the even ones, m.
     """
 
     scene: Scene
@@ -93,7 +96,7 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method and model, from the cache or computed."""
+        """Load or compute the body with its linear method, and its precomputed model."""
         spec = make_soft_body_spec(self.scene, spacing_m)
 
         def log_start(done: int, total: int, need: WorkBudget) -> None:
@@ -116,13 +119,13 @@ class SoftBodyBenchmark:
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
-        """Return the surface point that is pushed."""
+        """Return the surface point that is pushed in all trials."""
         body = self.coarsest()
         found = body.shape.closest(body.front + SAMPLE_OFFSET_M)
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return names and jobs of the references, the most accurate first."""
+        """Return names and inputs (jobs) of the reference solutions, the most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         for focused, even in zip(self.focused, self.even_m, strict=True):
@@ -135,7 +138,7 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return a table of the skin near the push for each method without a cached full table."""
+        """Return a table for the skin near the push, for each method without a cached table."""
         found = {}
         for name, spacing in self.table_m.items():
             body, model = self.linear(spacing)
@@ -144,14 +147,14 @@ class SoftBodyBenchmark:
         return found
 
     def prepare(self, on_progress: Progress) -> None:
-        """Solve and cache all jobs of the references and tables; the first call takes minutes."""
+        """Solve and cache all references and table snapshots; the first call takes minutes."""
         jobs = [job for _, job in self.reference_jobs()]
         for table in self.local_tables().values():
             jobs += table.jobs
         solve_cached_jobs(jobs, self.cache_dir, on_progress)
 
     def reference_set(self) -> ReferenceSet:
-        """Return the reference solutions, from the cache or computed."""
+        """Load the reference solutions from the cache, or compute them."""
         sample, named = self.sample(), self.reference_jobs()
         solved = solve_cached_jobs([job for _, job in named], self.cache_dir, _ignore_progress)
         references = [
@@ -161,10 +164,10 @@ class SoftBodyBenchmark:
         return ReferenceSet(references, sample, self.scene)
 
     def trials(self) -> Iterator[Trial]:
-        """Yield one trial per method and depth.
+        """Yield one trial (a measured case) for each method and push depth.
 
-        The error is the maximum displacement error of the skin nodes outside the contact, mm. The
-        force error is an extra metric.
+        The error of a trial is the maximum displacement error of the skin nodes outside the
+        contact, mm. The force error is an additional metric.
         """
         sample, references = self.sample(), self.reference_set()
         bodies = {name: self.linear(spacing)[0] for name, spacing in self.linear_m.items()}
@@ -186,7 +189,10 @@ class SoftBodyBenchmark:
         yield from self._newton_trials(references)
 
     def _newton_trials(self, references: ReferenceSet) -> Iterator[Trial]:
-        """Yield trials of one full Newton load step, each from the solution at a smaller depth."""
+        """Yield one trial of the full Newton method for each depth in `newton_m`.
+
+        Each trial is one load step that starts `NEWTON_STEP_M` above its depth.
+        """
         if not self.newton_m:
             return
         job = make_focused_job(
@@ -242,10 +248,11 @@ class ReferenceSet:
         *,
         in_range: bool,
     ) -> Trial:
-        """Return the trial of a method at one depth.
+        """Return the trial of a method at one push depth.
 
-        rest: skin nodes at rest (s, 3). run: computes the method's solution. The error is NaN where
-        no reference converged at the depth.
+        rest (s, 3): undeformed skin nodes. run: function that computes the solution. in_range:
+        whether the depth is in the valid range of the method. The error is NaN where no reference
+        converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = select_references(self._references, depth_m)
@@ -286,11 +293,11 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Ignore progress: all jobs are cached."""
+    """Ignore progress, for calls that find all results in the cache."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the benchmark over a scene's working range, with the user's cache."""
+    """Return the benchmark of all methods over the push depths of a scene's working range."""
     max_depth_m = scene.working_range.push_depth_m
     return SoftBodyBenchmark(
         scene,

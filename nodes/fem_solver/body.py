@@ -1,4 +1,4 @@
-"""Build a scene's soft body and compute its response in the world frame."""
+"""Build the soft body of a scene and compute its response to the finger in the world frame."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ Floats = NDArray[np.float64]
 def make_soft_body_spec(
     scene: Scene, skin_spacing_m: float, *, sticking: bool = False
 ) -> SoftBodySpec:
-    """Return the specification of the precomputation for this scene's object.
+    """Return the inputs of the precomputation for the object of a scene.
 
-    Raises ValueError as `mesh_spec`, and for a skin spacing above the fingertip's radius. A coarser
-    skin is too stiff: the force is doubled at 1.7 radii and seven times too large at 7 radii.
+    skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
+    Raises ValueError as `mesh_spec`, and for a skin spacing above the radius of the fingertip. Such
+    a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
+    radii, and seven times at 7 radii.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
             f"skin_spacing_m: {skin_spacing_m:g} is more than finger.radius_m "
-            f"({scene.finger.radius_m:g}), which makes the force far too large; reduce "
+            f"({scene.finger.radius_m:g}), which would make the force far too large; reduce "
             "skin_spacing_m to the radius or less"
         )
     mesh = mesh_spec(scene, skin_spacing_m)
@@ -47,14 +49,14 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return the specification of this body's nonlinear table."""
+    """Return the inputs of the nonlinear table of a body."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
 def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """Return the surface point (3,) nearest to the user.
+    """Return the surface point (3,) nearest to the user, mesh frame.
 
-    rest: skin nodes at rest (s, 3).
+    rest (s, 3): undeformed skin nodes.
     """
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
     away = 2.0 * float(np.ptp(rest, axis=0).max())
@@ -65,9 +67,10 @@ def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 class SceneBody:
     """Soft body of a scene with its pose in the world.
 
-    front (3,): surface point nearest to the user, mesh frame. rest (s, 3): skin nodes, mesh frame.
-    linear_depth_m: maximum depth of the linear method, at which the stiffness is evaluated.
-    friction_ratio: friction coefficient; 0 means that the finger slides without friction.
+    method: method that computes the response. front (3,): surface point nearest to the user, mesh
+    frame. rest (s, 3): undeformed skin nodes, mesh frame. linear_depth_m: maximum depth of the
+    linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; with
+    0 the finger slides without friction.
     """
 
     method: SoftBodyMethod
@@ -85,7 +88,8 @@ class SceneBody:
     ) -> tuple[Response, ContactAnchor | None]:
         """Return the response to a fingertip at `point_world` (3,) and the new contact anchor.
 
-        anchor: as returned by the previous call. Raises ValueError for a point that is not finite.
+        anchor: contact anchor that the previous call returned, or None. Raises ValueError for a
+        point that is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
@@ -99,7 +103,8 @@ class SceneBody:
         tangential_n = float(np.linalg.norm(response.force_n - normal_n * query.normal))
         limit_n = self.friction_ratio * max(normal_n, 0.0)
         if tangential_n > limit_n:
-            # The tangential force is proportional to the drag: reduce both to the friction limit.
+            # The tangential force is proportional to the displacement of the finger since it stuck:
+            # reduce both so that the force equals the friction limit.
             fraction = limit_n / tangential_n
             new_anchor = slide_anchor(self.shape, new_anchor, query.drag_m, fraction)
             response = self.method.respond(replace(query, drag_m=fraction * query.drag_m))
@@ -117,9 +122,9 @@ class SceneBody:
         )
 
     def message(self, response: Response, *, horizon_s: float = 0.0) -> SoftBody:
-        """Return the response as a message.
+        """Convert a response to a message, in the world frame.
 
-        horizon_s: time from the camera exposure to the predicted fingertip, s.
+        horizon_s: time from the camera exposure to the predicted fingertip position, s.
         """
         rotation = self.world_from_mesh[:3, :3]
         rotated = response.displacement @ rotation.T.astype(np.float32)
@@ -147,8 +152,8 @@ def build_scene_body(
 ) -> SceneBody:
     """Build the soft body of a scene from its precomputed model.
 
-    Raises ValueError for invalid depths, see `LinearSoftBody`, and an invalid pose, see
-    `world_from_mesh`.
+    The other arguments are described at `LinearSoftBody` and `SceneBody`. Raises ValueError for
+    invalid depths, and for an invalid pose of the object, see `world_from_mesh`.
     """
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
@@ -198,9 +203,10 @@ def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Tab
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
-    """Return the response `lost_s` seconds after the finger was lost.
+    """Return the response to show `lost_s` seconds after the finger was last measured.
 
-    It is constant for `hold_s` and then decays exponentially with the time constant `relax_s`.
+    It is the last response for a time `hold_s`, and then decays exponentially with the time
+    constant `relax_s`.
     """
     if lost_s <= hold_s:
         return response

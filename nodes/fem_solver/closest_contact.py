@@ -1,6 +1,7 @@
-"""Find the contact point of a fingertip on a smooth shape, also deep inside it.
+"""Find the contact point of a fingertip on a smooth shape, even if the fingertip is deep inside it.
 
-Deep inside, the nearest surface point is ambiguous.
+Deep inside, the nearest surface point is ambiguous. The choice therefore depends on the previous
+contact point, called the anchor.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from flexsheet.nodes.models.shapes import Shape
 Floats = NDArray[np.float64]
 
 MIN_CURVATURE_MARGIN = 0.3
-"""Minimum distance of the fingertip from the centre of curvature, over the radius of curvature.
-Below it the nearest point is ill-conditioned, and the anchor is not moved."""
+"""Minimum distance of the fingertip from the centre of curvature, divided by the radius of
+curvature. Closer to the centre, the nearest point is ill-conditioned, so the anchor is kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,7 @@ class ContactQuery:
     surface (3,), normal (3,): pushed surface point and its outward normal. depth_m: depth of the
     fingertip below that point along the normal, negative outside. beyond_m: distance of the
     fingertip past the end of the surface. drag_m (3,): displacement of the fingertip along the
-    surface since it stuck there; None for a sliding finger.
+    surface since it started to stick to that point; None for a sliding finger.
     """
 
     surface: Floats
@@ -38,7 +39,7 @@ class ContactQuery:
 
 @dataclass(frozen=True, slots=True)
 class ContactAnchor:
-    """Surface point (3,) that a finger pushes, and its normal (3,)."""
+    """Surface point (3,) that the finger pushes, and its outward normal (3,)."""
 
     point: Floats
     normal: Floats
@@ -49,13 +50,14 @@ def locate(
 ) -> tuple[ContactQuery, ContactAnchor | None]:
     """Return the contact of a fingertip at `point` (3,) and the anchor for the next call.
 
-    The contact point is the nearest surface point, except in two cases that use the anchor: near
-    the centre of curvature, and where the nearest point is on the far side of the body. A finger
-    pushed through a body therefore stays in contact with the side that it entered. Raises
-    ValueError for a point that is not finite.
+    anchor: the anchor that the previous call returned, or None. The contact point is the nearest
+    surface point, with two exceptions in which it is the anchor. These are a fingertip near the
+    centre of curvature, and a nearest point on the far side of the body. A finger pushed through a
+    body therefore stays in contact with the side that it entered. Raises ValueError for a point
+    that is not finite.
     """
     if not np.isfinite(point).all():
-        raise ValueError(f"fingertip position {point} is not finite")
+        raise ValueError(f"fingertip position {point} is not finite; check the fingertip messages")
     found = shape.closest(point, previous=None if anchor is None else anchor.point)
     height = float(found.height_m)
     if height > 0.0:
@@ -73,14 +75,15 @@ def locate_sticking(
 ) -> tuple[ContactQuery, ContactAnchor | None]:
     """Return the contact of a fingertip at `point` (3,) that sticks to its first contact point.
 
-    anchor: that point, from the previous call. Raises ValueError as `locate`.
+    anchor: that point, as returned by the previous call, or None. Also returns the anchor for the
+    next call. Raises ValueError as `locate`.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:
         return query, new_anchor
     depth = float((anchor.point - point) @ anchor.normal)
     if depth <= 0.0:
-        # The finger left its anchor and touches another point.
+        # The finger has left its anchor and touches another point.
         return query, new_anchor
     drag = point - anchor.point + depth * anchor.normal
     return ContactQuery(anchor.point, anchor.normal, depth, query.beyond_m, drag), anchor
@@ -89,7 +92,10 @@ def locate_sticking(
 def slide_anchor(
     shape: Shape, anchor: ContactAnchor, drag: Floats, fraction: float
 ) -> ContactAnchor:
-    """Return the anchor after the finger slid until `fraction` of its drag (3,) remains."""
+    """Return the anchor after the finger has slid over the surface.
+
+    drag (3,): displacement of the finger from the anchor. fraction: part of it that remains.
+    """
     found = shape.closest(anchor.point + (1.0 - fraction) * drag, previous=anchor.point)
     return ContactAnchor(found.point, found.normal)
 
@@ -97,7 +103,7 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip with the tangent plane at a surface point."""
+    """Return the contact of a fingertip at `point` with the tangent plane at a surface point."""
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal
     return ContactQuery(

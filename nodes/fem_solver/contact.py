@@ -1,14 +1,16 @@
 """Solve the contact of a fingertip sphere with a linear soft body, without friction.
 
-The skin is sampled at fixed contact points, finer than the mesh. At each point a penalty pressure
-is proportional to the remaining penetration. The nodal forces f minimise the strictly convex energy
+The skin (the surface of the body) is sampled at fixed contact points, which are closer together
+than the nodes of the mesh. At each point, a penalty pressure is proportional to the penetration
+that remains after the skin has moved. The nodal forces f minimise the strictly convex energy
 
     1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2
 
-C is the nodal compliance and W contains the shape functions at the contact points. t_q is the
-penetration of the rigid finger at point q; d_q is the penalty stiffness times the area. The
-solution is unique, independent of the path and Lipschitz continuous in the finger's position. A
-semismooth Newton iteration (Qi & Sun 1993) finds it in a few small dense solves.
+C is the nodal compliance, and W contains the shape functions at the contact points. t_q is the
+penetration of the rigid finger at point q before the skin moves; d_q is the penalty stiffness times
+the area of the point. The solution is unique, does not depend on the finger's path, and is
+Lipschitz continuous in the finger's position. A semismooth Newton iteration (Qi & Sun 1993) finds
+it by solving a few small dense systems.
 """
 
 from __future__ import annotations
@@ -28,18 +30,20 @@ Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 PENALTY_RATIO = 40.0
-"""Penalty stiffness of the contact (Pa/m) in units of E / finger radius."""
+"""Penalty stiffness of the contact (Pa/m), divided by (Young's modulus / finger radius)."""
 POINT_SPACING_RATIO = 0.4
 """Maximum spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
-"""Beyond this fraction of its radius the sphere is extended by its tangent cone."""
+"""Distance from the push axis, in finger radii, beyond which the finger's surface is the tangent
+cone of the sphere instead of the sphere."""
 FACING = (0.2, 0.6)
-"""Cosines between skin normal and push direction between which the penetration's weight rises from
-0 to 1."""
+"""Range of the cosine between skin normal and contact normal over which the weight of the
+penetration rises from 0 to 1."""
 PAD_RATIO = 1.1
 """Half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
-"""Tangential displacement of a sticking point under its own normal force, in finger radii."""
+"""Tangential displacement of a sticking contact point if its tangential force equals its normal
+force, in finger radii."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
@@ -48,13 +52,13 @@ CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class SkinResponse:
-    """Response of a linear body to unit forces on its skin, for a Young's modulus of 1 Pa.
+    """Response of a linear body to unit normal forces on its skin, for a Young's modulus of 1 Pa.
 
-    rest (s, 3): skin nodes, m, mesh frame. contact_nodes (m,): indices into the skin of the
-    nodes that can be loaded. normals (m, 3): outward. faces (f, 6): six-node triangles, indices
-    into `contact_nodes`. compliance (m, m): inward displacement of node i under 1 N inward on node
-    j; symmetric. influence (m, 3 s) float32: displacement of the whole skin under 1 N inward on
-    node j.
+    rest (s, 3): undeformed positions of the skin nodes, m, mesh frame. contact_nodes (m,): indices
+    into `rest` of the nodes that the finger can touch. normals (m, 3): outward normals at these
+    nodes. faces (f, 6): six-node triangles, as indices into `contact_nodes`. compliance (m, m):
+    inward displacement of node i (m) per inward force on node j (N); symmetric. influence (m, 3 s)
+    float32: displacement of the whole skin per inward force on each contact node.
     """
 
     rest: Floats
@@ -67,11 +71,11 @@ class SkinResponse:
 
 @dataclass(frozen=True, slots=True)
 class DragResponse:
-    """Response of a linear body to unit tangential forces on its skin, for 1 Pa.
+    """Response of a linear body to unit tangential forces on its skin, for a modulus of 1 Pa.
 
     tangents (m, 2, 3): two directions along the skin at each contact node. compliance (2m, 2m):
-    displacement along direction i under 1 N along direction j. influence (2m, 3 s) float32:
-    displacement of the whole skin.
+    displacement along direction i (m) per force along direction j (N). influence (2m, 3 s)
+    float32: displacement of the whole skin per force along each direction.
     """
 
     tangents: Floats
@@ -81,7 +85,10 @@ class DragResponse:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """Response of a soft body to one finger position, mesh frame; see `messages.SoftBody`."""
+    """Response of a soft body to one finger position, in the mesh frame.
+
+    The fields are described at the message `messages.SoftBody`.
+    """
 
     displacement: Floats32
     force_n: Floats
@@ -92,9 +99,10 @@ class Response:
 
 
 class SoftBodyMethod(Protocol):
-    """Interface of every soft body method.
+    """Interface of the methods that compute the response of a soft body to the finger.
 
-    name: as in the message. at_rest: displacement (n, 3) of the skin without contact, zero.
+    name: name of the method in messages. at_rest: displacement (n, 3) of the skin without contact,
+    which is zero.
     """
 
     @property
@@ -104,18 +112,18 @@ class SoftBodyMethod(Protocol):
     def at_rest(self) -> Floats32: ...
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the stiffness (N/m) at the touchable skin nearest to a surface point (3,)."""
+        """Return the stiffness (N/m) of the touchable skin nearest to a surface point (3,)."""
         ...
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force curve at the touchable skin nearest to a surface point (3,).
+        """Return the force-depth curve (n, 2) of the touchable skin nearest to a point (3,).
 
-        Rows (n, 2) are depth (m) and force (N). Both start at 0 and never decrease.
+        The columns are depth (m) and force (N). Both start at 0 and never decrease.
         """
         ...
 
     def respond(self, query: ContactQuery) -> Response:
-        """Return the response of the skin to a contact."""
+        """Compute the response of the skin to a contact."""
         ...
 
 
@@ -123,9 +131,9 @@ class SoftBodyMethod(Protocol):
 class NormalContact:
     """Solution of a frictionless contact.
 
-    forces (k,): inward forces on the contact nodes `nodes` (k,), N. force_n (3,): total force on
-    the finger. weights (q, k), normals (q, 3), pressed_n (q,): shape functions, normals and normal
-    forces of the points in contact.
+    nodes (k,): indices of the loaded contact nodes. forces (k,): inward forces on them, N. force_n
+    (3,): total force on the finger, N. weights (q, k), normals (q, 3), pressed_n (q,): shape
+    functions, skin normals and normal forces (N) at the q contact points under pressure.
     """
 
     nodes: Ints
@@ -138,10 +146,10 @@ class NormalContact:
 
 @dataclass(frozen=True, slots=True)
 class Drag:
-    """Tangential contact forces.
+    """Tangential contact forces between skin and finger.
 
-    forces (k, 2): along the tangents of the nodes `nodes` (k,), N. force_n (3,): total force on the
-    finger.
+    nodes (k,): indices of the loaded contact nodes. forces (k, 2): forces along the two tangents of
+    each of these nodes, N. force_n (3,): total tangential force on the finger, N.
     """
 
     nodes: Ints
@@ -150,9 +158,10 @@ class Drag:
 
 
 def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
-    """Return the depth limited smoothly (C1) to `largest_m`.
+    """Limit a push depth smoothly (with continuous slope) to less than `largest_m`.
 
-    Up to `linear_m` it equals `depth_m`; beyond, it approaches `largest_m` exponentially.
+    Depths up to `linear_m` are returned unchanged; beyond it, the result approaches `largest_m`
+    exponentially.
     """
     if depth_m <= linear_m:
         return depth_m
@@ -161,7 +170,11 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 
 
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
-    """Return the depths (m) of a force curve, dense up to `linear_m`, then geometric."""
+    """Return the depths (m) at which a force curve is sampled.
+
+    They are dense up to `linear_m`, and increase geometrically from there to the larger of
+    `largest_m` and `push_m`.
+    """
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
         linear_m, max_push_m, max(2, round(4 * np.log2(max_push_m / linear_m)) // 2 + 1)
@@ -172,7 +185,8 @@ def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Flo
 def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
     """Return shape functions (p, 6) and local coordinates (p, 2) of contact points in a triangle.
 
-    The points are the centroids of divisions^2 equal parts of a six-node triangle.
+    The triangle has six nodes and is divided into `divisions` squared equal parts. The contact
+    points are the centroids of the parts.
     """
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(divisions) for j in range(divisions - i)]
     inverted = [(i + 2 / 3, j + 2 / 3) for i in range(divisions) for j in range(divisions - i - 1)]
@@ -181,7 +195,7 @@ def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
 
 
 class SphereContact:
-    """Stateless solver of the contact between one body and one spherical fingertip."""
+    """Solver of the contact between a linear body and a spherical fingertip, without state."""
 
     def __init__(
         self,
@@ -193,7 +207,7 @@ class SphereContact:
     ) -> None:
         """Sample the contact points of the skin.
 
-        shape: the smooth surface that the response's triangles approximate, in the mesh frame.
+        shape: smooth surface that the triangles in `response` approximate, in the mesh frame.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -216,12 +230,13 @@ class SphereContact:
     def penetration(
         self, points: Floats, normals: Floats, centre: Floats, direction: Floats
     ) -> Floats:
-        """Return the penetration depth (q,), m, of points into the rigid finger.
+        """Return how deep skin points are inside the rigid finger (q,), m; negative outside.
 
-        points, normals (q, 3): skin points and outward normals. centre (3,): of the sphere.
-        direction (3,): outward surface normal at the contact; skin that faces another direction is
-        excluded (`FACING`). Beyond `FLANK_RATIO` of the radius the tangent cone extends the sphere,
-        so every point has a finite, C1 value. The value is negative outside the finger.
+        points, normals (q, 3): skin points and their outward normals. centre (3,): centre of the
+        sphere. direction (3,): outward surface normal at the contact. Skin that faces away from
+        this direction has no penetration, see `FACING`. Beyond `FLANK_RATIO` of its radius, the
+        sphere is replaced by its tangent cone, so that each value is finite and has a continuous
+        slope.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -235,7 +250,10 @@ class SphereContact:
         return result
 
     def solve(self, query: ContactQuery, depth_m: float) -> NormalContact | None:
-        """Return the contact at `depth_m` below `query.surface`; None without contact."""
+        """Solve the contact of a finger pushed `depth_m` below the surface point `query.surface`.
+
+        Returns None if the finger touches no contact point.
+        """
         centre = query.surface + (self._radius - depth_m) * query.normal
         limit = FLANK_RATIO * self._radius
         widest = limit + max(depth_m, 0.0)
@@ -253,7 +271,7 @@ class SphereContact:
         reached = np.flatnonzero(depths > 0.0)
         if not len(reached):
             return None
-        # Points outside the finger at rest are omitted: skin around a push moves inwards.
+        # The skin around a push moves inwards, so points outside the finger at rest stay outside.
         face, point = near[reached // count], reached % count
         nodes, local = np.unique(self._response.faces[face], return_inverse=True)
         weights = np.zeros((len(reached), len(nodes)))
@@ -273,11 +291,11 @@ class SphereContact:
 
 
 class DragContact:
-    """Tangential contact of a finger that sticks to the skin.
+    """Solver of the tangential contact of a finger that sticks to the skin.
 
-    Tangential springs connect the points in contact to the finger. Their stiffness is proportional
-    to the normal force at the point, so that contact starts and ends continuously. Normal and
-    tangential contact are not coupled.
+    Tangential springs connect the contact points to the finger. The stiffness of a spring is
+    proportional to the normal force at its point, so that contact starts and ends continuously. The
+    tangential forces do not affect the normal forces.
     """
 
     def __init__(
@@ -288,12 +306,16 @@ class DragContact:
         self._full_load_slip_m = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
 
     def solve(self, contact: NormalContact, drag: Floats) -> Drag:
-        """Return the tangential forces after a displacement `drag` (3,), m, since sticking."""
+        """Return the tangential forces for a given normal contact.
+
+        drag (3,): displacement of the finger since it started to stick, m.
+        """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
         across = self._response.tangents[nodes]
         along = np.eye(3) - contact.normals[:, :, None] * contact.normals[:, None, :]
-        # Tangential displacement at the points (3 q) due to the nodes' directions (2 k).
+        # Tangential displacement of the contact points (3 q) per displacement of the nodes along
+        # their two tangents (2 k).
         moved = np.einsum("qk,kai,qij->qjka", contact.weights, across, along, optimize=True)
         moved = moved.reshape(-1, 2 * count)
         springs = np.repeat(contact.pressed_n / self._full_load_slip_m, 3)
@@ -309,10 +331,10 @@ def solve_penalty_contact(
 ) -> Floats:
     """Return the nodal forces (k,) that minimise the contact energy (see the module docstring).
 
-    weights W (q, k), compliance C (k, k), penalty d (q,), depths t (q,). Newton's method starts
-    from Hertz's estimate that half of the overlap is in contact. It usually converges in two to
-    five full steps; after `FULL_STEPS` a line search damps it. Raises ArithmeticError without
-    convergence.
+    The arguments are the symbols of that energy: weights W (q, k), compliance C (k, k), penalty d
+    (q,) and depths t (q,). Newton's method starts from Hertz's estimate that points deeper than
+    half of the maximum depth are in contact. It usually converges in two to five full steps; after
+    `FULL_STEPS` a line search damps it. Raises ArithmeticError if it does not converge.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))
@@ -333,13 +355,19 @@ def solve_penalty_contact(
         if fraction == 1.0 and np.array_equal(now, active):
             return forces
         active = now
-    raise ArithmeticError(f"the contact of {len(penalty)} points did not converge")
+    raise ArithmeticError(
+        f"the contact solution with {len(penalty)} contact points did not "
+        "converge; reduce the push depth or skin_spacing_m"
+    )
 
 
 def _search_step(
     forces: Floats, target: Floats, problem: tuple[Floats, Floats, Floats, Floats]
 ) -> float:
-    """Return the largest 2^-j of the step from `forces` to `target` that lowers the energy."""
+    """Return the fraction (1, 1/2, 1/4...) of the step from `forces` to `target` to be taken.
+
+    It is the largest of these fractions for which the energy decreases.
+    """
     compliance, compliance_at_points, penalty, depths = problem
 
     def energy(trial: Floats) -> float:
@@ -353,10 +381,11 @@ def _search_step(
 
 
 class LinearSoftBody:
-    """Precomputed linear method: one contact solve and one product with the influence matrix.
+    """Linear soft-body method, based on the precomputed response to unit forces.
 
-    The method is valid up to `linear_depth_m`. Deeper pushes are reported as out of range: the
-    deflection is limited to `max_depth_m`, and the force grows in proportion to the depth.
+    Each push needs one contact solution and one product with the influence matrix. The method is
+    valid up to `linear_depth_m`. Deeper pushes are reported as out of range: the displacement is
+    limited to that at `max_depth_m`, and the force grows in proportion to the depth.
     """
 
     name = "linear"
@@ -376,10 +405,10 @@ class LinearSoftBody:
     ) -> None:
         """Precompute the force curves of all touchable mesh corners.
 
-        bounds (b, 3): skin nodes that cannot be touched; pushes next to them are out of range.
-        push_depth_m: end of the force curve; None for `max_depth_m`. drag: tangential response for
-        a sticking finger; None for no friction. Raises ValueError unless
-        0 < linear_depth_m < max_depth_m.
+        bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to them are
+        reported as out of range. push_depth_m: depth at which the force curve ends; None for
+        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raises
+        ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
@@ -415,7 +444,7 @@ class LinearSoftBody:
         self._smoothing2 = max(float(max_edge_m), finger_radius_m) ** 2
 
     def respond(self, query: ContactQuery) -> Response:
-        """Return the response to a contact."""
+        """Compute the response of the skin to a contact."""
         depth = saturate_depth(query.depth_m, self._linear, self._largest)
         contact = self.contact.solve(query, depth)
         curve = self.force_curve(query.surface)
@@ -442,13 +471,13 @@ class LinearSoftBody:
         )
 
     def _clears_bounds(self, surface: Floats) -> bool:
-        """Return whether the contact patch at a surface point contains touchable skin only."""
+        """Return whether the contact patch around a surface point has touchable skin only."""
         if not len(self._bounds):
             return True
         return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force over depth (N/m) at the end of the linear range, near `surface` (3,).
+        """Return force / depth (N/m) at the end of the linear range, near the point `surface` (3,).
 
         The value does not depend on the current push, so it is available before contact.
         """
@@ -456,18 +485,21 @@ class LinearSoftBody:
         return float(forces[len(CURVE_FRACTIONS)]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force curve near `surface` as a weighted mean of the nodes' curves."""
+        """Return the force curve near the point `surface` (3,).
+
+        It is a weighted mean of the force curves of the mesh corners.
+        """
         return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:
-        """Return Gaussian weights of the mesh corners around a point; their sum is 1."""
+        """Return Gaussian weights of the mesh corners for a point (3,); their sum is 1."""
         squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
         return result
 
     def _forces(self, point: Floats, normal: Floats) -> Floats:
-        """Return the non-decreasing normal force (n,), N, at the depths of the curve."""
+        """Return the normal force (n,), N, at the depths of the force curve; it never decreases."""
         shallow = self._depths[: len(CURVE_FRACTIONS) + 1]
         solved = np.append(shallow, [0.5 * (self._linear + self._largest), self._largest])
         forces = np.zeros(len(solved))
@@ -483,7 +515,10 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
-        """Return the skin displacement (3 s,) under forces (k,), N, for k rows of a table."""
+        """Return the skin displacement (3 s,), m, under several nodal forces.
+
+        table: influence matrix. rows, forces (k,): indices of its rows and the forces (N) on them.
+        """
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
         # Slices of consecutive rows avoid the copy that fancy indexing would make.
@@ -497,7 +532,10 @@ class LinearSoftBody:
 def unit_linear_body(
     response: SkinResponse, shape: Shape, bounds: Floats, finger_radius_m: float
 ) -> LinearSoftBody:
-    """Return the linear method for 1 Pa, linear up to one finger radius; bounds (b, 3)."""
+    """Return the linear method for a modulus of 1 Pa that is linear up to one finger radius.
+
+    bounds (b, 3): positions of skin nodes that must not be touched.
+    """
     return LinearSoftBody(
         response,
         shape,

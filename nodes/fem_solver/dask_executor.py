@@ -18,16 +18,16 @@ import distributed
 from flexsheet.nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
-"""`distributed` as an untyped module, because it has no annotations."""
+"""The module `distributed`, hidden from the type checker because it has no annotations."""
 
 CONNECT_S = 10.0
 """Timeout for the connection to a scheduler and for its first worker, s."""
 TRIES = 3
-"""Number of retries of a job whose worker was lost."""
+"""Maximum number of repetitions of a job whose worker was lost."""
 
 
 class SchedulerError(precompute_table.WorkersError):
-    """Raised when the workers of a scheduler cannot be used."""
+    """Raised if the workers of a dask scheduler cannot be used."""
 
     code = "scheduler"
     remedy = "Check the scheduler's address, and that its workers run the same version."
@@ -40,7 +40,7 @@ class SchedulerError(precompute_table.WorkersError):
 
 
 class DaskExecutor(Executor):
-    """Executor on a scheduler's workers whose running functions can be stopped."""
+    """Executor on the workers of a dask scheduler, which can also stop running functions."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client
@@ -53,7 +53,7 @@ class DaskExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut down as `Executor.shutdown`; cancel_futures also stops running functions."""
+        """Shut down as `Executor.shutdown` does; `cancel_futures` also stops running functions."""
         # Workers of a lost scheduler cannot be notified.
         if cancel_futures and self._client.status == "running":
             self._stop.set()
@@ -64,11 +64,12 @@ class DaskExecutor(Executor):
 def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
     """Connect to a scheduler and yield an executor on its workers.
 
-    address: such as tcp://host:8786. Leaving the context stops the running jobs. Raises
-    SchedulerError if the scheduler does not answer, has no worker, or a worker has another version.
+    address: address of the scheduler, such as tcp://host:8786. connect_s: timeout, s. Leaving the
+    context stops the running jobs. Raises SchedulerError if the scheduler does not answer, has no
+    worker, or a worker has another version of this project.
     """
     try:
-        # Closing a client that failed to connect is slow, so test the connection first.
+        # Test the connection first, because closing a client that failed to connect is slow.
         with socket.create_connection(
             untyped.comm.get_address_host_port(address), timeout=connect_s
         ):
@@ -109,7 +110,7 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
 
 
 def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a worker; `stop_requested` is true once the event `name` is set."""
+    """Run a function in a worker; `stop_requested` returns true once the event `name` is set."""
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)
     try:

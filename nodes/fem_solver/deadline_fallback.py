@@ -1,24 +1,24 @@
-"""Select the best of several methods that meets a deadline."""
+"""Select the best of several methods that is fast enough to meet a deadline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 LATE_STEPS = 5
-"""Number of consecutive late responses after which the method changes."""
+"""Number of consecutive late responses after which another method is selected."""
 RETRY_STEPS = 600
-"""Number of responses of a fallback method after which the best method is tried again."""
+"""Number of responses by another method after which the best method is tried again."""
 SMOOTHING = 0.1
-"""Weight of the newest duration in the mean (exponential smoothing)."""
+"""Weight of the newest duration in the exponentially smoothed mean duration."""
 
 
 class DeadlineFallback:
-    """Selects a method by the durations of recent responses."""
+    """Selector of a method, based on the durations of recent responses."""
 
     def __init__(self, names: Sequence[str], budget_s: float) -> None:
         """Select the first method.
 
-        names: methods, the best first. budget_s: maximum duration of a response, s.
+        names: names of the methods, the best first. budget_s: maximum duration of a response, s.
         """
         self._names, self._budget = tuple(names), budget_s
         self._mean: dict[str, float] = {}
@@ -38,7 +38,7 @@ class DeadlineFallback:
         self._since += 1
         chosen = self.name
         if self._late >= LATE_STEPS:
-            # An untried method counts as the fastest, so that it is measured.
+            # A method without measured durations counts as the fastest, so that it is tried.
             chosen = min(self._names, key=lambda name: self._mean.get(name, 0.0))
         elif self.is_fallback and self._since >= RETRY_STEPS:
             chosen = self._names[0]

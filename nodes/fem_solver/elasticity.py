@@ -1,7 +1,8 @@
 """Compute element matrices of linear isotropic elasticity on 10-node tetrahedra.
 
-Small strain, Hooke's law with Lame's constants (Zienkiewicz & Taylor, "The Finite Element Method",
-vol. 1, ch. 4-6). Degrees of freedom are numbered 3 * node + axis.
+The strain is small, and the material follows Hooke's law with Lame's constants (Zienkiewicz &
+Taylor, "The Finite Element Method", vol. 1, ch. 4-6). The index of a degree of freedom is 3 * node
++ axis.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MAX_POISSON_RATIO = 0.4999
-"""Closer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
+"""Maximum Poisson's ratio. Closer to 0.5, the bulk modulus is so large that rounding errors destroy
+the solution."""
 MIN_VOLUME_RATIO = 1e-6
-"""Minimum Jacobian of an element over its side's cube: flatter elements lose the solution to
-rounding."""
+"""Minimum Jacobian of an element over the cube of its edge length. For flatter elements, rounding
+errors destroy the solution."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
@@ -32,10 +34,13 @@ class SolidMeshError(FlexsheetError, ValueError):
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
     """Return Lame's constants (lambda, mu), Pa.
 
-    Raises ValueError outside E > 0, -1 < nu <= 0.4999.
+    Raises ValueError unless Young's modulus is positive and Poisson's ratio is in the range
+    -1 < nu <= 0.4999.
     """
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
-        raise ValueError(f"young_modulus_pa: {young_modulus_pa!r} must be a positive number")
+        raise ValueError(
+            f"young_modulus_pa: {young_modulus_pa!r} must be a positive number of pascals"
+        )
     if not -1.0 < poisson_ratio <= MAX_POISSON_RATIO:
         raise ValueError(
             f"poisson_ratio: {poisson_ratio!r} must be above -1 and at most "
@@ -65,7 +70,7 @@ def quadrature() -> tuple[Floats, Floats]:
 
 
 def shape_gradients(points: Floats) -> Floats:
-    """Return the shape functions' gradients (q, 10, 3) at points (q, 3) of the unit tetrahedron."""
+    """Return shape function gradients (q, 10, 3) at points (q, 3) of the unit tetrahedron."""
     barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
     slopes = np.vstack([-np.ones(3), np.eye(3)])
     corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
@@ -77,17 +82,18 @@ def shape_gradients(points: Floats) -> Floats:
 
 
 def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
-    """Return Jacobians (e, q, 3, 3) with respect to the unit tetrahedron, and determinants (e, q).
+    """Return Jacobian matrices (e, q, 3, 3) of the map from the unit tetrahedron to each element.
 
-    local (q, 10, 3): gradients of the shape functions. Raises SolidMeshError where an element is
-    inverted or flat, or a node's coordinates are not finite.
+    local (q, 10, 3): gradients of the shape functions at q points. Also returns the determinants
+    (e, q). Raises SolidMeshError if an element is inverted or flat, or the coordinates of a node
+    are not finite.
     """
     corners = nodes[elements]
     invalid = ~np.isfinite(corners).all(axis=(1, 2))
     if invalid.any():
         raise SolidMeshError(
             f"{int(invalid.sum())} of {len(elements)} elements have nodes that are not finite; the "
-            f"first is element number {int(np.argmax(invalid))}"
+            f"first is the element with index {int(np.argmax(invalid))}"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -95,8 +101,8 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     bad = determinant.min(axis=1) <= MIN_VOLUME_RATIO * size**3
     if bad.any():
         raise SolidMeshError(
-            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first is "
-            f"element number {int(np.argmax(bad))} (minimum Jacobian {determinant.min():.3g} m^3)"
+            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first has the "
+            f"index {int(np.argmax(bad))} (minimum determinant {determinant.min():.3g} m^3)"
         )
     return jacobian, determinant
 
@@ -112,7 +118,7 @@ def element_stiffness(
     points, weights = quadrature()
     local = shape_gradients(points)
     jacobian, determinant = jacobians(nodes, elements, local)
-    # Gradients in space: J^-T applied to the local ones, one row per (node, axis).
+    # Spatial gradients: the inverse transposed Jacobian times the local gradients.
     gradient = np.einsum("qak,eqki->eqai", local, np.linalg.inv(jacobian))
     flat = gradient.reshape(len(elements), len(points), 30)
     weighted = flat * (determinant * weights)[:, :, None]
@@ -125,9 +131,9 @@ def element_stiffness(
 
 
 def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
-    """Raise SolidMeshError if all fixed nodes are collinear, so that the body can move.
+    """Raise SolidMeshError if all fixed nodes are collinear, so that the body could rotate freely.
 
-    nodes (n, 3). fixed (n,): flags of the fixed nodes.
+    nodes (n, 3): positions. fixed (n,): whether each node is fixed.
     """
     fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
@@ -145,11 +151,11 @@ def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
 
 
 def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
-    """Return the numbers (3k,) of the nodes' degrees of freedom."""
+    """Return the indices (3k,) of the degrees of freedom of k nodes."""
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
 def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
-    """Return an array (size,) with values (k,) added at their indices (k,)."""
+    """Return an array (size,) of zeros to which values (k,) are added at their indices (k,)."""
     result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
     return result

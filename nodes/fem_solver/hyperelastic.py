@@ -1,13 +1,13 @@
 """Compute energy, forces and tangent of a compressible neo-Hookean solid of 10-node tetrahedra.
 
-Energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
-Analysis", 2nd ed., sec. 6.4.3), with Lame's constants, F the deformation gradient and J its
-determinant:
+The energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
+Analysis", 2nd ed., sec. 6.4.3) is
 
     psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2
 
-The first Piola stress is P = mu F + (lambda ln J - mu) F^-T, which is Hooke's law for small
-strains. The energy grows without bound as J -> 0, so no element inverts at finite energy.
+lambda and mu are Lame's constants, F is the deformation gradient, and J its determinant. The first
+Piola-Kirchhoff stress is P = mu F + (lambda ln J - mu) F^-T; for small strains it reduces to
+Hooke's law. The energy grows without bound as J -> 0, so no element inverts at finite energy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Ints = NDArray[np.int64]
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
 NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
-"""Coordinates (10, 3) of the element's nodes on the unit tetrahedron."""
+"""Coordinates (10, 3) of the nodes of an element on the unit tetrahedron."""
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
@@ -42,15 +42,15 @@ class InvertedElementError(FlexsheetError, ArithmeticError):
 
 
 class NeoHookeanSolid:
-    """Mesh of neo-Hookean material; displacements are (n, 3), m."""
+    """Solid of neo-Hookean material; the argument `displacement` is that of its nodes (n, 3), m."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
-        """Precompute gradients and volumes of the elements.
+        """Precompute the shape function gradients and the volumes of the elements.
 
-        nodes (n, 3), elements (e, 10). Raises SolidMeshError as `jacobians`, ValueError as
-        `lame_constants`.
+        nodes (n, 3), elements (e, 10): mesh. Raises SolidMeshError as `jacobians`, and ValueError
+        as `lame_constants`.
         """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
@@ -70,7 +70,7 @@ class NeoHookeanSolid:
         return float(self._volumes.sum())
 
     def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
-        """Return deformation gradients F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
+        """Return F (e, 8, 3, 3) and J (e, 8) at the quadrature points; see the module docstring."""
         moved = displacement[self.elements].transpose(0, 2, 1)
         gradient = moved[:, None] @ self._gradients
         gradient[..., 0, 0] += 1.0
@@ -89,9 +89,9 @@ class NeoHookeanSolid:
         return float((self._volumes * density).sum())
 
     def forces(self, displacement: Floats) -> Floats:
-        """Return the nodal forces (n, 3), N: the gradient of the energy.
+        """Return the elastic nodal forces (n, 3), N, which are the gradient of the energy.
 
-        Raises InvertedElementError where an element is inverted.
+        Raises InvertedElementError if an element is inverted.
         """
         gradient, inverse, log = self._state(displacement)
         stress = (self._lame * log - self._mu)[..., None, None] * inverse.transpose(0, 1, 3, 2)
@@ -101,11 +101,12 @@ class NeoHookeanSolid:
         return scatter_add(self._rows, per_node.ravel(), 3 * len(self.nodes)).reshape(-1, 3)
 
     def tangents(self, displacement: Floats) -> Floats:
-        """Return the element tangents (e, 30, 30), N/m: the energy's second derivative.
+        """Return the tangent stiffness of each element (e, 30, 30), N/m.
 
-        With h = F^-T times a shape function's gradient, the block of nodes a and b is mu (g_a .
-        g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T, summed over the points. Raises
-        InvertedElementError as `forces`.
+        This is the second derivative of the energy. For the nodes a and b of an element, let g_a
+        and g_b be the gradients of their shape functions, and h = F^-T g. The block of these nodes
+        is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T.
+        Raises InvertedElementError as `forces`.
         """
         _, inverse, log = self._state(displacement)
         count = len(self.elements)
@@ -122,16 +123,21 @@ class NeoHookeanSolid:
         return first
 
     def stiffen(self, matrices: Floats, weight: float) -> None:
-        """Add `weight` times mu times the positive definite Laplacian to tangents, in place."""
+        """Add a positive definite stiffness to element matrices (e, 30, 30), in place.
+
+        It is the Laplacian of the displacement times `weight` and the shear modulus. It regularizes
+        a tangent stiffness that is not positive definite.
+        """
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += weight * self._laplacian
 
     def min_volume_ratio(self, displacement: Floats) -> float:
-        """Return the minimum J over all quadrature points and nodes: 1 at rest, <= 0 if inverted.
+        """Return the minimum volume ratio J over all quadrature points and nodes.
 
-        Nodes are included because a corner of a quadratic element can invert while J is positive
-        at all quadrature points.
+        It is 1 without deformation, and at most 0 if an element is inverted. Nodes are included
+        because a corner of a quadratic element can invert while J is positive at all quadrature
+        points.
         """
         local = shape_gradients(NODE_COORDINATES)
         rest, moved = (
@@ -144,14 +150,14 @@ class NeoHookeanSolid:
         gradient, volume_ratio = self.deformation(displacement)
         if volume_ratio.min() <= 0.0:
             raise InvertedElementError(
-                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements are inverted "
+                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements of the mesh are inverted "
                 f"(minimum volume ratio {volume_ratio.min():.3g})"
             )
         return gradient, inverses(gradient, volume_ratio), np.log(volume_ratio)
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Return determinants (...) of matrices (..., 3, 3), faster than `numpy.linalg.det`."""
+    """Return the determinants (...) of matrices (..., 3, 3), faster than `numpy.linalg.det`."""
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     result: Floats = (
         a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])
@@ -162,7 +168,7 @@ def determinants(matrices: Floats) -> Floats:
 
 
 def inverses(matrices: Floats, determinant: Floats) -> Floats:
-    """Return inverses (..., 3, 3) of 3x3 matrices with known determinants (...)."""
+    """Return the inverses (..., 3, 3) of 3x3 matrices whose determinants (...) are known."""
     result = np.empty_like(matrices)
     for i in range(3):
         for j in range(3):

@@ -1,10 +1,10 @@
-"""Factor an element-by-element stiffness by the multifrontal Cholesky method.
+"""Factor the stiffness matrix of a mesh, given by element matrices, by multifrontal Cholesky.
 
-Nested dissection bisects the elements recursively (George 1973). The degrees of freedom that two
-halves share are eliminated after both. Each half leaves a dense Schur complement on its boundary,
-which is added to its parent's matrix (Duff & Reid 1983). Nearly all work is dense linear algebra.
-The elimination order is computed once per mesh and reused for every stiffness of a Newton
-iteration.
+Nested dissection bisects the set of elements recursively (George 1973). The degrees of freedom that
+two halves share are eliminated after those inside the halves. The elimination of a half leaves a
+dense Schur complement on its boundary, which is added to the matrix of its parent (Duff & Reid
+1983). Nearly all work is dense linear algebra. The elimination order is computed once per mesh and
+reused for every stiffness matrix of a Newton iteration.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """Raised for a stiffness that is not positive definite."""
+    """Raised for a stiffness matrix that is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
@@ -36,12 +36,13 @@ class IndefiniteError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """Node of the elimination tree.
+    """Node of the elimination tree, with a dense matrix over its degrees of freedom.
 
-    pivots, boundary: degrees of freedom eliminated here, and those left to the parent. elements:
-    numbers of a leaf's elements. scatter: indices of the element matrices' entries in the leaf's
-    dense matrix; one past its end for fixed nodes. children: numbers of earlier fronts, with the
-    positions of their boundaries in this front.
+    pivots: degrees of freedom that are eliminated here. boundary: those that are left to the
+    parent. elements: indices of the elements; empty unless the front is a leaf. scatter: position
+    in the dense matrix for each entry of the element matrices; one past its end for entries of
+    fixed nodes. children: indices of earlier fronts, with the positions of their boundaries in this
+    front.
     """
 
     pivots: Ints
@@ -53,14 +54,14 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """Cholesky factors K = L L^T in the precision of the stiffness."""
+    """Cholesky factors L of a stiffness matrix K = L L^T, stored in the precision of K."""
 
     fronts: list[Front]
     diagonal: list[Floats]
     off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Return the displacements under loads (3n,) or (3n, k); zero at fixed nodes."""
+        """Return the displacements of n nodes under loads (3n,) or (3n, k); 0 at fixed nodes."""
         (trsm,) = get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
         work = loads.reshape(len(loads), -1).astype(self.diagonal[0].dtype)
         for front, diagonal_block, off_block in zip(
@@ -83,10 +84,10 @@ class Factors:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Part of the mesh.
+    """Part of the mesh in the nested dissection.
 
-    pivots: nodes eliminated with it. boundary: nodes left to its parent. members: elements of a
-    leaf. halves: numbers of its two parts, empty for a leaf.
+    pivots: nodes that are eliminated with this part. boundary: nodes left to its parent. members:
+    indices of the elements, if it is a leaf. halves: indices of its two parts; empty for a leaf.
     """
 
     pivots: Ints
@@ -96,21 +97,21 @@ class _Part:
 
 
 class NestedDissection:
-    """Elimination order for one mesh and its supports."""
+    """Elimination order for a mesh with given fixed nodes."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: NDArray[np.bool_]) -> None:
         """Compute the elimination order.
 
-        nodes (n, 3), elements (e, k). fixed (n,): nodes that cannot move.
+        nodes (n, 3), elements (e, k): mesh. fixed (n,): whether each node is fixed.
         """
         self._elements, self._fixed = elements, fixed
         self._centres = nodes[elements].mean(axis=1)
         self._uses = np.bincount(elements.ravel(), minlength=len(nodes))
         self._parts: list[_Part] = []
         self._split(np.arange(len(elements)))
-        # Boundaries are sorted by elimination order, so that a part's boundary has the same order
-        # in its parent and only lower triangles are added. Nodes of one leaf are adjacent, so that
-        # blocks are added in long runs.
+        # Boundaries are sorted by elimination order. The nodes of a boundary then have the same
+        # order in the parent, so only lower triangles need to be added. Nodes of one leaf are
+        # adjacent, so that large blocks are added at once.
         self._rank = np.empty(len(nodes), dtype=np.int64)
         leaf = np.zeros(len(nodes), dtype=np.int64)
         for number, part in enumerate(self._parts):
@@ -125,10 +126,11 @@ class NestedDissection:
         self.fronts = [self._front(part) for part in self._parts]
 
     def factor(self, matrices: Floats) -> Factors:
-        """Factor the sum of element matrices (e, 3k, 3k), symmetric, float64 or float32.
+        """Factor the stiffness matrix that is the sum of element matrices (e, 3k, 3k).
 
-        float32 takes half the time and memory and gives about four digits. Raises IndefiniteError
-        for a sum that is not positive definite.
+        The matrices are symmetric, float64 or float32. float32 takes half of the time and memory;
+        solutions then have about four digits. Raises IndefiniteError if the sum is not positive
+        definite.
         """
         dtype = matrices.dtype
         trsm, syrk = get_blas_funcs(("trsm", "syrk"), dtype=dtype)
@@ -149,7 +151,10 @@ class NestedDissection:
                 dense[:pivot_count, :pivot_count], lower=1, clean=0
             )
             if failed_pivot:
-                raise IndefiniteError(f"pivot {failed_pivot} of front {number} is not positive")
+                raise IndefiniteError(
+                    "the stiffness matrix is not positive definite: "
+                    f"pivot {failed_pivot} of front {number} is not positive"
+                )
             off_block = trsm(
                 1.0, diagonal_block, dense[pivot_count:, :pivot_count], side=1, lower=1, trans_a=1
             )
@@ -162,10 +167,10 @@ class NestedDissection:
         return Factors(self.fronts, diagonal, off_diagonal)
 
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
-        """Append the parts of some elements, halves first.
+        """Divide some elements recursively, and append the parts, halves before their parent.
 
-        Returns the number of the last part, its free nodes (k,), and the number of its elements
-        that use each node (k,).
+        Returns the index of the last part, its free nodes (k,), and how many of its elements use
+        each of these nodes (k,).
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)
@@ -185,7 +190,7 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Return two halves of some elements, cut across the axis with the fewest shared nodes."""
+        """Divide some elements into two halves along the axis for which they share fewest nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]
@@ -222,9 +227,9 @@ class NestedDissection:
 
 
 def _add_block(dense: Floats, part: Floats, positions: Ints) -> None:
-    """Add the lower triangle of `part` to that of `dense` at increasing `positions`.
+    """Add the lower triangle of the matrix `part` to that of `dense`, at increasing `positions`.
 
-    Entries above the diagonal are undefined and never read.
+    Entries above the diagonal are undefined and are never read.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(positions) != 1) + 1, [len(positions)]])
     if len(starts) > MAX_RUNS:

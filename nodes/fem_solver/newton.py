@@ -1,13 +1,14 @@
 """Solve the contact of a fingertip sphere with a neo-Hookean body by Newton's method.
 
-This is the reference method. The finger is a rigid sphere. Contact points on the skin's faces
-carry a penalty pressure. It first grows with the square of the penetration, which makes forces C1,
-and then linearly. The penetration is about a hundredth of the radius under a pressure equal to
-Young's modulus. Newton's method with a line search minimises one energy. An inverted element has
-infinite energy and is never accepted.
+This is the reference method, against which the faster ones are measured. The finger is a rigid
+sphere. A penalty pressure acts on contact points of the skin (the surface of the body). It first
+grows with the square of the penetration, so that forces have a continuous slope, and then linearly.
+Under a pressure equal to Young's modulus the penetration is about a hundredth of the radius.
+Newton's method with a line search minimises the sum of elastic and contact energy. An inverted
+element has infinite energy, so it is never accepted.
 
-Without friction the solution depends only on the finger's position. With a sticking finger,
-tangential springs connect each point to its first contact, so the solution depends on the path.
+Without friction the solution depends only on the position of the finger. If the finger sticks, it
+also depends on the path: tangential springs connect each contact point to where it was touched.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Ints = NDArray[np.int64]
 Friction = Literal["none", "stick"]
 
 PENALTY_RATIO = 200.0
-"""Penalty stiffness of the contact (Pa/m) in units of E / finger radius."""
+"""Penalty stiffness of the contact (Pa/m), divided by (Young's modulus / finger radius)."""
 ROUNDING_RATIO = 0.005
 """Depth over which the penalty pressure rises quadratically from zero, in finger radii."""
 POINTS_PER_EDGE = 4
@@ -41,10 +42,10 @@ MIN_STEP_FRACTION = 1.0 / 16.0
 """Minimum fraction of a load step. Steps are halved until they converge or reach this fraction."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
-"""Attempts to make a tangent definite: weight of the contact's geometric stiffness, then added
-stiffness in units of the shear modulus."""
+"""Successive attempts to make the tangent stiffness positive definite. Each is a pair: weight of
+the geometric stiffness of the contact, and added stiffness in units of the shear modulus."""
 TOLERANCE = 1e-8
-"""Residual forces, as a fraction of the largest force in the body."""
+"""Maximum residual force at convergence, as a fraction of the largest force in the body."""
 
 
 class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
@@ -58,9 +59,10 @@ class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
 class EquilibriumState:
     """Equilibrium of the body with the finger.
 
-    displacement (n, 3), m. force_n (3,): force of the body on the finger. centre (3,): position of
-    the sphere. reached: whether the target position converged; otherwise `centre` is the last
-    converged position.
+    displacement (n, 3): displacement of the nodes, m. force_n (3,): force of the body on the
+    finger, N. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
+    undeformed volume. reached: whether the solution for the target position converged; otherwise
+    `centre` is the last position that converged.
     """
 
     displacement: Floats
@@ -73,7 +75,11 @@ class EquilibriumState:
 
 @dataclass(frozen=True, slots=True)
 class _StickState:
-    """Sticking points (k,) with offsets from the sphere's centre and skin normals (k, 3)."""
+    """Contact points that stick to the finger.
+
+    points (k,): indices of the contact points. offsets (k, 3): where they stick to the finger,
+    relative to its centre, m. normals (k, 3): unit normals of the sphere at the points.
+    """
 
     points: Ints
     offsets: Floats
@@ -84,19 +90,19 @@ NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((
 
 
 class SphereObstacle:
-    """Penalty contact between the skin and the finger."""
+    """Penalty contact between the skin of a body and the spherical finger."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
     ) -> None:
-        """Sample the contact points.
+        """Place the contact points on the faces.
 
-        faces (f, 6): six-node triangles that a finger can touch.
+        faces (f, 6): six-node triangles that the finger can touch.
         """
         self.radius_m = radius_m
         self._count, self._faces = len(nodes), faces
         corners = nodes[faces[:, :3]]
-        # The points are close enough that no finger fits between them.
+        # Place the points close enough together that the finger cannot pass between them.
         max_step_m = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
         divisions = int(np.ceil(max_step_m / (POINT_SPACING_RATIO * radius_m)))
         self._shape, _ = sample_triangle(max(POINTS_PER_EDGE, divisions))
@@ -108,15 +114,15 @@ class SphereObstacle:
         self.parents, self._local = _find_parents(elements, faces)
 
     def points(self, positions: Floats) -> Floats:
-        """Return the contact points (q, 3) of the deformed skin for node positions (n, 3)."""
+        """Return the positions (q, 3) of the contact points, given those (n, 3) of the nodes."""
         result: Floats = (self._shape @ positions[self._faces]).reshape(-1, 3)
         return result
 
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
-        """Return the contact points inside the sphere.
+        """Find the contact points inside the sphere.
 
-        Returns their numbers (k,), penetrations (k,), outward sphere normals (k, 3) and distances
-        from the centre (k,).
+        Returns their indices (k,), penetrations (k,), outward normals of the sphere (k, 3) and
+        distances from the centre (k,).
         """
         offset = self.points(positions) - centre
         distance = np.linalg.norm(offset, axis=1)
@@ -125,7 +131,7 @@ class SphereObstacle:
         return inner, self.radius_m - away, offset[inner] / away[:, None], away
 
     def energy(self, positions: Floats, centre: Floats, stick: _StickState) -> float:
-        """Return the energy of the penalty and of the tangential springs, J."""
+        """Return the contact energy (J): that of the penalty and of the tangential springs."""
         inner, depth, _, _ = self.inside(positions, centre)
         d = self._rounding
         low = depth < d
@@ -137,7 +143,7 @@ class SphereObstacle:
         return total
 
     def forces(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
-        """Return the energy's gradient (n, 3), N: the force of each node on the finger."""
+        """Return the gradient of `energy` (n, 3), N: the force of each node on the finger."""
         inner, depth, normals, _ = self.inside(positions, centre)
         per_point = np.zeros((len(self._penalty), 3))
         per_point[inner] = -(self._penalty[inner] * self._pressure(depth))[:, None] * normals
@@ -161,10 +167,10 @@ class SphereObstacle:
         *,
         geometric_stiffness_weight: float,
     ) -> None:
-        """Add the energy's second derivative to the element matrices (e, 30, 30).
+        """Add the second derivative of `energy` to the element matrices (e, 30, 30), in place.
 
-        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces its
-        indefinite part, which arises because a sphere pushes points sideways.
+        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces the part of
+        the derivative that may be indefinite; it arises because a sphere pushes points sideways.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
@@ -187,9 +193,9 @@ class SphereObstacle:
         np.add.at(matrices, (target[:, None, None], rows[:, :, None], rows[:, None, :]), summed)
 
     def update_stick(self, positions: Floats, centre: Floats, stick: _StickState) -> _StickState:
-        """Return the sticking points at equilibrium.
+        """Return the points that stick to the finger after a new equilibrium was found.
 
-        Points under pressure stick where they were first touched; other points are released.
+        Points under pressure stick where the finger first touched them; other points are released.
         """
         inner, _, normals, _ = self.inside(positions, centre)
         offsets = self.points(positions)[inner] - centre
@@ -209,7 +215,7 @@ class SphereObstacle:
 
 
 class NeoHookeanBody:
-    """Neo-Hookean body with fixed nodes, pushed by a finger."""
+    """Neo-Hookean (hyperelastic) body with fixed nodes that a finger pushes."""
 
     def __init__(
         self,
@@ -226,11 +232,12 @@ class NeoHookeanBody:
         min_step_fraction: float = MIN_STEP_FRACTION,
         factor_dtype: type[np.floating[Any]] = np.float64,
     ) -> None:
-        """Prepare the solver; errors as `NeoHookeanSolid`.
+        """Prepare the solver.
 
-        faces (f, 6): touchable six-node triangles, outward. tolerance, min_step_fraction: see
-        `TOLERANCE` and `MIN_STEP_FRACTION`. factor_dtype: precision of the tangent's factors, which
-        affects only the search direction.
+        fixed (n,): whether each node is fixed. faces (f, 6): six-node triangles that the finger can
+        touch, outward. tolerance, min_step_fraction: see `TOLERANCE` and `MIN_STEP_FRACTION`.
+        factor_dtype: precision of the factors of the tangent stiffness; it affects only the search
+        direction. Raises the errors of `NeoHookeanSolid`.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -247,19 +254,22 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Yield the equilibrium at each of the sphere's centres (3,), connected by straight paths.
+        """Move the finger to each of `centres` (3,) in a straight line and yield the equilibria.
 
-        start: displacement and centre of a frictionless equilibrium; None: the first centre must
-        not touch the body. After a step that does not converge, the last equilibrium is yielded
-        with `reached` false for all remaining centres. Inverted elements and a sphere inside the
-        body count as not converged. Raises ValueError for a centre that is not finite.
+        start: displacement and sphere centre of a known frictionless equilibrium. If it is None,
+        the sphere at the first centre must not touch the body. If a step does not converge, the
+        last equilibrium is yielded with `reached` false for all remaining centres. Inverted
+        elements and a sphere inside the body count as not converged. Raises ValueError for a centre
+        that is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
         stick, failed = NO_STICK, False
         for centre in centres:
             if not np.isfinite(centre).all():
-                raise ValueError(f"finger centre {centre} is not finite")
+                raise ValueError(
+                    f"finger centre {centre} is not finite; check the push point and depth"
+                )
             iterations = 0
             if position is None:
                 position = centre
@@ -301,10 +311,11 @@ class NeoHookeanBody:
     def solve_equilibrium(
         self, displacement: Floats, centre: Floats, stick: _StickState, *, guess: Floats
     ) -> tuple[Floats, int, Factors | None]:
-        """Return the equilibrium (n, 3), the number of iterations and the last factors.
+        """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
-        centre (3,): of the sphere. The iteration starts at `guess` if that has less energy than
-        `displacement`. Raises NewtonNotConvergedError.
+        The iteration starts at `guess` (n, 3) if that has less energy than `displacement` (n, 3).
+        Returns the displacement (n, 3) at equilibrium, the number of iterations, and the last
+        factors of the tangent stiffness. Raises NewtonNotConvergedError.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre, stick) < self._energy(displacement, centre, stick):
@@ -329,21 +340,28 @@ class NeoHookeanBody:
                     break
                 fraction *= 0.5
                 if fraction < 1e-4:
-                    raise NewtonNotConvergedError(f"no descent after {iteration} iterations")
+                    raise NewtonNotConvergedError(
+                        f"the line search found no lower energy after {iteration} Newton iterations"
+                    )
             displacement, energy = trial, now
-        raise NewtonNotConvergedError(f"not converged after {MAX_ITERATIONS} iterations")
+        raise NewtonNotConvergedError(
+            f"the equilibrium did not converge in {MAX_ITERATIONS} Newton iterations"
+        )
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
         """Raise NewtonNotConvergedError for inverted elements or a sphere centre inside the body.
 
-        No penalty acts on a finger that passed through the skin completely.
+        The latter is checked because no penalty acts on a finger that is completely inside the
+        body.
         """
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
-            raise NewtonNotConvergedError(f"an element is inverted (volume ratio {ratio:.3g})")
+            raise NewtonNotConvergedError(
+                f"an element of the mesh is inverted (minimum volume ratio {ratio:.3g})"
+            )
         triangles = (self.solid.nodes + displacement)[self._hull] - centre
         if winding_number(triangles) > 0.5:
-            raise NewtonNotConvergedError("the finger is inside the body")
+            raise NewtonNotConvergedError("the centre of the finger is inside the body")
 
     def _energy(self, displacement: Floats, centre: Floats, stick: _StickState) -> float:
         elastic = self.solid.energy(displacement)
@@ -359,7 +377,7 @@ class NeoHookeanBody:
         stick: _StickState,
         factors: Factors | None,
     ) -> Floats:
-        """Return the first-order displacement for a finger that moves to `target`."""
+        """Predict the displacement (n, 3), to first order, for a finger that moves to `target`."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
@@ -369,9 +387,9 @@ class NeoHookeanBody:
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
     def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
-        """Return the factors of the tangent, regularized if it is indefinite.
+        """Factor the tangent stiffness; regularize it if it is not positive definite.
 
-        Raises NewtonNotConvergedError if no regularization suffices.
+        Raises NewtonNotConvergedError if none of `REGULARIZATIONS` makes it positive definite.
         """
         positions = self.solid.nodes + displacement
         elastic = self.solid.tangents(displacement)
@@ -389,13 +407,16 @@ class NeoHookeanBody:
                 return self._order.factor(matrices.astype(self.factor_dtype, copy=False))
             except IndefiniteError:
                 continue
-        raise NewtonNotConvergedError("no regularization makes the stiffness definite")
+        raise NewtonNotConvergedError(
+            "the tangent stiffness is not positive definite with any regularization"
+        )
 
 
 def winding_number(triangles: Floats) -> float:
-    """Return the winding number of closed outward triangles (t, 3, 3) about the origin: 1 inside.
+    """Return the winding number of a closed surface about the origin: 1 if that is inside, else 0.
 
-    It is the sum of solid angles over 4 pi (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
+    triangles (t, 3, 3): corners, counter-clockwise seen from outside. The winding number is the sum
+    of the solid angles, divided by 4 pi (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
     1983).
     """
     a, b, c = triangles.transpose(1, 0, 2)
@@ -406,7 +427,11 @@ def winding_number(triangles: Floats) -> float:
 
 
 def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
-    """Return the element (f,) of each face (f, 6) and the local numbers (f, 6) of its nodes."""
+    """Find the element of each face (f, 6).
+
+    Returns the indices (f,) of the elements, and the indices (f, 6) of the nodes of each face
+    within its element (0 to 9).
+    """
     sides = elements[:, FACES]
     keys = np.sort(sides[..., :3], axis=2).reshape(-1, 3)
     base = int(elements.max()) + 1

@@ -1,4 +1,4 @@
-"""Node that computes the deformation of the scene's object under the finger."""
+"""Provide the node that computes how the finger deforms the virtual object of the scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,11 @@ POLL_S = 0.05
 
 
 class FemSolver(Node):
-    """Node that publishes the skin at rest and its displacement for each fingertip message."""
+    """Node that publishes the undeformed skin of the object, and its displacement by the finger.
+
+    The skin is the surface of the object. It is published once for each scene, and the displacement
+    for each fingertip message.
+    """
 
     live_parameters: ClassVar[frozenset[str]] = frozenset(
         {"prediction_horizon_s", "hold_s", "relax_s"}
@@ -67,7 +71,10 @@ class FemSolver(Node):
         self._anchor: ContactAnchor | None = None
 
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
-        """Set the bodies that compute responses, the best first; empty before a scene."""
+        """Set the soft bodies that compute responses, one per method, the best first.
+
+        The list is empty until a scene has arrived.
+        """
         self._bodies = {one.method.name: one for one in bodies}
         if bodies:
             self._fallback = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
@@ -115,7 +122,10 @@ class FemSolver(Node):
             self._table_task = asyncio.create_task(self._build_table(scene, bodies[0]))
 
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
-        """Compute the nonlinear table while the linear method computes the responses."""
+        """Compute the nonlinear table in the background and use it when it is finished.
+
+        In the meantime, the linear method computes the responses.
+        """
         try:
             progress = partial(self._progress, self._stop)
             best = await asyncio.to_thread(self._factory.build_table, scene, linear, progress)
@@ -162,11 +172,12 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run `compute` in a thread and return its result.
+    """Run `compute` in a thread and return its result, unless that is no longer needed.
 
-    compute: receives `progress` with a stop event as its first argument. Raises Interrupted once
-    `is_superseded` returns true. The thread is then abandoned, because meshing takes up to 8 s, and
-    its errors are ignored.
+    compute: function that receives `progress`, bound to a stop event as the first argument.
+    is_superseded: function that returns true if a newer request has arrived. In this case,
+    Interrupted is raised. The thread is not awaited, because meshing takes up to 8 s, and its
+    errors are ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

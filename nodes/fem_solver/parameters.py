@@ -1,4 +1,4 @@
-"""Define the soft body node's parameters, as a launch file gives them."""
+"""Define the parameters of the soft-body node, which a launch file sets."""
 
 from __future__ import annotations
 
@@ -15,53 +15,61 @@ from flexsheet.nodes.node import NodeParameters
 class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
-        description="Method of the soft body. auto: the scene's, else the nonlinear table if it is "
-        "cached, else linear. nonlinear_table: computed in the background if it is not cached, "
-        "which takes minutes.",
+        description="Method that computes the deformation. auto: the method that the scene "
+        "specifies; otherwise the nonlinear table if it is cached, or linear. nonlinear_table: if "
+        "the table is not cached, it is computed in the background, which takes minutes.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Distance between touchable skin nodes. auto: the scene's, else 0.003.",
+        description="Distance between mesh nodes on the touchable surface. auto: the value that "
+        "the scene specifies, or 0.003.",
     )
     compute_table: bool = Field(
         default=False,
-        description="Compute the nonlinear table in the background if the scene chooses it and it "
-        "is not cached.",
+        description="Whether the nonlinear table is computed in the background if the scene "
+        "specifies it and it is not cached.",
     )
     linear_depth_m: Positive = Field(
         default=0.006,
-        description="Maximum depth of the linear method; deeper pushes are reported out of range.",
+        description="Maximum push depth of the linear method; deeper pushes are reported as out of "
+        "range.",
     )
     max_depth_m: Positive = Field(
         default=0.010,
-        description="Limit of the deflection with the linear method.",
+        description="Push depth that limits the deformation with the linear method.",
     )
     friction_ratio: NonNegative = Field(
         default=0.0,
-        description="Friction coefficient between finger and object. Above 0 the linear method is "
-        "used.",
+        description="Friction coefficient between finger and object. 0: the finger slides without "
+        "friction. Above 0, the linear method is used.",
     )
     step_budget_s: Positive = Field(
         default=0.004,
-        description="Maximum duration of a step; five consecutive late steps change the method.",
+        description="Maximum duration of the computation for one fingertip message. After five "
+        "consecutive longer ones, another method is used.",
     )
     workers: int = Field(
-        default=0, ge=0, description="Number of worker processes for a table. 0: one per core."
+        default=0,
+        ge=0,
+        description="Number of processes that compute a nonlinear table. 0: one per core.",
     )
     scheduler: str | None = Field(
         default=None,
         description="Address of a dask.distributed scheduler, such as tcp://host:8786, whose "
-        "workers compute the table. null: this machine's cores.",
+        "workers compute the nonlinear table. null: processes of this machine compute it.",
     )
     prediction_horizon_s: NonNegative = Field(
-        default=0.0, description="Prediction time of the fingertip after its exposure."
+        default=0.0,
+        description="Time after the camera exposure for which the fingertip is predicted.",
     )
     hold_s: NonNegative = Field(
-        default=0.1, description="Time for which the deformation remains after the finger is lost."
+        default=0.1, description="Time for which the deformation is kept after the finger is lost."
     )
     relax_s: Positive = Field(
-        default=0.15, description="Time constant of the deformation's decay after `hold_s`."
+        default=0.15,
+        description="Time constant with which the deformation decays after `hold_s`.",
     )
     cache_dir: Path | None = Field(
-        default=None, description="Folder of precomputed results. null: the user's cache."
+        default=None,
+        description="Folder of precomputed results. null: the cache folder of the user.",
     )

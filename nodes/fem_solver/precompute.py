@@ -1,7 +1,7 @@
-"""Compute and cache the skin's response to a unit load on every touchable node.
+"""Compute and cache the response of the skin to a unit force on every touchable node.
 
-The file is named by a digest of the specification. Young's modulus is not part of it, because the
-response is proportional to 1/E and is stored for 1 Pa.
+The skin is the surface of the soft body. The cache file is named by a digest of the inputs. Young's
+modulus is not one of them: the response is inversely proportional to it and is stored for 1 Pa.
 """
 
 from __future__ import annotations
@@ -32,28 +32,29 @@ VERSION = 3
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
-"""Number of loads that take as long as meshing and as factoring, for the progress."""
+"""Duration of meshing, and of factoring the stiffness, in durations of one load; for progress."""
 
 Progress = Callable[[int, int, "WorkBudget"], None]
-"""Callback with (done, total) steps and the required resources, first called before the work
-starts. It may raise `Interrupted` to stop the work."""
+"""Callback that receives the steps done, their total and the required resources. It is first called
+before the work starts, and may raise `Interrupted` to stop the work."""
 
 
 class WorkBudget(Protocol):
-    """Interface of the resources that a computation needs."""
+    """Interface of an estimate of the resources that a computation needs."""
 
     def text(self) -> str: ...
 
 
 class Interrupted(Exception):
-    """Raised when a computation is stopped on request; its checkpoints remain."""
+    """Raised when a computation is stopped on request; its stored parts remain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
     """Inputs of a precomputation.
 
-    sticking: also compute the response to tangential forces, which takes three times the memory.
+    sticking: whether the response to tangential forces is also computed, for a finger that sticks
+    to the skin; it takes three times the memory.
     """
 
     mesh: MeshSpec
@@ -69,7 +70,7 @@ class SoftBodySpec:
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the specification and of the code's version."""
+        """Return a digest of the inputs and of `VERSION`."""
         return make_digest(self.depends_on())
 
 
@@ -77,8 +78,9 @@ class SoftBodySpec:
 class SoftBodyModel:
     """Precomputed elastic response of a soft body and its skin mesh.
 
-    triangles (t, 3), outward. bounds (s,): whether a node is not touchable; false also past an end
-    of the touchable surface. drag: the tangential response, if specified.
+    response: response to normal forces. triangles (t, 3): skin triangles, outward. bounds (s,):
+    whether each skin node must not be touched; false also for nodes on end faces. drag: response
+    to tangential forces, or None.
     """
 
     response: SkinResponse
@@ -89,7 +91,10 @@ class SoftBodyModel:
 
 @dataclass(frozen=True, slots=True)
 class ResponseBudget:
-    """Resources of a precomputation."""
+    """Estimate of the resources of a precomputation.
+
+    loads: number of unit forces. working_bytes, table_bytes: memory for computing and for results.
+    """
 
     skin_nodes: int
     loads: int
@@ -114,7 +119,7 @@ class ResponseBudget:
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
 ) -> ResponseBudget:
-    """Return the resources that `compute` needs for this mesh and elimination order."""
+    """Return the resources that `compute` needs for a given mesh and elimination order."""
     factors = sum(len(f.pivots) * (len(f.pivots) + len(f.boundary)) for f in order.fronts) * 8
     stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
     chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
@@ -124,12 +129,12 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate the resources of `compute` without a mesh, within a factor of two.
+    """Estimate the resources of `compute` within a factor of two, without building the mesh.
 
     Raises UnfitMeshError as `mesh_budget`.
     """
     nodes = mesh_budget(spec.mesh)
-    # Empirical fractions of skin nodes among all nodes, and of touchable among skin nodes.
+    # Empirical numbers of skin nodes, and of touchable nodes among them.
     skin = int(6.0 * nodes.nodes ** (2.0 / 3.0))
     loads, geometry = skin // 2, spec.mesh.geometry
     if isinstance(geometry, Plane):
@@ -143,11 +148,11 @@ def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
 def compute(
     spec: SoftBodySpec, progress: Progress, checkpoints: CheckpointStore | None = None
 ) -> SoftBodyModel:
-    """Mesh the object, factor its stiffness and solve for one unit load per touchable node.
+    """Mesh the object, factor its stiffness and solve for one unit force per touchable node.
 
-    checkpoints: store of finished parts. Raises SolidMeshError for a body without sufficient
-    support, ValueError for an invalid material or size, and MemoryError before any allocation if
-    the machine has too little memory.
+    checkpoints: store in which finished parts are kept, so that an interrupted computation can
+    continue. Raises SolidMeshError for a body without sufficient support and ValueError for an
+    invalid material or size. Raises MemoryError, before any allocation, without enough memory.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -199,7 +204,7 @@ def compute(
     contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes)
     skin = mesh.nodes[mesh.skin]
     found = make_shape(dict(spec.mesh.geometry)).closest(skin)
-    # Nodes off the smooth surface are on its ends: end caps, or the sides of a slab.
+    # Nodes that are not on the touchable shape are on end caps or on the sides of a slab.
     off_surface = np.linalg.norm(found.point - skin, axis=1) > 0.5 * spec.mesh.skin_spacing_m
     bounds = ~(off_surface | found.on_edge)
     bounds[contact_nodes] = False
@@ -221,10 +226,11 @@ def _solve_unit_loads(
     get_part: Callable[[int, Callable[[], Part]], Part],
     advance: Callable[[int], None],
 ) -> tuple[Floats32, Floats]:
-    """Return influence (m p, 3 s) and compliance (m p, m p) of the m contact nodes.
+    """Solve for unit forces on the m contact nodes, in p directions at each.
 
-    directions (m, p, 3): of the p unit forces at each node. get_part: loads a stored part by its
-    number, or computes and stores it.
+    directions (m, p, 3): directions of the forces. get_part: function that loads the stored part
+    with an index, or computes and stores it. Returns displacements per force, m/N: those of the s
+    skin nodes (m p, 3 s), and those of the contact nodes along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -254,7 +260,7 @@ def _solve_unit_loads(
 
 
 def make_tangents(normals: Floats) -> Floats:
-    """Return two unit tangents (m, 2, 3), perpendicular to each other, for normals (m, 3)."""
+    """Return two perpendicular unit tangents (m, 2, 3) for each of the normals (m, 3)."""
     smallest_axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, smallest_axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -262,23 +268,26 @@ def make_tangents(normals: Floats) -> Floats:
 
 
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
-    """Raise MemoryError, with a remedy, if the machine has less free memory than required."""
+    """Raise MemoryError if the machine has less free memory than required.
+
+    what, remedy: subject and advice for the error text.
+    """
     import psutil
 
     free = psutil.virtual_memory().available
     if required_bytes > free:
         raise MemoryError(
-            f"{what} needs {required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; "
-            f"{remedy}"
+            f"{what} needs {required_bytes / 2**30:.1f} GiB of memory, but {free / 2**30:.1f} GiB "
+            f"are free on this machine; {remedy}"
         )
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""Field names that differ in the cache file: field name to stored name."""
+"""Names in the cache file, for the fields whose name differs from it."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Return the cache specification of a soft body's linear response."""
+    """Describe how the linear response of a soft body is stored in the cache."""
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
         content = {"triangles": model.triangles, "bounds": model.bounds}
@@ -302,6 +311,6 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 
 
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
-    """Load the cached model, or compute and store it; errors as `compute` and `cached`."""
+    """Load the cached model, or compute and store it; raises as `compute` and `cached`."""
     entry = response_cache(spec)
     return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))

@@ -1,8 +1,8 @@
-"""Compute the nonlinear table of a scene's body from snapshots solved in parallel.
+"""Compute the nonlinear table of a soft body from snapshots that are solved in parallel.
 
-Snapshots are independent and take most of the time. An executor of `concurrent.futures` solves
-them, either processes of this machine or the workers of a cluster (`dask_executor`). Each snapshot
-is stored as soon as it is solved.
+Snapshots (`snapshots`) are solutions for pushes at single points. They are independent of each
+other and take most of the time. They are solved by an executor of `concurrent.futures`: processes
+of this machine or the workers of a cluster (`dask_executor`). Each is stored when it is solved.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from flexsheet.nodes.models.shapes import make_shape
 VERSION = 3
 """Version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""Progress steps of a snapshot and of a node of the table."""
+"""Number of progress steps that a snapshot, and a node of the table, count for."""
 POLL_S = 0.2
 """Period of progress reports and stop checks while snapshots are solved."""
 SNAPSHOT_BYTES = 600_000_000
 """Approximate memory for solving one snapshot."""
 
 Progress = Callable[[int, int, "TableBudget"], None]
-"""Callback with (done, total) steps and the required resources, first called before the work
-starts. It may raise `precompute.Interrupted` to stop the work."""
+"""Callback that receives the steps done, their total and the required resources. It is first called
+before the work starts, and may raise `precompute.Interrupted` to stop the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,10 @@ class TableSpec:
 
 @dataclass(frozen=True, slots=True)
 class TableBudget:
-    """Resources of a table's computation."""
+    """Estimate of the resources that the computation of a table needs.
+
+    nodes: number of nodes of the table. bytes: memory.
+    """
 
     snapshots: int
     nodes: int
@@ -79,7 +82,10 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """Yield an executor with `count` local processes; an exception kills them immediately."""
+    """Yield an executor with `count` processes of this machine.
+
+    If an exception leaves the context, the processes are stopped without finishing their jobs.
+    """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     executor = ProcessPoolExecutor(count, context, initializer=_init_worker, initargs=(stop,))
@@ -93,7 +99,7 @@ def local_processes(count: int) -> Iterator[Executor]:
 
 
 stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
-"""Function that returns, in a worker, whether the current job must stop."""
+"""Function that tells a worker whether the current job must stop."""
 
 
 def _init_worker(stop: Event) -> None:
@@ -104,8 +110,8 @@ def _init_worker(stop: Event) -> None:
 def _exit_on(stop: Event) -> None:
     """Exit the worker process when `stop` is set.
 
-    A job cannot be stopped sooner than after one depth, up to a minute. Finished results are not
-    lost, because the parent process stores them.
+    This is necessary because a job checks for a stop only after each push depth, which takes up to
+    a minute. Finished results are not lost, because the parent process stores them.
     """
     stop.wait()
     os._exit(0)
@@ -130,12 +136,12 @@ class LostWorkersError(WorkersError):
 
 
 def code_version() -> str:
-    """Return the combined version of the code that computes a snapshot."""
+    """Return the version of the code that computes snapshots, combined from those of its parts."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
 def make_table_cache(spec: TableSpec) -> Specification[Table]:
-    """Return the cache specification of a nonlinear table."""
+    """Describe how a nonlinear table is stored in the cache."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
     )
@@ -152,9 +158,9 @@ def compute_table(
 ) -> Table:
     """Load the cached table, or compute and store it.
 
-    model: linear response of the same body. workers: number of the executor's workers on this
-    machine. Raises MemoryError, before any snapshot is solved, if the machine has too little memory
-    for these workers; other errors as `cached` and `solve_all`.
+    model: linear response of the same body. workers: how many workers of the executor run on this
+    machine. Raises MemoryError, before any snapshot is solved, if this machine has too little
+    memory for them, and the errors of `cached` and `solve_all`.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -186,7 +192,7 @@ def _compute_table(
     progress(0, total, need)
     precompute.require_memory(
         need.bytes,
-        f"the soft body's table ({need.text()})",
+        f"computing the nonlinear table of the soft body ({need.text()})",
         f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
     )
     jobs = [
@@ -227,10 +233,11 @@ def solve_all(
     checkpoints: CheckpointStore,
     on_progress: Callable[[int], None],
 ) -> list[snapshots.Snapshot]:
-    """Return the jobs' snapshots, loaded from checkpoints or solved.
+    """Return the snapshots of the jobs, loaded from `checkpoints` or solved and stored there.
 
-    on_progress: called with the number of finished snapshots; may raise to cancel the pending jobs.
-    Raises LostWorkersError if the executor loses its workers, and the errors of the jobs.
+    on_progress: called with the number of finished snapshots; it may raise an exception to cancel
+    the pending jobs. Raises LostWorkersError if the executor loses its workers, and the errors of
+    the jobs.
     """
     solved: dict[int, snapshots.Snapshot] = {}
     for number in range(len(jobs)):
@@ -252,8 +259,9 @@ def solve_all(
                     snapshot = future.result()
                 except CancelledError as error:
                     raise LostWorkersError(
-                        "the workers that solve the snapshots were lost; restart them and repeat "
-                        "the command, which continues from the finished snapshots"
+                        "the worker processes that solve snapshots for the soft body's table were "
+                        "lost; restart them and repeat the command, which continues from the "
+                        "finished snapshots"
                     ) from error
                 checkpoints.save(f"push-{number:04d}", encode_fields(snapshot))
                 solved[number] = snapshot

@@ -1,7 +1,7 @@
-"""Solve the reference solutions of the soft-body benchmark, and tables around a single point.
+"""Compute reference solutions for the soft-body benchmark, and tables around a single point.
 
-Both consist of Newton solutions at and near one surface point. Worker processes solve them, and the
-cache stores them.
+Both consist of solutions of Newton's method for pushes at or near one surface point. Worker
+processes compute them, and the cache stores them.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSolution:
-    """Solution of a push on one mesh, with a locator on its surface; name: description."""
+    """Solution of a push on one mesh.
+
+    name: description of the mesh. locator: search structure for points on its surface.
+    """
 
     name: str
     sample: SamplePoint
@@ -54,12 +57,15 @@ class ReferenceSolution:
     locator: SurfaceLocator
 
     def reaches(self, depth_m: float) -> bool:
-        """Return whether the solution converged at a depth."""
+        """Return whether the solution converged at a push depth."""
         depths = self.snapshot.depths_m[: self.snapshot.reached]
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3) of skin points (q, 3) and the normal force for 1 Pa."""
+        """Return the displacement (q, 3) of skin points (q, 3) and the normal force for 1 Pa.
+
+        depth_m: push depth, one of those of the snapshot.
+        """
         level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
         nodes, weights = self.locator.weights(points)
         displacement: Floats = np.einsum("qa,qai->qi", weights, self.snapshot.moved[level][nodes])
@@ -69,9 +75,10 @@ class ReferenceSolution:
 def select_references(
     references: Sequence[ReferenceSolution], depth_m: float
 ) -> list[ReferenceSolution]:
-    """Return the references that converged at a depth, the most accurate first.
+    """Return the references that converged at a push depth, the most accurate first.
 
-    Errors are relative to the first; its difference from the second is its uncertainty.
+    Errors of methods are measured against the first one. Its difference from the second one is
+    taken as its uncertainty.
     """
     return [reference for reference in references if reference.reaches(depth_m)]
 
@@ -79,9 +86,10 @@ def select_references(
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job of a push on a mesh with a skin spacing of `ratio` finger radii.
+    """Return the job for a push, with a skin spacing of `ratio` finger radii near the finger.
 
-    Only the skin near the finger has this spacing if the shape supports focused meshes.
+    If the shape does not support meshes that are fine only near the finger, all touchable skin has
+    this spacing.
     """
     spacing = ratio * scene.finger.radius_m
     spec = replace(body.spec.mesh, skin_spacing_m=spacing)
@@ -99,7 +107,7 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job of a push on a mesh with the same spacing on all touchable skin."""
+    """Return the job for a push, on a mesh with the same spacing on all touchable skin."""
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -113,7 +121,10 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Return the jobs' snapshots, from the cache or solved; the cache key is the job's digest."""
+    """Return the snapshots of the jobs, from the cache or solved.
+
+    The name of a cache file is a digest of the job.
+    """
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]
     missing = [number for number, name in enumerate(names) if cache.load(name) is None]
@@ -151,9 +162,9 @@ def _digest(*jobs: SnapshotJob) -> str:
 
 
 class LocalTable:
-    """Nonlinear table of a body that is filled only near one point.
+    """Nonlinear table of a body that is filled only near one surface point.
 
-    Its values there equal those of the full table; `jobs` are the few snapshots that they need.
+    Its values there equal those of the full table, but it needs only the few snapshots of `jobs`.
     """
 
     def __init__(
@@ -185,7 +196,7 @@ class LocalTable:
         ]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
-        """Return the body with the table built from the snapshots of `jobs`."""
+        """Build the table from the snapshots of `jobs` and return the body with it."""
         response, radius = self._model.response, self._scene.finger.radius_m
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius
@@ -217,7 +228,7 @@ class LocalTable:
 def load_full_table(
     body: SceneBody, scene: Scene, model: SoftBodyModel, cache_dir: Path
 ) -> SceneBody | None:
-    """Return the body with its full table, or None if that is not cached."""
+    """Return the body with its full nonlinear table, or None if the cache does not contain it."""
     table = load_cached(make_table_cache(make_table_spec(scene, body.spec)), cache_dir)
     return None if table is None else attach_table(body, scene, model, table)
 

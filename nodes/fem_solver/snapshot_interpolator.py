@@ -1,8 +1,9 @@
-"""Interpolate snapshots between their sample points, in order to fill a table.
+"""Interpolate snapshots between their sample points, in order to fill a nonlinear table.
 
-Near the finger, the displacement field of a snapshot is transported: shifted and rotated from the
-solved sample point to the new one. Far from the finger it is not transported, because the body's
-ends and supports do not move with the finger.
+A snapshot is the solution for pushes at one sample point to several depths. Near the finger, its
+displacement field is transported: shifted and rotated from the solved sample point to the new one.
+Far from the finger it is not transported, because the ends and supports of the body do not move
+with the finger.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ field falls from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""Relative ridge penalty on the slopes of the local fit, which may be underdetermined."""
+"""Relative ridge penalty on the slopes of the local fit, which may otherwise be underdetermined."""
 FACE_COORDINATES = np.array(
     [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
 )
-"""Local coordinates (6, 2) of the six-node triangle's nodes."""
+"""Local coordinates (6, 2) of the nodes of a six-node triangle."""
 
 
 class SurfaceLocator:
-    """Search for the skin points of a mesh nearest to given points."""
+    """Search structure that finds the skin points of a mesh nearest to given points."""
 
     def __init__(self, rest: Floats, faces: Ints) -> None:
-        """Build the search tree for skin nodes `rest` (s, 3) and six-node faces (f, 6)."""
+        """Build the search tree for undeformed skin nodes `rest` (s, 3) and their faces (f, 6)."""
         from scipy.spatial import cKDTree
 
         self._faces = faces
@@ -51,7 +52,10 @@ class SurfaceLocator:
         self._sides, self._inverse = sides, gram @ sides
 
     def weights(self, points: Floats) -> tuple[Ints, Floats]:
-        """Return nodes and shape functions (q, 6) at the skin nearest to points (q, 3)."""
+        """Find the skin nearest to points (q, 3).
+
+        Returns the nodes (q, 6) of the nearest faces and the shape functions (q, 6) there.
+        """
         _, near = self._tree.query(points, k=CANDIDATES)
         offset = points[:, None] - self._origin[near]
         local = np.einsum("qkij,qkj->qki", self._inverse[near], offset)
@@ -67,7 +71,10 @@ class SurfaceLocator:
 
 
 def minimal_rotation(start: Floats, end: Floats) -> Floats:
-    """Return the rotation (3, 3) of minimum angle between unit vectors (3,), not opposite."""
+    """Return the rotation (3, 3) of minimum angle from the unit vector `start` to `end` (3,).
+
+    The vectors must not be opposite.
+    """
     axis = np.cross(start, end)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + start @ end))
@@ -75,7 +82,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """Snapshot with its sample point and a locator on its mesh."""
+    """Snapshot with its sample point and a search structure for its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot
@@ -83,25 +90,29 @@ class PlacedSnapshot:
 
 
 class SnapshotInterpolator:
-    """Interpolator of snapshots between sample points (transported moving least squares)."""
+    """Interpolator of snapshots between sample points.
+
+    It combines transported displacement fields with weights from moving least squares.
+    """
 
     def __init__(
         self, solved: Sequence[PlacedSnapshot], towards_user: Floats, radius_m: float
     ) -> None:
-        """Store the solved snapshots, all with the same depths.
+        """Store the solved snapshots, which must all have the same depths.
 
-        towards_user (3,): a direction less than 180 degrees from all normals. radius_m: radius of
-        the finger.
+        towards_user (3,): direction that is not opposite to any normal. radius_m: radius of the
+        finger.
         """
         self._solved, self._user, self._radius = solved, towards_user, radius_m
         self._points = np.array([one.sample.point for one in solved])
         self.depths_m = solved[0].snapshot.depths_m
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Floats32, Floats, float]:
-        """Return the interpolated snapshot at a sample point.
+        """Interpolate the snapshots at a new sample point.
 
-        rest (s, 3): skin nodes. Returns the displacement (k, s, 3), the force (k, 3) for 1 Pa, and
-        the weighted mean of the neighbours' numbers of converged depths.
+        rest (s, 3): undeformed skin nodes. Returns the displacement (k, s, 3) and the force (k, 3)
+        for 1 Pa at k depths. The last result is the number of depths that converged, as a weighted
+        mean over the snapshots used.
         """
         weights = self.neighbour_weights(sample)
         moved: Floats32 | None = None
@@ -118,7 +129,7 @@ class SnapshotInterpolator:
         return moved, force, reached
 
     def neighbour_weights(self, sample: SamplePoint) -> list[tuple[int, float]]:
-        """Return the numbers of the solved snapshots near a point and their weights; the sum is 1.
+        """Return indices and weights of the snapshots near a sample point; the weights add up to 1.
 
         The weights are those of linear moving least squares over the surface (Lancaster &
         Salkauskas 1981).
@@ -163,14 +174,17 @@ class SnapshotInterpolator:
 
 
 def _tangents(towards_user: Floats) -> list[int]:
-    """Return the two coordinate axes most perpendicular to the direction to the user."""
+    """Return the indices of the two axes that are most nearly perpendicular to a direction."""
     return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
 
 
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots and their mirror images, without duplicates on mirror planes."""
+    """Return the snapshots and their mirror images, without duplicates on planes of symmetry.
+
+    mirrors: symmetries of the body, as returned by `snapshots.find_mirror_planes`.
+    """
     placed: dict[tuple[int, ...], PlacedSnapshot] = {}
     for sample, snapshot in zip(samples, solved, strict=True):
         for signs in mirrors:

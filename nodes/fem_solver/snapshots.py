@@ -1,7 +1,9 @@
-"""Define and solve the neo-Hookean snapshots of a table.
+"""Define and solve the snapshots from which the nonlinear table of a soft body is built.
 
-Snapshots are solved for a Young's modulus of 1 Pa, because the modulus only scales the forces. A
-job contains all its inputs as arrays, so that another process or machine can solve it.
+A snapshot is the solution for pushes at one surface point (sample point) to several depths, for a
+neo-Hookean material. It is solved for a Young's modulus of 1 Pa, because the modulus only scales
+the forces. A job contains all inputs of a snapshot as arrays, so that another process or machine
+can solve it.
 """
 
 from __future__ import annotations
@@ -30,18 +32,19 @@ Bools = NDArray[np.bool_]
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
 SPACING_RATIO = 0.35
-"""Skin spacing of the mesh at the push, in finger radii."""
+"""Distance between skin nodes near the push, in finger radii."""
 NEAR_RATIO = 1.5
-"""Distance from the push within which the mesh has this spacing, in finger radii."""
+"""Distance from the push within which skin nodes have this spacing, in finger radii."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
-"""Positions of the sample points along a cylinder's axis, over half its length."""
+"""Positions of the sample points along the axis of a cylinder, as fractions of half its length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
-"""Angle between sample points around a cylinder, and angle of the last one from the edge of the
+"""Angle between sample points around a cylinder, and angle between the last one and the edge of the
 touchable skin."""
 APART_RATIO, RIM_RATIO = 2.2, 0.9
-"""Other shapes: distances between sample points, and from untouchable skin, in finger radii."""
+"""For other shapes: distance between sample points, and their minimum distance from skin that
+cannot be touched, in finger radii."""
 TOLERANCE, MIN_STEP_FRACTION = 1e-5, 0.25
-"""Solver tolerance and minimum step, looser than for a reference solution."""
+"""Tolerance and minimum fraction of a load step, looser than for a reference solution."""
 SAME_RATIO = 1e-6
 
 
@@ -61,7 +64,8 @@ class SamplePoint:
 class SnapshotJob:
     """Input of a snapshot: pushes at one sample point to several depths.
 
-    nodes (n, 3), elements (e, 10), fixed (n,). faces (f, 6): faces that the finger can touch.
+    nodes (n, 3), elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
+    six-node triangles that the finger can touch.
     """
 
     nodes: Floats
@@ -78,9 +82,9 @@ class SnapshotJob:
 class Snapshot:
     """Solution of a job.
 
-    rest (s, 3): skin nodes. faces (f, 6): six-node triangles. moved (k, s, 3): skin displacement at
-    the depths (k,). force_n (k, 3): force on the finger for 1 Pa. reached: number of converged
-    depths; deeper entries repeat the last converged solution.
+    rest (s, 3): undeformed skin nodes. faces (f, 6): six-node triangles of the skin. moved (k, s,
+    3): skin displacement at the push depths `depths_m` (k,). force_n (k, 3): force on the finger
+    for 1 Pa. reached: number of converged depths; deeper entries repeat the last converged one.
     """
 
     rest: Floats
@@ -92,9 +96,10 @@ class Snapshot:
 
 
 def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
-    """Solve a job.
+    """Compute the snapshot that a job describes.
 
-    Raises SnapshotCancelledError when `stopped` returns true; other errors as `NeoHookeanBody`.
+    stopped: function that returns true to cancel the solution. Raises SnapshotCancelledError if it
+    does, and the errors of `NeoHookeanBody`.
     """
     from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late: scipy is slow to import
 
@@ -132,13 +137,14 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
 
 def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
-    """Return the sign vectors (3,) of the body's mirror symmetries across x and y.
+    """Find the mirror symmetries of a body about its planes x = 0 and y = 0.
 
-    The identity is first. Both the body and its support must be symmetric.
+    Both the body and its support must be symmetric. Returns one vector (3,) for each symmetry, with
+    -1 for mirrored coordinates; the first is the identity (1, 1, 1).
     """
     from scipy.spatial import cKDTree
 
-    # Inner nodes of a symmetric body need not be symmetric, so only these nodes are compared.
+    # Inner nodes of a symmetric body may be asymmetric: compare touchable and fixed nodes only.
     some = np.union1d(mesh.contact_nodes, np.flatnonzero(mesh.fixed))
     points, is_fixed = mesh.nodes[some], mesh.fixed[some]
     tree, same = cKDTree(points), SAME_RATIO * float(np.ptp(points, axis=0).max())
@@ -155,9 +161,9 @@ def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
 def choose_sample_points(
     spec: MeshSpec, mesh: SolidMesh, mirrors: list[Floats], radius_m: float
 ) -> list[SamplePoint]:
-    """Return sample points that, with their mirror images, cover the touchable skin.
+    """Choose sample points that, with their mirror images, cover the touchable skin.
 
-    radius_m: radius of the finger.
+    mirrors: symmetries, as returned by `find_mirror_planes`. radius_m: radius of the finger.
     """
     if isinstance(spec.geometry, Cylinder):
         return _choose_cylinder_points(spec.geometry, spec.touch_angle_rad, mirrors)
@@ -174,7 +180,7 @@ def choose_sample_points(
         inner = chosen & (rim > RIM_RATIO * radius_m)
         chosen = inner if inner.any() else chosen
     points, normals = points[chosen], normals[chosen]
-    # Farthest point sampling.
+    # Repeatedly add the point that is farthest from all chosen points (farthest point sampling).
     numbers = [int((points @ np.array(spec.towards_user)).argmax())]
     distances = np.linalg.norm(points - points[numbers[0]], axis=1)
     while distances.max() > APART_RATIO * radius_m:
@@ -209,10 +215,10 @@ def make_snapshot_job(
     finger_radius_m: float,
     spacing_m: float | None = None,
 ) -> SnapshotJob:
-    """Return the job of pushes at a sample point to the depths of a table.
+    """Return the job for pushes at a sample point to the depths `DEPTHS_M` of a table.
 
-    The mesh is focused on the push if the shape supports that; otherwise it is `mesh`. spacing_m:
-    skin spacing of a focused mesh; None for that of a table.
+    If the shape supports it, the job has a new mesh that is fine near the push; otherwise it uses
+    `mesh`. spacing_m: skin spacing of the new mesh; None for that of a table.
     """
     geometry, support = spec.geometry, spec.support
     if isinstance(geometry, Cylinder) and isinstance(support, StripSupport):
@@ -246,7 +252,7 @@ def make_job_on_mesh(
     finger_radius_m: float,
     depths_m: tuple[float, ...],
 ) -> SnapshotJob:
-    """Return the job of pushes at a sample point on the given mesh."""
+    """Return the job for pushes at a sample point with the given mesh."""
     return SnapshotJob(
         nodes=mesh.nodes,
         elements=mesh.elements,
@@ -262,7 +268,10 @@ def make_job_on_mesh(
 def reflect_snapshot(
     snapshot: Snapshot, sample: SamplePoint, signs: Floats
 ) -> tuple[Snapshot, SamplePoint]:
-    """Return the mirror image of a snapshot and of its sample point; signs (3,)."""
+    """Return the mirror image of a snapshot and of its sample point.
+
+    signs (3,): -1 for the coordinates that are mirrored, otherwise 1.
+    """
     faces = snapshot.faces
     if signs.prod() < 0.0:
         faces = faces[:, [0, 2, 1, 5, 4, 3]]
@@ -277,5 +286,5 @@ def reflect_snapshot(
 
 
 def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
-    """Return the snapshot from arrays that `flexsheet.nodes.cache.encode_fields` made."""
+    """Return the snapshot that `flexsheet.nodes.cache.encode_fields` converted to arrays."""
     return Snapshot(reached=int(content.pop("reached")), **content)

@@ -1,4 +1,7 @@
-"""Build a scene's soft body, with the linear method or the nonlinear table, cached or computed."""
+"""Build the soft body of a scene, with the linear method or the nonlinear table.
+
+Precomputed data is loaded from the cache, or computed and stored there.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +19,20 @@ from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""Method, or `auto`: the nonlinear table if it is cached, else linear."""
+"""Soft-body method, or `auto`: the nonlinear table if it is cached, otherwise linear."""
 
 SKIN_SPACING_M = 0.003
-"""Default skin spacing without a parameter and a scene setting."""
+"""Distance between skin nodes if neither a parameter nor the scene specifies it."""
 
 
 def choose_method(
     scene: Scene, method: MethodChoice, skin_spacing_m: float | Literal["auto"]
 ) -> tuple[MethodChoice, float]:
-    """Return method and skin spacing (m) for a scene and a node's parameters.
+    """Return the method and the skin spacing (m), given a scene and the parameters of a node.
 
-    With `auto`, the scene's choice of the linear method applies even if a table is cached. The
-    scene's choice of the table never starts its computation, which takes minutes; only the
-    parameter does.
+    method, skin_spacing_m: parameters; `auto` leaves the choice to the scene. If the scene chooses
+    the linear method, that is used even if a table is cached. If it chooses the table, the table is
+    used if it is cached; only the parameter starts its computation, which takes minutes.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -41,11 +44,11 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """Factory of soft bodies that caches the last model in memory.
+    """Builder of soft bodies that keeps the last precomputed model in memory.
 
-    workers: number of processes for a table, 0: one per core. scheduler: address of a dask
-    scheduler whose workers compute the table instead. All methods take seconds to minutes when the
-    cache is empty.
+    workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
+    dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
+    all methods take seconds to minutes.
     """
 
     skin_spacing_m: float
@@ -60,7 +63,7 @@ class SoftBodyFactory:
     def bodies(
         self, scene: Scene, method: MethodChoice, progress: precompute.Progress
     ) -> list[body.SceneBody]:
-        """Return the soft body with each available method, the best first.
+        """Build the soft body of a scene once for each available method, the best method first.
 
         Raises the errors of `load_or_compute` and `build_scene_body`.
         """
@@ -76,7 +79,7 @@ class SoftBodyFactory:
             max_depth_m=self.max_depth_m,
             friction_ratio=self.friction_ratio,
         )
-        # The table has no tangential response.
+        # The table cannot represent a sticking finger: it contains no tangential response.
         if method == "linear" or spec.sticking:
             return [linear]
         table = load_cached(
@@ -89,9 +92,10 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:
-        """Return the last model if it is of this body, else load or compute it.
+        """Return the last model if it has the same inputs, otherwise load or compute it.
 
-        An abandoned thread may concurrently replace the last model, so it is read only once.
+        Another thread, whose result is no longer needed, may replace `_model` at any time.
+        Therefore it is read only once.
         """
         last, key = self._model, spec.key()
         if last is None or last[0] != key:
@@ -101,7 +105,10 @@ class SoftBodyFactory:
     def pending_note(
         self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]
     ) -> str:
-        """Return a note that the scene's nonlinear table is not computed yet, or an empty text."""
+        """Return a note for the user if the scene's nonlinear table is missing, else an empty text.
+
+        made: bodies that `bodies` returned.
+        """
         choice = scene.methods.soft_body
         waits_for_table = (
             choice is not None and choice.method == "nonlinear_table" and method == "auto"
@@ -109,16 +116,17 @@ class SoftBodyFactory:
         if not waits_for_table or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
         return (
-            "; the scene's nonlinear table is not computed yet (flexsheet precompute SCENE "
-            f"--skin-spacing {self.skin_spacing_m:g})"
+            "; the scene's nonlinear table is not computed yet; run flexsheet precompute SCENE "
+            f"--skin-spacing {self.skin_spacing_m:g}"
         )
 
     def build_table(
         self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress
     ) -> body.SceneBody:
-        """Compute and cache the nonlinear table and return the body with it.
+        """Compute and cache the nonlinear table, and return the body that uses it.
 
-        Errors as `compute_table` and `connect_workers`.
+        linear: body with the linear method. Raises the errors of `compute_table` and
+        `connect_workers`.
         """
         model = self._load_model(linear.spec, progress)
         with self._executor() as (executor, workers):
@@ -134,7 +142,7 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor for snapshots and the number of its workers on this machine."""
+        """Yield the executor that solves snapshots, and how many of its workers run here."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # late: it is slow to import
@@ -152,4 +160,4 @@ FACTORY_PARAMETERS = {one.name for one in fields(SoftBodyFactory) if one.init} -
     "cache_dir",
     "skin_spacing_m",
 }
-"""Node parameters that are passed to the factory unchanged."""
+"""Names of the node parameters that are passed to the factory unchanged."""

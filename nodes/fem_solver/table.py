@@ -1,14 +1,15 @@
 """Compute the response to pushes from a precomputed nonlinear table.
 
-The table contains the displacement of the whole skin and the force for a push at every touchable
-node, at several depths. The mesh's shape functions interpolate between nodes, and cubics with a
-continuous slope between depths. The response is therefore a continuous function of the finger's
-position. It reads 24 rows: six nodes at four depths. (A proper orthogonal decomposition over depth
-needs nine of thirteen modes for an error of 0.1 mm, because the contact area grows with depth. That
-would read more.)
+For pushes at every touchable node to several depths, the table contains the force and the
+displacement of the skin (the surface of the body). Shape functions of the mesh interpolate
+between nodes, and cubics with a continuous slope between depths. The response is therefore a
+continuous function of the finger's position. One response reads 24 rows of the table: six nodes at
+four depths. (A proper orthogonal decomposition over depth would have to read more. It needs nine of
+thirteen modes for an error of 0.1 mm, because the contact area grows with depth.)
 
-The table is filled with Newton solutions (snapshots) at some tens of sample points, interpolated to
-the nodes between them (`snapshot_interpolator`). At small depths the linear method fills it.
+The table is filled with solutions of Newton's method, called snapshots, at some tens of sample
+points. They are interpolated to the other nodes (`snapshot_interpolator`). At small depths the
+linear method is used instead.
 """
 
 from __future__ import annotations
@@ -44,26 +45,27 @@ Ints = NDArray[np.int64]
 LINEAR_DEPTHS_M = (0.0007,)
 """Depths of the table in addition to those of the snapshots."""
 BLEND_M = (0.0007, 0.0015)
-"""Depths between which the table changes from the linear response to the snapshots."""
+"""Range of depths over which the table changes from the linear response to the snapshots."""
 MIN_COSINE = -0.25
-"""Minimum cosine between the normals of a skin triangle when deformed and at rest."""
+"""Minimum cosine of the angle between the deformed and the undeformed normal of a skin triangle."""
 END_SPAN_M = 0.00125
-"""Distance between the end of the method's range and the deepest solution; deeper pushes are
-saturated to the deepest solution."""
+"""Distance from the end of the valid range to the depth of the deepest solution. Deeper pushes
+approach the deepest solution."""
 FADE_RATIO = 2.0
-"""Distance past the end of the touchable skin over which the deflection fades to zero, in finger
+"""Distance past the end of the touchable skin over which the displacement fades to zero, in finger
 radii."""
 CANDIDATE_FACES = 4
 Progress = Callable[[int, int], None]
-"""Callback with (done, total) nodes."""
+"""Callback with the number of nodes done and their total."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Responses to pushes at the m contact nodes, at L depths, for 1 Pa.
+    """Responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
 
-    depths_m (L,): the first is 0. fields (m, L - 1, 3 s) float32: skin displacement at all depths
-    except 0. force_n (m, L, 3). reach_m (m,): maximum depth with a valid solution at each node.
+    depths_m (L,): push depths; the first is 0. fields (m, L - 1, 3 s) float32: displacement of the
+    s skin nodes at all depths except 0. force_n (m, L, 3): force on the finger. reach_m (m,):
+    maximum depth with a valid solution at each contact node.
     """
 
     depths_m: Floats
@@ -73,7 +75,10 @@ class Table:
 
 
 def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
-    """Return the memory of a table, bytes; depths: number of depths of a snapshot."""
+    """Return the memory that a table needs, bytes.
+
+    loads: number of contact nodes. depths: number of depths of a snapshot.
+    """
     return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
@@ -84,10 +89,11 @@ def fill_table(
     interpolator: SnapshotInterpolator,
     on_progress: Progress,
 ) -> Table:
-    """Return the table of a body.
+    """Compute the table of a body.
 
-    triangles (t, 3): of its skin. linear: method of the same response for 1 Pa, linear at all
-    depths of the table. on_progress: called with (done, total) nodes; may raise to stop.
+    triangles (t, 3): triangles of its skin. linear: linear method for the same response and a
+    modulus of 1 Pa; its linear range must contain all blended depths. on_progress: called with the
+    number of nodes done and their total; it may raise an exception to stop.
     """
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
     points, normals = response.rest[response.contact_nodes], response.normals
@@ -114,7 +120,11 @@ def _fill_levels(
     interpolator: SnapshotInterpolator,
     depths: Floats,
 ) -> tuple[Floats32, Floats, float]:
-    """Return displacement (L, 3 s) and force (L, 3) at the depths, and the maximum depth, m."""
+    """Compute the table entries of one contact node.
+
+    Returns the displacement (L, 3 s) and the force (L, 3) at the L depths, and the maximum depth
+    (m) with a valid solution.
+    """
     moved = np.zeros((len(depths), response.rest.size), dtype=np.float32)
     force = np.zeros((len(depths), 3))
     solved, pushed, reached = interpolator.interpolate(sample, response.rest)
@@ -133,13 +143,13 @@ def _fill_levels(
 
 
 class CubicInterpolator:
-    """C1 cubic interpolator over increasing depths.
+    """Cubic interpolator over increasing depths, with continuous slope.
 
-    The slope at a depth is that of the parabola through it and its two neighbours.
+    The slope at a depth is that of the parabola through its value and the two neighbouring values.
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """Precompute the cubics for depths (L,), L >= 4."""
+        """Precompute the cubics for at least four depths (L,)."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)
@@ -155,17 +165,22 @@ class CubicInterpolator:
             self._powers.append(np.array(rows)[:, first : first + 4])
 
     def weights_at(self, depth_m: float) -> tuple[int, Floats]:
-        """Return the index of the first of four depths and their weights (4,) at a depth."""
+        """Return the four weights (4,) that interpolate at a depth.
+
+        They apply to four successive depths, the index of the first of which is returned before
+        them.
+        """
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
         return self._first[level], np.array([1.0, t, t * t, t * t * t]) @ self._powers[level]
 
 
 def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int32]) -> int:
-    """Return the number of leading depth levels of a skin displacement (L, s, 3) that are valid.
+    """Count the depths, from the shallowest, at which an interpolated skin displacement is valid.
 
-    A level is valid if no triangle is rotated farther than `MIN_COSINE`. Transport past an edge of
-    the skin can rotate triangles farther.
+    rest (s, 3): undeformed skin nodes. moved (L, s, 3): displacement at each depth. A depth is
+    valid if no triangle is rotated by more than the angle whose cosine is `MIN_COSINE`. The
+    interpolation of snapshots can rotate triangles farther next to an edge of the skin.
     """
 
     def normals(points: Floats) -> Floats:
@@ -183,9 +198,10 @@ def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int3
 
 
 def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
-    """Return the distance (m) of a point (3,) from a triangle's edges, and the nearest edge point.
+    """Return the distance (m) between a point (3,) and the edges of a triangle.
 
-    corners (3, 3). The nearest point is in local coordinates (2,).
+    corners (3, 3): corners of the triangle. Also returns the nearest point on the edges, in local
+    coordinates (2,) of the triangle.
     """
     starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
     along = np.clip(
@@ -200,7 +216,7 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 
 
 class TableSoftBody:
-    """`SoftBodyMethod` that interpolates a nonlinear table."""
+    """Soft-body method (`SoftBodyMethod`) that interpolates in a nonlinear table."""
 
     name = "nonlinear_table"
 
@@ -217,7 +233,8 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds: as in `LinearSoftBody`. linear_depth_m: depth at which the stiffness is evaluated.
+        bounds (b, 3): positions of skin nodes that must not be touched. push_depth_m: depth at
+        which the force curve ends. linear_depth_m: depth at which the stiffness is evaluated.
         """
         from scipy.linalg.blas import sgemv
         from scipy.spatial import cKDTree
@@ -252,7 +269,7 @@ class TableSoftBody:
         self._reach_and_bound = np.column_stack([self.reach_m, np.minimum(bound_distance, 1.0)])
 
     def respond(self, query: ContactQuery) -> Response:
-        """Return the response to a contact."""
+        """Compute the response of the skin to a contact."""
         nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
@@ -285,11 +302,12 @@ class TableSoftBody:
         )
 
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
-        """Return the face nodes (6,) and shape functions (6,) at the nearest touchable point.
+        """Find the point of the touchable skin that is nearest to a surface point (3,).
 
-        Also returns the distance (m) of the surface point (3,) from the touchable skin.
+        Returns the nodes (6,) of its face, the shape functions (6,) there, and the distance (m) of
+        the surface point from the touchable skin.
         """
-        # Squared distances without the common term.
+        # Squared distances, without the square of `surface`, which all have in common.
         squared = self._centre_squares - self._centres @ (2.0 * surface)
         tried = squared.argpartition(CANDIDATE_FACES)[:CANDIDATE_FACES].tolist()
         every = (self._across @ surface).reshape(-1, 2) - self._offset
@@ -305,18 +323,18 @@ class TableSoftBody:
                 triangle_shape_functions(inner),
                 max(0.0, off - self._sag),
             )
-        # One Newton step from the flat face's coordinates to those of the curved face.
+        # Correct the coordinates on the flat face to those on the curved face by one Newton step.
         left = surface - np.array(triangle_shape_functions_at(a, b)) @ self._corners[best]
         a_left, b_left = (self._inverse[best] @ left).tolist()
         weights = np.array(triangle_shape_functions_at(a + a_left, b + b_left))
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force over depth (N/m) at `linear_depth_m`, near `surface` (3,)."""
+        """Return force / depth (N/m) at `linear_depth_m`, near the point `surface` (3,)."""
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force curve near `surface` (3,), as `SoftBodyMethod`."""
+        """Return the force curve near `surface` (3,), see `SoftBodyMethod.force_curve`."""
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 
@@ -326,7 +344,10 @@ class TableSoftBody:
         return result
 
     def _curve(self, number: int, normal: Floats) -> Floats:
-        """Return the non-decreasing normal force of a contact node at the depths of the curve."""
+        """Return the normal force (N) of a contact node at the depths of the force curve.
+
+        The force never decreases with depth.
+        """
         reach = float(self.reach_m[number])
         bent = np.array([saturate_depth(float(d), reach - END_SPAN_M, reach) for d in self._depths])
         along = self._force[number] @ normal

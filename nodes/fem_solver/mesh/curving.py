@@ -1,4 +1,4 @@
-"""Move the midpoints of boundary edges to the true surface where the elements remain valid."""
+"""Curve boundary edges: move their midpoints to the true surface if the elements remain valid."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MAX_SAG_RATIO = 0.25
-"""Maximum displacement of an edge's midpoint over the edge's length. A farther surface point is on
-another side of a thin part."""
+"""Maximum displacement of the midpoint of an edge, divided by the length of the edge. A surface
+point farther away is on another side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
     """Return the nodes (n, 3) with midpoints of boundary edges moved to the nearest surface points.
 
-    elements (e, 10): with straight edges. The edges of an element are left straight if its Jacobian
-    would fall below `MIN_JACOBIAN_RATIO` of the straight element's.
+    elements (e, 10): elements with straight edges. nearest: function that returns the nearest
+    surface points. The edges of an element remain straight if its Jacobian determinant would fall
+    below `MIN_JACOBIAN_RATIO` times that of the straight element.
     """
     middles = np.unique(boundary_faces(elements)[:, 3:])
     result = nodes.copy()

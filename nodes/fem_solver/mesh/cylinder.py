@@ -1,11 +1,11 @@
 """Mesh a solid cylinder with quadratic tetrahedra, graded towards the side that fingers touch.
 
-The mesh frame has its origin at the cylinder's centre, x along the axis and z away from the
-support. A cross-section of point rings is triangulated (Delaunay) and extruded along x to prisms.
-Each prism is split into three tetrahedra by the order of its vertices' numbers, so that neighbours
-use the same diagonal (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra into
-tetrahedra", 1999). The midpoints of edges on the curved side are on the true cylinder
-(isoparametric elements); all other edges are straight.
+The mesh frame has its origin at the centre of the cylinder, x along the axis and z away from the
+support. A cross-section consists of concentric rings of points. It is triangulated (Delaunay) and
+extruded along x to prisms. Each prism is split into three tetrahedra according to the order of its
+vertex indices, so that neighbours use the same diagonal (Dompierre et al., "How to subdivide
+pyramids, prisms and hexahedra into tetrahedra", 1999). The midpoints of edges on the curved side
+are on the true cylinder (isoparametric elements); all other edges are straight.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ Ints = NDArray[np.int64]
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Growth of the element size per depth below the side."""
+"""Increase of the element size per depth below the curved side (m/m)."""
 RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
-"""Growth of the element size per distance from a focus."""
+"""Increase of the element size per distance from the focus (m/m)."""
 MAX_SIZE_RATIO = 0.35
-"""Maximum element size about a focus, over the radius."""
+"""Maximum element size of a mesh with a focus, as a fraction of the radius."""
 SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """Point of the side around which the mesh is fine.
+    """Point on the curved side around which the mesh is fine.
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
     have the requested size.
@@ -63,25 +63,26 @@ def cylinder_mesh(
 ) -> SolidMesh:
     """Return the mesh of a solid cylinder.
 
-    support_angle_rad: full angle of the fixed strip about -z. touch_angle_rad: half angle of the
-    touchable skin about +z, where the skin nodes are `skin_spacing_m` apart. Elements grow to twice
-    the size at the back and inside, or with the distance from a focus. Raises ValueError for a
-    spacing too coarse for the radius, or for invalid angles.
+    support_angle_rad: full angle of the fixed strip, centred on -z. touch_angle_rad: half angle of
+    the touchable skin, centred on +z. Its nodes are `skin_spacing_m` apart. Elements are larger
+    with depth and up to twice as large at the back; with a focus, their size increases with the
+    distance from it. Raises ValueError for a spacing too coarse for the cylinder, or invalid
+    angles.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
         raise ValueError(
-            f"object.support_angle_rad: {support_angle_rad:g} must be between 0 and 2 pi"
+            f"object.support_angle_rad: {support_angle_rad:g} must be between 0 and 2 pi; change it"
         )
     if touch_angle_rad <= 0.0 or touch_angle_rad > np.pi - half_support + 1e-9:
         raise ValueError(
-            f"touchable half angle: {touch_angle_rad:g} rad must be positive and below the angle "
-            f"of the support, {np.pi - half_support:g} rad; reduce object.support_angle_rad"
+            f"touchable skin: its half angle {touch_angle_rad:g} rad must be positive and must end "
+            f"before the support at {np.pi - half_support:g} rad; reduce object.support_angle_rad"
         )
     if not 0.0 < skin_spacing_m <= 0.25 * min(radius_m, length_m):
         raise ValueError(
-            f"skin_spacing_m: {skin_spacing_m:g} must be positive and at most a quarter of radius "
-            f"({radius_m:g} m) and length ({length_m:g} m)"
+            f"skin_spacing_m: {skin_spacing_m:g} must be positive and at most a quarter of the "
+            f"cylinder's radius ({radius_m:g} m) and length ({length_m:g} m); change it"
         )
     element_m = 2.0 * skin_spacing_m
     sizes = _Sizes(element_m, touch_angle_rad, radius_m, focus)
@@ -105,7 +106,7 @@ def cylinder_mesh(
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """Required edge lengths around and along the cylinder's side."""
+    """Required edge lengths on the curved side, in the circumferential and the axial direction."""
 
     element_m: float
     touch_angle: float
@@ -133,9 +134,9 @@ class _Sizes:
 
 
 def _stations(length_m: float, sizes: _Sizes) -> Floats:
-    """Return the positions of the cross-sections along the axis, including both ends.
+    """Return the x coordinates of the cross-sections, including both ends of the cylinder.
 
-    One cross-section is at the focus, with equal steps on both sides within `near_m`.
+    With a focus, one cross-section is at the focus, and the distances are equal within `near_m`.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -151,9 +152,10 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return angles from `start` to `stop` (excluded) on an arc, spaced by the required sizes.
+    """Return the angles of points on an arc from `start` to `stop` (excluded).
 
-    radius, depth: of the arc, m; the depth is below the cylinder's side.
+    The points are spaced by the required sizes. radius: radius of the arc, m. depth: depth of the
+    arc below the curved side, m.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -162,7 +164,10 @@ def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _
 
 
 def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
-    """Return points with the given density over `fine`, including its first and not its last."""
+    """Return points in the range of `fine`, without its end, spaced according to a density.
+
+    density: required number of points per unit at each of the values `fine`.
+    """
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
     pieces = max(min_count, round(float(total[-1])))
     result: Floats = np.interp(np.arange(pieces) * total[-1] / pieces, total, fine)
@@ -170,7 +175,7 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Yield radius and depth of each ring of points, from the outermost below the side inwards."""
+    """Yield radius and depth of each ring of points below the side, from outside inwards."""
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
@@ -182,9 +187,9 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 
 
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Return points (y, z) and triangles of the cross-section, counter-clockwise seen from +x.
+    """Return the points (y, z) and the triangles of the cross-section.
 
-    Both ends of the support are points.
+    The triangles are counter-clockwise seen from +x. Both ends of the support are points.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
@@ -208,8 +213,9 @@ def _focused_disc(
 ) -> tuple[Floats, Ints]:
     """Return a cross-section as `_disc`, symmetric about the diameter through the focus.
 
-    Only the ends of the support may break the symmetry. In an asymmetric mesh the force on a sphere
-    has a sideways component of some percent, which moves the whole body without friction.
+    Only the ends of the support may break the symmetry. With an asymmetric mesh, the force on the
+    finger would have a sideways component of some percent. Without friction, this force would move
+    the whole body.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -224,7 +230,8 @@ def _focused_disc(
         rim = [_sample_arc(a, b, radius_m, 0.0, sizes) for a, b in itertools.pairwise(stops)]
         rings = [(radius_m, np.concatenate(rim)), *inner]
         off = np.concatenate([_circle(r * (1.0 + SPIRAL * p[1:]), p[1:]) for r, p in rings])
-        # On a spiral, no four points are cocircular, so both halves get the same triangulation.
+        # Triangulate points moved onto a spiral, where no four points are on a common circle. The
+        # triangulation is then unique, and both halves get the same one.
         flat = np.column_stack([0.0 * axis, axis * np.where(axis < 0.0, 1.0 + SPIRAL * np.pi, 1.0)])
         number = np.append(np.arange(len(axis)), count + np.arange(len(off)))
         true = np.concatenate([_circle(np.full(len(p) - 1, r), p[1:]) for r, p in rings])
@@ -240,12 +247,15 @@ def _focused_disc(
 
 
 def _circle(radius: float | Floats, angles: Floats) -> Floats:
-    """Return points (n, 2) at angles (n,) from +z."""
+    """Return points (n, 2), as (y, z), on circles about the origin at angles (n,) from +z."""
     return np.column_stack([radius * np.sin(angles), radius * np.cos(angles)])
 
 
 def _triangles(points: Floats, where: Floats) -> Ints:
-    """Return counter-clockwise triangles (t, 3) of points (n, 2); Delaunay at positions `where`."""
+    """Return counter-clockwise triangles (t, 3) of points (n, 2).
+
+    The Delaunay triangulation is computed with the points at the positions `where` (n, 2).
+    """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
     triangles = Delaunay(where).simplices.astype(np.int64)
@@ -258,9 +268,9 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
-    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section.
+    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the cross-section extruded to `x`.
 
-    The diagonals alternate between slices, so that the solid has no preferred direction.
+    The diagonals alternate between slices, so that the mesh has no preferred direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
@@ -296,7 +306,10 @@ def _finish_mesh(
     half_support: float,
     touch_angle: float,
 ) -> SolidMesh:
-    """Return the 10-node mesh with curved edges on the side, fixed and touchable nodes."""
+    """Return the mesh of 10-node elements, with curved edges on the side, and select its nodes.
+
+    The selection concerns fixed, skin and touchable nodes.
+    """
     nodes, elements = add_midside_nodes(corners, tetrahedra)
     level = np.empty(len(nodes), dtype=np.int64)
     level[: len(corners)] = 2 * layer

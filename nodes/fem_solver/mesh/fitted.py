@@ -1,12 +1,13 @@
-"""Mesh any smooth closed surface by fitting a core of lattice tetrahedra to it.
+"""Mesh the solid inside any smooth closed surface by fitting tetrahedra of a lattice to it.
 
 The method follows Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing
 highly deformable objects with tetrahedra", 2003), on a bisected lattice:
 
-1. The lattice is bisected to the required sizes, and finer where the surface is sharply curved.
-2. Vertices deep enough inside form the core, and all tetrahedra with a core vertex are used. So
-   every tetrahedron has a corner inside and at most one boundary face. Where the boundary touches
-   itself in an edge or a vertex, vertices are removed from the core.
+1. Lattice tetrahedra are bisected to the required sizes, and more where the surface is sharply
+   curved.
+2. Lattice vertices deep enough inside the surface form the core. All tetrahedra with a core vertex
+   are used, so every tetrahedron has a corner inside and at most one boundary face. Where the
+   boundary touches itself in an edge or a vertex (a pinch), vertices are removed from the core.
 3. The boundary is moved to the surface while the element shapes are optimized (`smoothing`).
 
 The method is deterministic. Parts thinner than the smallest elements are omitted.
@@ -39,26 +40,26 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 INITIAL_CELL_RATIO = 2
-"""Width of the cells before bisection over the minimum element size."""
+"""Width of the lattice cells before bisection, divided by the minimum element size."""
 MIN_SIZE_RATIO = 0.5
-"""Minimum element size at sharp curvature, over the minimum size elsewhere."""
+"""Minimum element size at sharp curvature, divided by the minimum size elsewhere."""
 CURVATURE_SIZE_RATIO = 0.8
-"""Element size at sharp curvature, in radii of curvature."""
+"""Maximum element size, divided by the radius of curvature of the surface."""
 SURFACE_DISTANCE_RATIO = 0.5
-"""Maximum distance of a surface tetrahedron's nearest corner from the surface, over its longest
-edge."""
+"""Maximum distance between the surface and the nearest corner of a tetrahedron for which that
+counts as a surface element, divided by its longest edge."""
 CORE_DEPTH_RATIO = 0.4
-"""Minimum depth of the core's vertices below the surface, over their shortest edge."""
+"""Minimum depth of a core vertex below the surface, divided by the shortest edge at the vertex."""
 MAX_THINNED_FRACTION = 0.05
 """Maximum fraction of core vertices that may be removed; otherwise the object is too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
-"""Maximum number of fits. While an element is flatter than `GOOD_RATIO`, its highest core vertex
-is removed and the fit is repeated; the best fit is used."""
+"""Maximum number of fits. If the radius ratio of an element is below `GOOD_RATIO`, its core vertex
+nearest to the surface is removed and the fit is repeated; the best fit is used."""
 
 
 class _SurfaceCache:
-    """Cache of distance, normal and curvature of the surface at lattice vertices."""
+    """Cache of the distance, normal and curvature of the surface, computed at lattice vertices."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
@@ -69,7 +70,10 @@ class _SurfaceCache:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return signed distance (n,), normal (n, 3) and curvature (n,) of the nearest surface."""
+        """Return data of the surface at the points nearest to lattice vertices (n, 3).
+
+        These are the signed distance (n,), the normal (n, 3) and the curvature (n,).
+        """
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
         if new:
@@ -84,10 +88,10 @@ class _SurfaceCache:
 
 
 def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3) and elements (e, 10) of the solid inside the shape's surface.
+    """Return nodes (n, 3) and elements (e, 10) of the solid inside the surface of a shape.
 
-    low_m, high_m (3,): corners of its bounding box. Raises UnfitMeshError for a shape that is too
-    thin for elements of this size.
+    low_m, high_m (3,): corners of the bounding box of the shape. Raises UnfitMeshError for a shape
+    that is too thin for elements of the size that `grading` requires.
     """
     cell = INITIAL_CELL_RATIO * grading.element_m
     field = _SurfaceCache(shape, 0.5 * (low_m + high_m), cell)
@@ -117,21 +121,24 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
         bad = ratios < GOOD_RATIO
         if not bad.any():
             break
-        # The highest core vertex of each bad element is removed.
+        # Remove the core vertex nearest to the surface from each bad element.
         ends = used[cells[bad]]
         height = np.where(core[ends], distance[ends], -np.inf)
         core[ends[np.arange(len(ends)), height.argmax(axis=1)]] = False
     if best is None:
         raise UnfitMeshError(
             f"skin_spacing_m: elements of {grading.element_m:.3g} m that fill the object are too "
-            "distorted; reduce it, or increase object.geometry.smoothing_m"
+            "distorted; reduce skin_spacing_m, or increase object.geometry.smoothing_m"
         )
     nodes, elements = add_midside_nodes(*best)
     return curve_edges(nodes, elements, lambda points: shape.closest(points).point), elements
 
 
 def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
-    """Return sizes (n,), m, limited to `CURVATURE_SIZE_RATIO` radii at curvatures (n,), 1/m."""
+    """Limit element sizes (n,), m, to `CURVATURE_SIZE_RATIO` times the radius of curvature.
+
+    bend (n,): curvatures, 1/m. grading: determines the lower bound of the result.
+    """
     finest = np.maximum(
         CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
     )
@@ -139,7 +146,10 @@ def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> F
 
 
 def hull_faces(tetrahedra: Ints) -> Ints:
-    """Return the corners (f, 3), sorted, of the faces that belong to one tetrahedron only."""
+    """Return the boundary faces (f, 3): those that belong to one tetrahedron only.
+
+    The corner indices of each face are sorted.
+    """
     faces = np.sort(
         tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1
     )
@@ -150,7 +160,7 @@ def hull_faces(tetrahedra: Ints) -> Ints:
 def _cover_with_lattice(
     field: _SurfaceCache, half_m: Floats, grading: Grading
 ) -> tuple[Ints, Ints]:
-    """Return bisected lattice vertices (n, 3) and tetrahedra (e, 4) that cover the solid."""
+    """Return vertices (n, 3) and tetrahedra (e, 4) of a bisected lattice that covers the solid."""
 
     def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
         distance, normals, bend = field.at(vertices)
@@ -163,7 +173,7 @@ def _cover_with_lattice(
         matters = at_surface | (corners.min(axis=1) < 0.0)
         return np.asarray(matters & (length > EDGE_SIZE_RATIO * sizes))
 
-    # One extra layer of cells, because no core vertex may be on the lattice's boundary.
+    # Add one layer of cells, because no core vertex may be on the boundary of the lattice.
     counts = np.ceil(half_m / field.cell_m).astype(np.int64) + 1
     return bisect(*make_lattice((int(counts[0]), int(counts[1]), int(counts[2]))), too_large)
 
@@ -178,9 +188,10 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """Return the tetrahedra (k, 4) around the core, without pinches of their boundary.
+    """Return the tetrahedra (k, 4) with a core vertex, chosen so that the boundary has no pinches.
 
-    Vertices where the boundary touches itself are removed from `core` (n,), in place.
+    Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
+    (n,): signed distance of the vertices from the surface.
     """
     before = int(core.sum())
     while True:
@@ -192,7 +203,8 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
         about = about[core[about]]
         if not len(about) or core.sum() < (1.0 - MAX_THINNED_FRACTION) * before:
             raise UnfitMeshError(
-                "skin_spacing_m: the object is too thin for elements of this size; reduce it"
+                "skin_spacing_m: the object is too thin for elements of twice this size; reduce "
+                "skin_spacing_m"
             )
         core[about[distance[about].argmax()]] = False
 
@@ -210,8 +222,8 @@ def _find_pinches(faces: Ints) -> Ints:
     crowded = np.unique(edges[uses != 2])
     if len(crowded):
         return crowded
-    # Every edge has two faces, so the faces around a vertex form closed fans. In a graph of face
-    # corners connected across edges, each fan is a component; a vertex must have exactly one.
+    # Every edge has two faces, so the faces around a vertex form closed fans. Connect the corners
+    # of faces across edges to a graph: each fan is a component, and a vertex must have only one.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

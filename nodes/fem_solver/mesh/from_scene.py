@@ -1,4 +1,7 @@
-"""Mesh a scene's object: specification, resources and mesh."""
+"""Mesh the virtual object of a scene: specify the mesh, estimate its resources and build it.
+
+The skin is the surface of the object. Its spacing is the distance between neighbouring skin nodes.
+"""
 
 from __future__ import annotations
 
@@ -43,32 +46,34 @@ Ints = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 VERSION = 1
-"""Version of the mesher. Increase it when the mesh for the same specification changes."""
+"""Version of the meshing code. Increase it when the mesh for the same specification changes."""
 TOUCH_MARGIN_RAD = 0.45
-"""Angle by which the touchable skin exceeds the working range's tilt."""
+"""Angle by which the touchable skin extends beyond the maximum tilt of the working range."""
 SLAB_DEPTHS = 2.0
-"""Depth of the slab that represents a half-space, in the working range's push depths."""
+"""Depth of the slab that represents a half-space, over the push depth of the working range."""
 MIN_THICKNESS_SPACINGS = 4.0
-"""Minimum thickness of the object, in skin spacings: two elements."""
+"""Minimum thickness of the object in skin spacings; four spacings are two elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""Peak memory while meshing; `benchmarks.meshing` measures it."""
+"""Peak memory while meshing, per node; `benchmarks.meshing` measures it."""
 SAMPLES = 16
 """Sample points along each side of the bounding box for the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""Measured numbers of nodes over the sums in `_budget`."""
+"""Measured ratios of the number of nodes to the estimates that `_budget` computes. The first two
+hold for inner and skin nodes; the others correct the sum for a cylinder and for a mesh file."""
 MAX_LOST_FRACTION = 0.1
 """Maximum fraction of an object's volume that its mesh may omit."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshSpec:
-    """Inputs of a mesh.
+    """All inputs that determine a mesh.
 
-    towards_user: unit vector in the mesh frame. down: direction of a base support, object frame.
-    rotation_rad: rotation of a cylinder's mesh frame about the object's x. slab_depth_m: depth of
-    the slab that represents a half-space.
+    touch_angle_rad: maximum angle between a touchable normal and the direction to the user.
+    towards_user: unit vector to the user, mesh frame. down: downward direction for a base
+    support, object frame. rotation_rad: rotation of the mesh frame of a cylinder about the x axis
+    of the object. slab_depth_m: depth of the slab that represents a half-space.
     """
 
     geometry: Geometry
@@ -100,14 +105,14 @@ class MeshSpec:
 
 @dataclass(frozen=True, slots=True)
 class MeshBudget:
-    """Approximate number of nodes and memory of a mesh."""
+    """Approximate number of nodes of a mesh, and memory (bytes) that meshing needs."""
 
     nodes: int
     bytes: int
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
-    """Return the specification of a scene's mesh; raises ValueError as `world_from_mesh`."""
+    """Return the specification of the mesh of a scene; raises ValueError as `world_from_mesh`."""
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
@@ -131,11 +136,11 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
 
 
 def world_from_mesh(scene: Scene) -> Floats:
-    """Return the pose (4, 4) of the mesh frame.
+    """Return the pose (4, 4) of the mesh frame in the world.
 
-    It is the object's pose. A cylinder's frame is rotated about the axis so that z points to the
-    user. Raises ValueError if a cylinder's axis points to the user, because its side cannot be
-    touched then.
+    It is the pose of the object. For a cylinder it is rotated about the axis so that z points to
+    the user. Raises ValueError if the axis of a cylinder points to the user, because its side
+    cannot be touched then.
     """
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
@@ -160,25 +165,25 @@ def _cylinder_rotation_rad(scene: Scene) -> float:
 
 
 def _rounded(vector: Floats) -> Vector:
-    """Return the vector rounded, so that rounding errors do not change the mesh's key."""
+    """Round a vector, so that small numerical differences do not change `MeshSpec.key`."""
     # Adding zero converts -0.0 to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Return the resources of `build_mesh`, in up to a second; errors as `_budget`."""
+    """Estimate the resources that `build_mesh` needs, in at most a second; raises as `_budget`."""
     return _budget(spec, make_shape(dict(spec.geometry)))
 
 
 def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     """Estimate the number of nodes of the mesh, within a factor of two.
 
-    Nodes are half an element size apart. The integral of (2 / size)^3 over the volume estimates the
-    inner nodes, and that of (2 / size)^2 over the surface the skin nodes. The measured factors
-    above correct both.
+    Nodes are half an element size apart. The number of inner nodes is therefore about the integral
+    of (2 / element size)^3 over the volume. That of skin nodes is about the integral of (2 /
+    element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both.
 
-    Raises UnfitMeshError for a spacing that does not fit the object, or more than `MAX_NODES`.
+    Raises UnfitMeshError for a skin spacing that does not fit the object, or more than `MAX_NODES`.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
@@ -187,7 +192,7 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
-            f"minimum extent ({thickness:g} m)"
+            f"minimum extent ({thickness:g} m); change it"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -213,29 +218,29 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     if nodes > MAX_NODES:
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} requires about {nodes} nodes "
-            f"({budget.bytes / 2**30:.1f} GiB while meshing), the maximum is {MAX_NODES}; "
+            f"({budget.bytes / 2**30:.1f} GiB of memory), the maximum is {MAX_NODES}; "
             "increase the spacing"
         )
     return budget
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
-    """Return the lower and upper corner (3,) of the meshed volume's bounding box."""
+    """Return the lower and upper corner (3,) of the bounding box of the meshed volume."""
     low, high = GEOMETRIES[spec.geometry.shape].bounds_m(spec.geometry)
     margin = spec.slab_depth_m
     return low - margin, high + np.array([margin, margin, 0.0])
 
 
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """Mesh the scene's object in the frame of `world_from_mesh`; errors as `build_mesh`."""
+    """Mesh the object of a scene in the frame of `world_from_mesh`; raises as `build_mesh`."""
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
 
 def build_mesh(spec: MeshSpec) -> SolidMesh:
-    """Return the mesh of a specification.
+    """Build the mesh of a specification.
 
     Raises UnfitMeshError as `_budget`, for an object too thin for its elements, and for a support
-    that fixes too little or all touchable skin.
+    that fixes too few nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
@@ -267,9 +272,10 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
 
 
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
-    """Return the mesh of a cylinder.
+    """Build the mesh of a cylinder.
 
-    The mesh has nodes on the edges of a strip support; other supports fix the nodes inside them.
+    If the support is a strip, the mesh has nodes on its edges. Any other support fixes the nodes
+    that happen to be inside it.
     """
     strip = isinstance(spec.support, StripSupport)
     mesh = cylinder_mesh(
@@ -291,7 +297,7 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
 
 
 def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
-    """Return which skin points (n, 3), mesh frame, are fixed; see `supports.select_fixed`."""
+    """Return whether each skin point (n, 3), mesh frame, is fixed; see `supports.select_fixed`."""
     object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.rotation_rad, 0.0, 0.0])[:3, :3]
     return select_fixed(
         spec.support,
@@ -303,7 +309,7 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 
 
 def _slab_normals(nodes: Floats) -> Floats:
-    """Return the vertical normals (n, 3) of a slab's top and bottom; elsewhere, x."""
+    """Return the normals (n, 3) at the top and bottom nodes of a slab; at other nodes, +x."""
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()
@@ -314,11 +320,11 @@ def _slab_normals(nodes: Floats) -> Floats:
 
 
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
-    """Raise UnfitMeshError if parts too thin for the elements are missing in the mesh."""
+    """Raise UnfitMeshError if the mesh lacks parts of the object, too thin for the elements."""
     required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
     lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
     if lost_fraction > MAX_LOST_FRACTION:
         raise UnfitMeshError(
             f"skin_spacing_m: {100 * lost_fraction:.0f} % of the object is too thin for elements "
-            f"of {2.0 * spec.skin_spacing_m:g} m; reduce it"
+            f"of {2.0 * spec.skin_spacing_m:g} m; reduce skin_spacing_m"
         )

@@ -1,4 +1,4 @@
-"""Define element sizes: fine on touchable skin, coarser behind and below it."""
+"""Define the element sizes of a mesh: small at touchable skin, larger at the back and inside."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ Ints = NDArray[np.int64]
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Growth of the element size per depth below the skin."""
+"""Increase of the element size per depth below the skin (m/m)."""
 RAMP_RAD = 0.6
-"""Angle behind the touchable skin over which the element size grows."""
+"""Angle beyond the touchable skin over which the element size increases."""
 EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
-"""Maximum longest edge of a tetrahedron over the required size: the diagonal of a square, plus 10 %
-for the distortion by maps."""
+"""Maximum ratio of the longest edge of a tetrahedron to the required size. It is that of the
+diagonal to the side of a square, plus 10 % for distortion by maps to curved surfaces."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grading:
     """Element sizes of a mesh.
 
-    Skin is fine where its normal is within `touch_angle_rad` of the unit vector `towards_user`.
+    Skin whose normal is within `touch_angle_rad` of the unit vector `towards_user` can be touched.
+    Its nodes are `skin_spacing_m` apart; elsewhere elements are larger.
     """
 
     skin_spacing_m: float
@@ -34,15 +35,18 @@ class Grading:
 
     @property
     def element_m(self) -> float:
-        """Return the minimum element size, m: edges have a node at their midpoint."""
+        """Return the minimum element size, m; it is two spacings, as edges have a midpoint node."""
         return 2.0 * self.skin_spacing_m
 
     def touchable(self, normals: Floats) -> Bools:
-        """Return whether skin with these unit normals (n, 3) can be touched."""
+        """Return whether skin with the unit normals (n, 3) can be touched (n,)."""
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
-        """Return the required sizes (n,), m, at depths (n,) below skin with unit normals (n, 3)."""
+        """Return the required element sizes (n,), m.
+
+        normals (n, 3): unit normals of the nearest skin. depth_m (n,): depths below it.
+        """
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind
         return np.asarray(self.element_m * coarser + DEPTH_GROWTH * np.maximum(depth_m, 0.0))
@@ -53,7 +57,7 @@ class Grading:
 
 
 def longest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the length (e,) of each tetrahedron's longest edge."""
+    """Return the length of the longest edge of each tetrahedron (e,)."""
     corners = points[tetrahedra]
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     square = [np.square(corners[:, i] - corners[:, j]).sum(axis=1) for i, j in pairs]

@@ -1,12 +1,13 @@
-"""Mesh sphere, ellipsoid, rounded box and slab by mapping a bisected lattice to them.
+"""Mesh sphere, ellipsoid, rounded box and slab by mapping the vertices of a bisected lattice.
 
-With the cuboid's coordinates u in -1..1, s = max |u_i|, and w = u / s on the cuboid's surface, the
-map is
+Let u be the coordinates of a lattice vertex, scaled so that the lattice is the cube [-1, 1]^3. With
+s = max |u_i|, w = u / s is a point on the surface of the cube. The vertex is mapped to
 
     x(u) = c u + s^2 (X(w) - c w)
 
-X maps the cuboid's surface to the solid's (`CuboidMap.surface`). c are the half extents of the
-inner lattice, which is undistorted near the centre. Symmetric solids get symmetric meshes.
+X maps the surface of the cube to that of the solid (`CuboidMap.surface`). c are half extents
+(`CuboidMap.inner_m`); near the centre, the lattice is only scaled by them. Symmetric solids get
+symmetric meshes.
 """
 
 from __future__ import annotations
@@ -38,34 +39,42 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""Widths of the cells before bisection over the minimum element size."""
+"""Widths of the lattice cells before bisection, divided by the minimum element size; all are tried.
+"""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
-"""Stiffness of springs to the map's positions, see `smooth_mesh`. The first value is used with
-which all elements are better than `GOOD_RATIO`."""
+"""Stiffness of the springs that hold corners at their mapped positions, see `smooth_mesh`. The
+first value is used for which the radius ratios of all elements exceed `GOOD_RATIO`."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""Maximum number of elements of a lattice, over that of the lattice with the fewest."""
+"""Number of elements above which a lattice is not tried, over that of the smallest lattice."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-    """Return images (n, 3) of lattice vertices (n, 3), and the surface points they project to."""
+    """Map lattice vertices (n, 3) to the solid.
+
+    half_cells (3,): half the number of lattice cells along each axis. Returns the mapped points
+    (n, 3) and the surface points X(w) (n, 3), see the module docstring.
+    """
     u = vertices / (CELL * half_cells)
     weight = np.abs(u).max(axis=1, keepdims=True)
-    # The centre has no direction; any direction is valid there.
+    # At the centre w is undefined; any direction may be used.
     w = np.where(weight > 0.0, u / np.maximum(weight, 1e-300), np.array([0.0, 0.0, 1.0]))
     outside = template.surface(w)
     return template.inner_m * u + weight**2 * (outside - template.inner_m * w), outside
 
 
 def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), object frame, and elements (e, 10) of a shape with this map."""
+    """Return nodes (n, 3), object frame, and elements (e, 10) of the solid inside a shape.
+
+    template: map from the cube to the shape. Raises UnfitMeshError if all meshes are too distorted.
+    """
 
     def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
         points, outside = map_lattice(template, vertices, half_cells)
         depth = np.linalg.norm(outside - points, axis=1)
         return points, grading.sizes(shape.closest(outside).normal, depth)
 
-    # The outermost cells are compressed where a corner of the lattice is mapped to a round surface.
+    # Where a lattice corner is mapped to a round surface, the outermost cells are compressed.
     squeezed = np.pi / 4 if template.is_round else 1.0
     for corners, tetrahedra, on_hull in _map_lattices(
         squeezed * template.half_m, grading.element_m, positions
@@ -85,7 +94,7 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
                 return nodes, elements
     raise UnfitMeshError(
         f"skin_spacing_m: elements of {grading.element_m:.3g} m that fill the object are too "
-        "distorted; change it, or choose a less elongated object"
+        "distorted; change skin_spacing_m, or choose a less elongated object"
     )
 
 
@@ -107,24 +116,25 @@ def mesh_slab(plane: Plane, margin_m: float, grading: Grading) -> tuple[Floats, 
 
 
 def distance_to_rectangle(points: Floats, plane: Plane) -> Floats:
-    """Return the distance (n,) of points (n, 3) from the touchable rectangle."""
+    """Return the distances (n,) of points (n, 3) from the touchable rectangle of a plane."""
     half = 0.5 * np.array([plane.width_m, plane.height_m])
     beside = np.maximum(np.abs(points[:, :2]) - half, 0.0)
     return np.asarray(np.linalg.norm(np.column_stack([beside, points[:, 2]]), axis=1))
 
 
 MapFunction = Callable[[Ints, Ints], tuple[Floats, Floats]]
-"""Function from lattice vertices (n, 3) and half the numbers of cells (3,) to the vertices' images
-(n, 3) and the required element sizes there (n,), m."""
+"""Function that maps lattice vertices (n, 3), given half the number of cells along each axis (3,).
+It returns the mapped points (n, 3) and the required element sizes there (n,), m."""
 
 
 def _map_lattices(
     half_m: Floats, element_m: float, positions: MapFunction
 ) -> list[tuple[Floats, Ints, Bools]]:
-    """Return corners (n, 3), tetrahedra (e, 4) and boundary flags (n,) of several lattices.
+    """Return several mapped lattices, sorted by their number of elements.
 
-    They start with cells of different sizes and are bisected where required. They are sorted by
-    their number of elements.
+    They start with cells of different sizes and are bisected where smaller elements are required.
+    Each consists of corners (n, 3), tetrahedra (e, 4), and whether each corner is on the boundary
+    (n,).
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:

@@ -1,4 +1,4 @@
-"""Compute quality measures of straight and curved tetrahedra."""
+"""Measure the quality of tetrahedra with straight or curved edges."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ Ints = NDArray[np.int64]
 MIN_RADIUS_RATIO = 0.1
 """Minimum radius ratio of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""Minimum Jacobian of a curved element over that of the straight one."""
+"""Minimum Jacobian determinant of a curved element over that of the element with straight edges."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
-"""Number of the midside node between two corners."""
+"""Index of the node at the midpoint of the edge between two corners of an element."""
 
 
 def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return signed volumes (e,) of the straight tetrahedra on the first four nodes, m^3."""
+    """Return signed volumes (e,), m^3, of the straight tetrahedra between the first four nodes."""
     corners = points[tetrahedra[:, :4]]
     volume: Floats = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     return volume
 
 
 def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the radius ratios 3 r / R (e,) of inscribed and circumscribed sphere.
+    """Return the radius ratio (e,) of each tetrahedron, a measure of its quality.
 
-    The ratio is 1 for a regular tetrahedron, 0 for a flat and negative for an inverted one. By
-    Crelle, 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p - 2 c)) with the products a, b, c of opposite
-    edges and their sum p.
+    It is 3 r / R, with the radii r of the inscribed and R of the circumscribed sphere: 1 for a
+    regular tetrahedron, 0 for a flat and negative for an inverted one. Crelle's formula gives R
+    from the volume V: 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p - 2 c)). Here a, b and c are the
+    products of the lengths of opposite edges, and p is their sum.
     """
     corners = points[tetrahedra[:, :4]]
     volume = signed_volumes(points, tetrahedra)
@@ -48,19 +49,20 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     )
     total = products.sum(axis=0)
     heron = total * (total - 2.0 * products).prod(axis=0)
-    # r = 3 V / area and R = sqrt(heron) / (24 V); the maximum avoids 0 / 0 for flat tetrahedra.
+    # r = 3 V / area and R = sqrt(heron) / (24 V). The lower bound avoids 0 / 0 for flat tetrahedra.
     root = np.sqrt(np.maximum(heron, 1e-300))
     ratio: Floats = 216.0 * volume * np.abs(volume) / (area * root)
     return ratio
 
 
 def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
-    """Return a lower bound (e,) of each 10-node tetrahedron's Jacobian over the straight one's.
+    """Return how much curved edges reduce the Jacobian determinant of each 10-node tetrahedron.
 
-    The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients (Johnen,
-    Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The derivatives
-    are linear. The coefficient of three corners is therefore a mean over their permutations, of the
-    determinant with one derivative evaluated at each corner.
+    The result (e,) is a lower bound of the determinant over that of the element with straight
+    edges. The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients
+    (Johnen, Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The
+    three derivatives of position are linear, so each coefficient belongs to three corners. It is
+    the mean, over all permutations of these corners, of the determinant of the derivatives at them.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -1,11 +1,12 @@
 """Optimize the shape of tetrahedra while their boundary is moved to a surface.
 
-The objective is the sum over tetrahedra of w^2, with w = (|A|^2 / 3)^(3/2) / det A and A the map
-from the regular tetrahedron. w is the inverse mean ratio: 1 for a regular tetrahedron of any size,
-infinite for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
-"Tetrahedral mesh improvement via optimization of the element condition number", 2002). Elements
-therefore never become inverted. Springs along the normals pull the boundary corners to the surface;
-their stiffness increases in each round. The corners can slide along the surface.
+The objective is the sum of w^2 over all tetrahedra. w = (|A|^2 / 3)^(3/2) / det A is the inverse
+mean ratio, a measure of distortion. The matrix A maps a regular tetrahedron to the actual one. w is
+1 for a regular tetrahedron of any size and infinite for a flat one, so elements never become
+inverted (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp, "Tetrahedral mesh
+improvement via optimization of the element condition number", 2002). Springs along the surface
+normals pull the boundary corners to the surface, and the corners can slide along it. The stiffness
+of the springs increases in several rounds.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""Function from points (n, 3) to the nearest surface points and the outward normals there."""
+"""Function that maps points (n, 3) to the nearest surface points and outward normals there."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""Spring stiffness in each round, for lengths in median edges and a boundary that starts up to one
-element off the surface."""
+"""Spring stiffness in each round, if the boundary is at first up to one element off the surface.
+Lengths are measured in median edge lengths."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
-"""Spring stiffness in each round, for lengths in median edges and a boundary that starts on the
-surface."""
+"""Spring stiffness in each round, if the boundary is on the surface from the start."""
 MIN_FINAL_RADIUS_RATIO = 0.15
-"""Minimum radius ratio of an element after its corners are moved onto the surface."""
+"""Minimum radius ratio (`quality.radius_ratios`) of an element after its corners are moved onto the
+surface."""
 ROUND_STEPS = 20
 MEMORY = 8
-"""Number of steps and gradient changes that L-BFGS stores."""
+"""Number of previous steps and gradient changes that the L-BFGS method uses."""
 
 _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
@@ -43,7 +44,7 @@ _FROM_REGULAR = np.linalg.inv(_REGULAR)
 
 
 def make_surface_query(shape: Shape) -> Surface:
-    """Return the `Surface` function of a shape, for `smooth_mesh`."""
+    """Return the function of type `Surface` for a shape, an argument of `smooth_mesh`."""
 
     def nearest(points: Floats) -> tuple[Floats, Floats]:
         found = shape.closest(points)
@@ -61,11 +62,12 @@ def smooth_mesh(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Return the smoothed corner positions (n, 3) of tetrahedra with positive volume.
+    """Return improved positions (n, 3) of the corners of tetrahedra with positive volume.
 
-    hull: numbers of the corners that move to the surface. anchor: stiffness of springs from each
-    corner to its start position, which preserve the grading. Corners of elements that would be
-    flatter than `MIN_FINAL_RADIUS_RATIO` are not moved fully onto the surface.
+    hull: indices of the corners that move to the surface. springs: spring stiffness in each round.
+    anchor: stiffness of springs from each corner to its start position, which preserve the
+    variation of element sizes. If an element would have a radius ratio below
+    `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
@@ -100,7 +102,10 @@ def smooth_mesh(
 
 
 def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
-    """Return the sum of w^2 and its gradient (n, 3); infinite where a tetrahedron is inverted."""
+    """Return the sum of w^2 (see the module docstring) and its gradient (n, 3).
+
+    The sum is infinite if a tetrahedron is inverted.
+    """
     first = points[tetrahedra[:, 0]]
     edges = np.swapaxes(points[tetrahedra[:, 1:]] - first[:, None], 1, 2)
     shape = edges @ _FROM_REGULAR
@@ -120,10 +125,11 @@ def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
 
 
 def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
-    """Minimize by `ROUND_STEPS` steps of L-BFGS with backtracking.
+    """Minimize an energy by `ROUND_STEPS` steps of L-BFGS with a backtracking line search.
 
-    See Nocedal and Wright, Numerical Optimization, alg. 7.5. The line search of scipy does not
-    accept infinite values.
+    points (n, 3): start. energy: function that returns value and gradient. Source: Nocedal and
+    Wright, Numerical Optimization, alg. 7.5. The optimizer of scipy is not used, because its line
+    search does not accept infinite values.
     """
     value, gradient = energy(points)
     steps: list[tuple[Floats, Floats, float]] = []
@@ -133,7 +139,7 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
         if slope >= 0.0:
             steps, direction = [], -gradient
             slope = -float(np.square(gradient).sum())
-        # A step of at most a fifth of a median edge.
+        # Limit the step of each point to a fifth of the median edge length.
         max_step = float(np.sqrt(np.square(direction).sum(axis=1).max()))
         step = min(1.0, 0.2 / max(max_step, 1e-300))
         while step > 1e-6:
@@ -152,7 +158,7 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
 
 
 def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, float]]) -> Floats:
-    """Multiply by the approximate inverse Hessian (two-loop recursion of L-BFGS)."""
+    """Multiply a gradient by the approximate inverse Hessian (two-loop recursion of L-BFGS)."""
     result = gradient.copy()
     weights = []
     for moved, gradient_change, inverse in reversed(steps):

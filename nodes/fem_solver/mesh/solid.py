@@ -1,7 +1,7 @@
-"""Define solid meshes of 10-node tetrahedra with their skin, fixed and touchable parts.
+"""Define solid meshes of 10-node tetrahedra and the roles of their surface nodes.
 
-An element lists its corners, then the midpoints of its edges (VTK's order). Midpoints of edges on a
-curved surface are on the true surface; all other edges are straight.
+The nodes of an element are its corners, then the midpoints of its edges, in the order of VTK.
+Midpoints of edges on a curved surface are on the true surface; all other edges are straight.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-"""Corners of the edges whose midpoints are nodes 4..9 of a tetrahedron (VTK's order)."""
+"""Corners of the edges whose midpoints are the nodes 4 to 9 of a tetrahedron."""
 FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-"""Nodes of the faces: three corners, counter-clockwise seen from outside, then their midpoints."""
+"""Nodes of the faces of a tetrahedron: three corners, counter-clockwise seen from outside, then the
+midpoints of the edges between them."""
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-"""A six-node triangle as four linear ones over the same nodes."""
+"""Division of a six-node triangle into four flat triangles over the same nodes."""
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
@@ -36,11 +37,13 @@ class UnfitMeshError(FlexsheetError, ValueError):
 class SolidMesh:
     """Solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3): m, mesh frame. elements (e, 10). slab (n,): number of a node's slice along one
-    axis. The nodes of one element are in at most two successive slabs; nodes are sorted by
-    slab. fixed (n,) bool. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into
-    `skin`, outward. contact_nodes (m,): touchable nodes, a sorted subset of `skin`. contact_normals
-    (m, 3). contact_faces (f, 6): indices into `contact_nodes` of six-node triangles, outward.
+    nodes (n, 3): positions, m, mesh frame. elements (e, 10): indices of their nodes. slab (n,):
+    index of the slice along one axis that contains the node. The nodes of one element are in at
+    most two successive slabs; nodes are sorted by slab. fixed (n,): whether each node is fixed.
+    skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`, outward.
+    contact_nodes (m,): nodes that the finger can touch, a sorted subset of `skin`. contact_normals
+    (m, 3): outward normals there. contact_faces (f, 6): indices into `contact_nodes` of six-node
+    triangles, outward.
     """
 
     nodes: Floats
@@ -55,7 +58,7 @@ class SolidMesh:
 
 
 def triangle_shape_functions(local: Floats) -> Floats:
-    """Return a six-node triangle's shape functions (..., 6) at local coordinates (..., 2)."""
+    """Return the shape functions (..., 6) of a six-node triangle at local coordinates (..., 2)."""
     a, b = local[..., 0], local[..., 1]
     c = 1.0 - a - b
     result = np.empty((*local.shape[:-1], 6))
@@ -69,7 +72,7 @@ def triangle_shape_functions(local: Floats) -> Floats:
 
 
 def triangle_shape_functions_at(a: float, b: float) -> tuple[float, ...]:
-    """Return `triangle_shape_functions` at one point, faster than with arrays."""
+    """Return the values of `triangle_shape_functions` at one point, without slow small arrays."""
     c = 1.0 - a - b
     corners = (c * (2.0 * c - 1.0), a * (2.0 * a - 1.0), b * (2.0 * b - 1.0))
     return (*corners, 4.0 * c * a, 4.0 * a * b, 4.0 * b * c)
@@ -86,7 +89,10 @@ def boundary_faces(elements: Ints) -> Ints:
 
 
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), corners first, and elements (e, 10) with straight edges."""
+    """Convert tetrahedra (e, 4) to 10-node elements with straight edges.
+
+    Returns the nodes (n, 3), of which the corners come first, and the elements (e, 10).
+    """
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     elements = np.concatenate([tetrahedra, inverse.reshape(-1, 6) + len(corners)], axis=1)
@@ -104,10 +110,9 @@ def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
-    """Return the slab (n,) of each node, counted along the longest axis.
+    """Return the slab (n,) of each node, as defined in `SolidMesh`, along the longest axis.
 
-    The nodes of an element are in at most two successive slabs. Raises UnfitMeshError for several
-    components.
+    Raises UnfitMeshError if the mesh consists of several separate components.
     """
     axis = int(np.ptp(nodes, axis=0).argmax())
     level = np.full(len(nodes), -1)
@@ -117,7 +122,9 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
     while len(waiting):
         reached = (level[waiting] >= 0).any(axis=1)
         if not reached.any():
-            raise UnfitMeshError("the mesh has several components; reduce skin_spacing_m")
+            raise UnfitMeshError(
+                "the mesh of the object has several separate parts; reduce skin_spacing_m"
+            )
         number += 1
         new_nodes = np.unique(waiting[reached])
         level[new_nodes[level[new_nodes] < 0]] = number
@@ -128,10 +135,11 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
 def make_solid_mesh(
     nodes: Floats, elements: Ints, *, touchable: Bools, fixed: Bools, normals: Floats
 ) -> SolidMesh:
-    """Return the mesh with nodes sorted by slab, and with its skin and touchable part.
+    """Sort the nodes by slab, find the skin and the touchable part, and return the mesh.
 
-    touchable, fixed (n,): flags of boundary nodes. normals (n, 3): outward at touchable nodes.
-    Faces are touchable if all their nodes are touchable and none is fixed.
+    touchable, fixed (n,): whether each boundary node can be touched, and is fixed. normals (n, 3):
+    outward normals at touchable nodes. A face is touchable if all its nodes are touchable and none
+    is fixed.
     """
     level = number_slabs(nodes, elements)
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))
@@ -158,9 +166,9 @@ def make_solid_mesh(
 
 
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
-    """Restrict the touchable part to nodes that are `touchable` (n,) and not fixed.
+    """Return the mesh with its touchable part restricted to nodes that are `touchable` (n,).
 
-    Raises UnfitMeshError if no face remains.
+    Fixed nodes are also excluded. Raises UnfitMeshError if no face remains.
     """
     good = (touchable & ~mesh.fixed)[mesh.contact_nodes]
     faces = mesh.contact_faces[good[mesh.contact_faces].all(axis=1)]

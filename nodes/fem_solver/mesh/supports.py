@@ -1,4 +1,4 @@
-"""Select the skin nodes that a scene's support fixes."""
+"""Select the skin nodes that are fixed by the support that a scene describes."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ TOLERANCE_M = 1e-9
 def select_fixed(
     support: Support, points: Floats, normals: Floats, *, towards_user: Floats, down: Floats
 ) -> Bools:
-    """Return which skin points (n, 3) with outward unit normals (n, 3) are fixed, (n,).
+    """Return whether each skin point (n, 3) is fixed (n,).
 
-    All vectors are in the object's frame: towards_user (3,), unit vector; down (3,), of a base, of
-    any length. Raises UnfitMeshError if all fixed points are collinear.
+    normals (n, 3): outward unit normals at the points. towards_user (3,): unit vector to the user.
+    down (3,): downward direction for a base support, of any length. All are in the object frame.
+    Raises UnfitMeshError if all fixed points are collinear.
     """
     chosen: Bools
     match support:
@@ -54,7 +55,7 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear."""
+    """Raise UnfitMeshError if all chosen points are collinear, so that the body could rotate."""
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
@@ -63,5 +64,5 @@ def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
             return
     raise UnfitMeshError(
         f"object.support: this {kind} fixes {len(some)} of {len(points)} skin nodes; at least "
-        "three that are not collinear are required; enlarge it, or reduce skin_spacing_m"
+        "three that are not collinear are required; enlarge the support or reduce skin_spacing_m"
     )

@@ -1,4 +1,4 @@
-"""Shapes of virtual objects; `surface.Shape` is their interface."""
+"""Provide the shapes of virtual objects; `surface.Shape` is their common interface."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ from flexsheet.nodes.models.shapes.triangles import MeshError
 
 
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
-    """Make the shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
+    """Make the shape that a geometry describes, as in `make_shape(dict(scene.object.geometry))`.
 
-    The key `shape` is the name, `origin` is ignored, and the other keys are the dimensions. Raises
-    KeyError for an unknown name and ValueError (MeshError) for invalid dimensions.
+    geometry: the key `shape` is the name of the shape, `origin` is ignored, and the other keys are
+    its dimensions. Raises KeyError for an unknown name and ValueError (for meshes its subclass
+    MeshError) for invalid dimensions.
     """
     dimensions = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
     return GEOMETRIES[geometry["shape"]].make_shape(**dimensions)

@@ -1,8 +1,8 @@
 """Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions of a description receive the dimensions of a geometry: an object with its fields, such
-as `scene.object.geometry` or the shape itself. To add a kind of geometry, add its shape and its
-description to the table.
+The functions in a description receive the dimensions of a geometry. These are an object with the
+dimensions as attributes, such as `scene.object.geometry` or the shape itself. To add a kind of
+geometry, write its shape class and add a description to the table.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from flexsheet.nodes.models.shapes.surface import Shape
 Floats = NDArray[np.float64]
 
 INNER_RATIO = 0.8
-"""Half extents of a round solid's inner lattice over those of the solid."""
+"""Size of the undistorted lattice inside the mesh of a round solid over the size of the solid."""
 
 
 @dataclass(frozen=True, slots=True)
 class CuboidMap:
-    """Map from the surface of the cube -1..1 to the surface of a solid.
+    """Map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) of the undistorted lattice near its centre.
-    surface: function from points (n, 3) on the cube to points (n, 3) on the solid.
-    is_round: whether the whole surface is curved, as an ellipsoid's; otherwise it has flat faces.
+    inner_m: half extents (3,) that the whole lattice would have if it were nowhere distorted.
+    surface: function that maps points (n, 3) on the cube to points (n, 3) on the solid.
+    is_round: true if the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
 
     half_m: Floats
@@ -50,12 +50,13 @@ class CuboidMap:
 class GeometryDescription:
     """Description of one kind of geometry by functions of its dimensions.
 
-    make_shape: makes the shape from the dimensions as keywords.
-    bounds_m: returns the lower and upper corner (3,) of the solid's bounding box; for a half-space,
-        of the touchable rectangle.
-    extent_m: returns the maximum extent of the touchable surface along a unit vector (3,).
-    scale: returns the changed dimensions of the geometry scaled by a ratio.
-    cuboid_map: returns the map for meshing, from dimensions and shape; None for other mesh methods.
+    make_shape: makes the shape; the dimensions are its keyword arguments.
+    bounds_m: returns the lower and upper corner (3,) of the bounding box of the solid. For a
+        half-space it is that of the touchable rectangle.
+    extent_m: returns how far the touchable surface extends from the origin along a unit vector.
+    scale: returns the dimensions that change if the geometry is scaled by a ratio.
+    cuboid_map: returns the map for meshing, given dimensions and shape; None if the shape is meshed
+        by another method.
     """
 
     make_shape: Callable[..., Shape]
@@ -71,15 +72,18 @@ def map_round_solid(half_m: Floats) -> CuboidMap:
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return the map from a box to the nearest points of a box-like solid."""
+    """Return the map that moves points on a box to the nearest points of a box-like solid.
+
+    half_m (3,): half extents of the box.
+    """
     return CuboidMap(half_m, half_m, lambda w: shape.closest(half_m * w).point, False)
 
 
 def cube_to_sphere(w: Floats) -> Floats:
-    """Map points (n, 3) of the surface of the cube -1..1 to the unit sphere.
+    """Map points w (n, 3) on the surface of the cube [-1, 1]^3 to the unit sphere.
 
-    The map is smooth and nearly area-preserving:
-    w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically.
+    The map is smooth and nearly area-preserving. Its first coordinate is
+    w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3); the others follow by cyclic permutation.
     """
     square = np.square(w)
     second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
@@ -96,7 +100,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent of the side, because the end caps are not touchable."""
+    """Return the extent of the side of a cylinder, because its end caps cannot be touched."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 
@@ -170,4 +174,4 @@ GEOMETRIES: dict[str, GeometryDescription] = {
         scale=_scale_mesh,
     ),
 }
-"""Descriptions by the name that scenes give in `object.geometry.shape`."""
+"""Descriptions by name; scene files give the name in `object.geometry.shape`."""

@@ -1,14 +1,17 @@
 """Represent a closed triangle mesh as a smooth implicit surface.
 
-Facets would cause jumps of the sheet's orientation. `rho` is the smoothing length.
+A sheet that is tangent to flat facets would change its orientation in jumps. The surface is
+therefore smoothed over the smoothing length `rho` (m), in two steps:
 
-1. Osculating jets (Cazals and Pouget, Estimating Differential Quantities Using Polynomial Fitting
-of Osculating Jets, 2005): around selected vertices a quadratic is fitted by least squares. Its
-position, normal and shape operator A give the signed distance to second order: s_i(x) = n_i d +
-d A_i d / 2 with d = x - p_i.
-2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003): f(x) = sum
-w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and w_i = 0 for t_i >
-1. The surface is f = 0.
+1. Local quadratic fits, called jets (Cazals and Pouget, Estimating Differential Quantities Using
+Polynomial Fitting of Osculating Jets, 2005): a quadratic is fitted by least squares around selected
+vertices. Jet i has a centre p_i, a unit normal n_i and a shape operator A_i (the derivative of the
+normal along the surface). With d = x - p_i, the signed distance of a point x to second order is
+s_i(x) = n_i d + d A_i d / 2.
+2. Blending (partition of unity; Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
+f(x) = sum w_i s_i / sum w_i. The weights are w_i = (1 - t_i)^4 with t_i = (d d + 3 (n_i d)^2) /
+rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The region t_i < 1, in which a jet has weight,
+is its support.
 
 f is three times continuously differentiable, so the normal has a continuous second derivative along
 a path. Supports are half as thick along the normal as across it, so that the two sides of a thin
@@ -46,39 +49,43 @@ from flexsheet.nodes.models.shapes.triangles import (
 )
 
 FLATNESS = 3.0
-"""A support's thickness along the normal is 1 / sqrt(1 + FLATNESS) of that across it."""
+"""Flatness of a jet's support: it extends 1 / sqrt(1 + FLATNESS) as far along the jet's normal as
+across it."""
 FIT_RATIO = 1.25
-"""Radius in which vertices are used for the fit of a jet, over `rho`."""
+"""Radius around a jet within which vertices are used for its fit, divided by `rho`."""
 SPACING_RATIO = 1.0 / 3.0
-"""Minimum distance of jets on the same side of the surface, over `rho`."""
+"""Minimum distance between jets on the same side of the surface, divided by `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""Minimum cosine between a jet's normal and that of a vertex in its fit."""
+"""Minimum cosine of the angle between the normals of a jet and of a vertex used for its fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""Maximum curvature of a jet, times `rho`."""
+"""Maximum curvature of a jet (1/m), multiplied by `rho`."""
 EDGE = 1.5
-"""Minimum curvature at an edge over the maximum curvature of a jet."""
+"""Curvature above which a point counts as an edge, divided by the maximum curvature of a jet."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""Deviations of the length of f's gradient from 1. Above the first, jets of different directions
-meet at an edge. Above the second, f = 0 is beyond the rim of a thin part and not on the surface."""
+"""Limits of | |grad f| - 1 |, which is 0 where neighbouring jets agree. Above the first limit, jets
+with different normals meet at an edge. Above the second, the point with f = 0 is an artefact beyond
+the rim of a thin part, and not on the surface."""
 MIN_SUPPORT = 0.1
-"""Minimum sum of the weights on the surface; it is smaller only beyond a rim."""
+"""Minimum sum of the weights w_i on the surface; it is smaller only beyond a rim."""
 MEMBERS_KNOWN = 0.1
-"""Distance, in `rho`, over which a list of the supports near a point remains complete."""
+"""Distance that a point may move, divided by `rho`, before its list of nearby jets is updated."""
 STRIDE_RATIO = 0.4
-"""Maximum step of the projection in `rho`, so that it remains within the supports."""
+"""Maximum step of the projection divided by `rho`; it keeps the iteration within the supports."""
 REST_RATIO = 1e-3
-"""Step in `rho` below which the projection has converged, to nanometres and about 1e-5 rad."""
+"""Step, divided by `rho`, below which the projection has converged. The remaining error is some
+nanometres and about 1e-5 rad."""
 APART_RATIO = 0.4
-"""Minimum distance of distinct nearest points, in `rho`."""
+"""Distance above which two nearest points count as distinct, divided by `rho`."""
 MAX_DEVIATION_RATIO = 0.22
-"""Maximum distance of the surface from the mesh, in `rho`."""
+"""Maximum distance between the surface and the mesh, divided by `rho`."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
-"""Maximum number of additional starts in the search for the global nearest point."""
+"""Maximum number of additional starting points in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""Lower bound of the eigenvalues of I + h A near a centre of curvature."""
+"""Lower bound on the eigenvalues of I + h A (h: height above the jet, A: its shape operator), which
+vanish at a centre of curvature."""
 RIM_FRACTION = 0.8
-"""Fraction of the radius from which the weight decreases in `rise_m`."""
+"""Fraction of the radius beyond which `rise_m` reduces the weight of heights."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -87,10 +94,10 @@ if TYPE_CHECKING:
 
 
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """Return the default smoothing length, 1.75 median edges, m.
+    """Return the default smoothing length of a mesh: 1.75 times its median edge length, m.
 
-    Shorter lengths leave facets visible, longer ones flatten curved parts; `benchmarks.shapes`
-    measures both.
+    With a shorter length, the facets would still be noticeable. With a longer one, curved parts
+    would be flattened. `benchmarks.shapes` measures both effects.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -98,10 +105,10 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """Shape of a closed mesh that is smoothed over `smoothing_m`; see the module docstring."""
+    """Closed mesh, smoothed over the length `smoothing_m`; see the module docstring."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
-        """Build the smooth surface of a closed mesh.
+        """Fit the jets that define the smooth surface of a closed mesh.
 
         Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
         length, and ValueError for a length that is not positive.
@@ -114,7 +121,7 @@ class SmoothMeshShape:
         if smoothing_m > MAX_EXTENT_FRACTION * extent:
             raise MeshError(
                 f"smoothing_m: {smoothing_m * 1e3:.3g} mm is more than a third of the object's "
-                f"extent of {extent * 1e3:.3g} mm; reduce it"
+                f"largest extent, {extent * 1e3:.3g} mm; reduce smoothing_m"
             )
         self.smoothing_m = smoothing_m
         used = np.unique(faces)
@@ -122,7 +129,7 @@ class SmoothMeshShape:
             vertices[used], np.searchsorted(used, faces), smoothing_m
         )
         self._centre, self._normal, self._operator = _jets(fine_vertices, fine, smoothing_m)
-        from scipy.spatial import cKDTree  # late, as all of scipy: processes must start quickly
+        from scipy.spatial import cKDTree  # imported late: scipy is slow to import
 
         self._tree = cKDTree(self._centre)
         corners = fine_vertices[fine]
@@ -130,7 +137,7 @@ class SmoothMeshShape:
         self._samples = np.concatenate(
             [fine_vertices, middles.reshape(-1, 3), corners.mean(axis=1)]
         )
-        # Maximum distance of each jet from the points to which it is the nearest.
+        # Maximum distance between each jet and the sample points whose nearest jet it is.
         away, nearest = self._tree.query(self._samples)
         cover = np.zeros(len(self._centre))
         np.maximum.at(cover, nearest, away)
@@ -138,24 +145,25 @@ class SmoothMeshShape:
         self._table, self._counts = self._support_table(1.1 * cover)
 
     def deviation_m(self) -> float:
-        """Return the maximum distance of the mesh from the smooth surface, m.
+        """Return the maximum distance between the mesh and the smooth surface, m.
 
-        It is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError above
-        `MAX_DEVIATION_RATIO` of `smoothing_m`.
+        It is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError if it
+        exceeds `MAX_DEVIATION_RATIO` times `smoothing_m`.
         """
         deviation = float(np.abs(self.closest(self._samples).height_m).max())
         if deviation > MAX_DEVIATION_RATIO * self.smoothing_m:
             raise MeshError(
                 f"smoothing_m: with {self.smoothing_m * 1e3:.3g} mm the surface deviates from the "
-                f"mesh by {deviation * 1e3:.3g} mm; reduce it or refine the mesh"
+                f"mesh by {deviation * 1e3:.3g} mm; reduce smoothing_m or refine the mesh"
             )
         return deviation
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; undecided where two distinct points are equally near.
+        """Find the nearest points, as specified by `Shape.closest`.
 
-        `on_edge` is true for curvatures above `EDGE * MAX_CURVATURE_RATIO / smoothing_m`: at rims
-        thinner than `smoothing_m` and at rounded edges, over which a sheet cannot roll.
+        `on_edge` is true where the curvature exceeds `EDGE * MAX_CURVATURE_RATIO / smoothing_m`.
+        This is the case at rims thinner than `smoothing_m` and at rounded edges, over which a sheet
+        cannot roll. `undecided` is true where two distinct surface points are equally near.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -191,13 +199,13 @@ class SmoothMeshShape:
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance`."""
+        """Return the signed distances, as specified by `Shape.signed_distance`."""
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Return `closest` for one query (3,) by projection from the previous point.
+        """Find the nearest point of one query (3,), starting at the previous point `before` (3,).
 
-        Returns None if that does not converge.
+        Returns None if the projection does not converge.
         """
         feet = self._descend_one(query, before)
         if not feet.is_nearest[0]:
@@ -214,9 +222,9 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest points of queries (n, 3), and which are undecided (n,).
+        """Return the nearest points of queries (n, 3), and whether each one is ambiguous (n,).
 
-        before: previous points (n, 3), or None.
+        before: nearest points (n, 3) of the previous queries, or None.
         """
         if before is None:
             return self._find_global_nearest(queries)
@@ -229,11 +237,12 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the global nearest points without previous points, and which are undecided.
+        """Return the global nearest points of queries (n, 3), and whether each is ambiguous (n,).
 
-        The projection from the nearest jet ends at distance D. A nearer point has a jet within the
-        cover radius c. By the bound on curvature, that jet is at most sqrt(D^2 + c^2 (1 + 4 D /
-        rho)) from the query. `_select_starts` selects the starts of further projections from these.
+        First, each query is projected from its nearest jet, which gives a point at a distance D.
+        Any nearer point has a jet within the radius `_cover` = c. Because curvature is bounded,
+        that jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets in this
+        radius, `_select_starts` chooses the starting points of further projections.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
@@ -260,7 +269,7 @@ class SmoothMeshShape:
                     undecided[row] = True
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
-            # At a rim that the jets do not cover, the nearest jet is the result.
+            # At a rim that no jet covers, use the centre of the nearest jet as the nearest point.
             feet.point[lost], feet.normal[lost] = start[lost], self._normal[nearest[lost]]
             feet.shape_operator[lost] = self._operator[nearest[lost]]
             feet.support[lost], undecided[lost] = 0.0, True
@@ -269,11 +278,14 @@ class SmoothMeshShape:
     def _select_starts(
         self, queries: Floats, lists: list[list[int]], feet: Floats, distance: Floats
     ) -> tuple[Indices, Indices]:
-        """Return starts for a nearer point: rows of the queries (k,), and jets (k,).
+        """Choose further starting points for the search for a nearer surface point.
 
-        The nearest point of such a jet's quadratic is a minimum near the jet, at a distance not
-        much above `distance` (n,). Only one of the jets within `rho` is selected. Jets near the
-        projections `feet` (n, 3) are excluded.
+        lists: indices of the candidate jets (local quadratic fits) of each query. feet (n, 3),
+        distance (n,): nearest points found so far and their distances. Returns k pairs: indices of
+        the queries (k,) and of the jets (k,) at which to start.
+
+        A jet is chosen if the nearest point on its quadratic is close to the jet and not much
+        farther than `distance`. Jets within `rho` of `feet` or of a chosen jet are left out.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -288,7 +300,7 @@ class SmoothMeshShape:
         across = offset - height * normal
         values, vectors = np.linalg.eigh(_IDENTITY + height[:, :, None] * self._operator[jets])
         along = (np.swapaxes(vectors, 1, 2) @ across[:, :, None])[:, :, 0]
-        # The factor 1.5 covers the error of a quadratic's nearest point.
+        # The factor 1.5 allows for the error of the nearest point on a quadratic.
         reach = 1.5 * self._cover * np.maximum(values, MIN_CURVATURE_FACTOR)
         promising = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
         rough_distance = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
@@ -322,7 +334,7 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Implement `Shape.rise_m`, evaluated at the jets."""
+        """Return the rise, as specified by `Shape.rise_m`, evaluated at the centres of the jets."""
         offset = self._centre[:-1] - point
         height = offset @ normal
         across = np.einsum("ji,ji->j", offset, offset) - height * height
@@ -338,7 +350,7 @@ class SmoothMeshShape:
         offset = queries - self._centre[jet]
         height = (offset * normal).sum(1)[:, None]
         across = offset - height * normal
-        # The first two terms of the series of (I + h A)^-1, for small h only.
+        # Use the first two terms of the series of (I + h A)^-1, which is valid for small h only.
         near = np.clip(height, -0.25 * self.smoothing_m, 0.25 * self.smoothing_m)
         along = across - near * (operator @ across[:, :, None])[:, :, 0]
         length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -347,10 +359,11 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """Return the jets (j, k) whose supports reach each jet's neighbourhood, and counts (j,).
+        """List, for each jet, the jets that have weight in its neighbourhood.
 
-        cover (j,): radius of that neighbourhood. Rows are padded with the number of a jet at
-        infinity, which is appended to the jets.
+        cover (j,): radius of the neighbourhood of each jet. Returns a table (j, k) of jet indices
+        and the number (j,) of valid entries in each row. Rows are padded with the index of a
+        far-away jet without influence, which this method appends to the jets.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -364,9 +377,9 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f as a `LevelSet` at points (n, 3) near the surface.
+        """Evaluate f, as a `LevelSet`, at points (n, 3) near the surface.
 
-        The support is the sum of the weights.
+        The last result (n,) is the sum of the weights w_i.
         """
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
@@ -378,7 +391,7 @@ class SmoothMeshShape:
         inside = np.maximum(inside, 0.0)
         weight = inside**4
         total = weight.sum(1)
-        # Only a start far from the surface is outside all supports; it uses the nearest jet alone.
+        # A starting point far from the surface may be outside all supports: use the nearest jet.
         alone = total < 1e-12
         if alone.any():
             weight[alone] = members[alone] == nearest[alone, None]
@@ -386,7 +399,8 @@ class SmoothMeshShape:
         bent = (operator @ offset[..., None])[..., 0]
         distance = height + 0.5 * np.einsum("nki,nki->nk", offset, bent)
         slope = normal + bent
-        # Derivatives of the weights: w' = -4 u^3 and w'' = 12 u^2 by t; dt = (2 / rho^2) lean.
+        # With u = 1 - t, the weight u^4 has the derivatives -4 u^3 and 12 u^2 with respect to t.
+        # The gradient of t is (2 / rho^2) lean.
         lean = offset + FLATNESS * height[..., None] * normal
         fall = (-8.0 / square) * inside**3
         value = (weight * distance).sum(1) / total
@@ -405,9 +419,10 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the nearest jet of a point (3,) and the jets (k,) with supports near it.
+        """Return the index of the jet nearest to a point (3,), and the k jets with weight near it.
 
-        Also returns their centres (k, 3), normals (k, 3) and shape operators (k, 3, 3).
+        The latter are given as indices (k,), centres (k, 3), normals (k, 3) and shape operators
+        (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -421,9 +436,10 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """`LevelAt` of a `SmoothMeshShape` for the points of one projection.
+    """Function that evaluates f of a `SmoothMeshShape` along one projection, as a `LevelAt`.
 
-    The list of jets is updated only after a distance of `MEMBERS_KNOWN`.
+    To save time, the list of nearby jets is updated only when the point has moved by
+    `MEMBERS_KNOWN` times `rho`.
     """
 
     __slots__ = ("_jets", "_jets_point", "_shape")
@@ -466,7 +482,10 @@ class _LevelNear:
 
 
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
-    """Clear `is_nearest` of points with f = 0 beyond the rim of a thin part."""
+    """Clear `is_nearest` for projections that ended beyond the rim of a thin part.
+
+    There, f = 0 does not represent the surface.
+    """
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
     return feet
@@ -478,7 +497,7 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Replace rows of projections by the chosen rows of other projections."""
+    """Replace the given rows of `feet` by the chosen rows of `other`, in place."""
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
     feet.steepness[rows], feet.support[rows] = other.steepness[chosen], other.support[chosen]
@@ -486,7 +505,7 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Return points (j, 3), normals (j, 3) and shape operators (j, 3, 3) of the fitted jets."""
+    """Fit the jets; return their centres (j, 3), normals (j, 3) and shape operators (j, 3, 3)."""
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
 
@@ -507,9 +526,9 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Return vertices of which no two on the same side are closer than `spacing`.
+    """Select vertices such that no two on the same side of the surface are closer than `spacing`.
 
-    Every other vertex has a selected one within that distance.
+    Every other vertex has a selected vertex within that distance. Returns the selected indices.
     """
     selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
@@ -536,10 +555,11 @@ def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
 def _jet(
     origin: Floats, rough: Floats, around: Floats, rho: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit a quadratic z(x, y) to points (m, 3); return point, normal (3,), shape operator (3, 3).
+    """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
 
-    z is along the approximate normal; lengths are scaled by the fit's radius. For too few points
-    the result is the solution of minimum norm.
+    origin, rough (3,): vertex and approximate normal, which defines the z axis. Lengths are scaled
+    by the radius of the fit. If there are too few points, the solution of minimum norm is used.
+    Returns the centre (3,), the normal (3,) and the shape operator (3, 3).
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])
@@ -564,7 +584,7 @@ def _jet(
     normal = frame @ normal
     point = origin + shift * reach * rough
     if (bounded != values).any():
-        # With bounded curvature the quadratic is outside the edge; move it inwards.
+        # Bounding the curvature moves the quadratic outside a sharp edge; shift it back inwards.
         offset = around - point
         distance = offset @ normal + 0.5 * np.einsum("mi,ij,mj->m", offset, operator, offset)
         point = point + (distance @ weight / weight.sum()) * normal

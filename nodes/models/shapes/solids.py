@@ -1,4 +1,7 @@
-"""Define the analytic shapes: cylinder, sphere, plane, ellipsoid, rounded box."""
+"""Define the shapes of virtual objects that have formulas: cylinder, sphere, plane, ellipsoid, box.
+
+Each class implements the interface `Shape` of `surface`, where the terms are defined.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +32,8 @@ _IDENTITY = np.eye(3)
 class CylinderShape(Convex):
     """Circular cylinder about the x axis, centred on the origin.
 
-    Only the side is touchable, because the sheet is clamped along x. The nearest point to a finger
-    beyond an end cap is on the side's rim, with `on_edge`.
+    Only the side can be touched, because the sheet is clamped along x. For a finger beyond an end
+    cap, the nearest point is on the rim of the side, and `on_edge` is true.
     """
 
     radius_m: float
@@ -40,7 +43,7 @@ class CylinderShape(Convex):
         check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; undecided on the axis."""
+        """Find the nearest points, as specified by `Shape.closest`; ambiguous on the axis."""
         queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
         normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
@@ -54,7 +57,7 @@ class CylinderShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, beyond, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance` for the solid with its end caps."""
+        """Return the signed distances to the solid with its end caps, see `Shape`."""
         queries = check_points(points)
         aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
         beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
@@ -62,13 +65,13 @@ class CylinderShape(Convex):
         return np.asarray(outside + np.minimum(np.maximum(aside, beyond), 0.0))
 
     def angle_rad(self, point: Floats) -> float:
-        """Return the angle of a point (3,) about the axis: 0 on +z, positive towards +y."""
+        """Return the angle of a point (3,) about the axis, rad: 0 on +z, positive towards +y."""
         return float(np.arctan2(point[1], point[2]))
 
 
 @dataclass(frozen=True, slots=True)
 class SphereShape(Convex):
-    """Sphere about the origin."""
+    """Sphere centred on the origin."""
 
     radius_m: float
 
@@ -76,7 +79,7 @@ class SphereShape(Convex):
         check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; undecided at the centre."""
+        """Find the nearest points, as specified by `Shape.closest`; ambiguous at the centre."""
         queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
         operator = (_IDENTITY - _outer(normal)) / self.radius_m
@@ -85,13 +88,13 @@ class SphereShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, nowhere, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance`."""
+        """Return the signed distances, as specified by `Shape.signed_distance`."""
         return np.asarray(np.linalg.norm(check_points(points), axis=-1) - self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """Half-space z <= 0, touchable on a rectangle of its face about the origin."""
+    """Half-space z <= 0 that can be touched on a rectangle of its face, centred on the origin."""
 
     width_m: float
     height_m: float
@@ -100,7 +103,10 @@ class PlaneShape(Convex):
         check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; `on_edge` beyond the rectangle (x: width, y: height)."""
+        """Find the nearest points, as specified by `Shape.closest`.
+
+        `on_edge` is true beyond the rectangle, whose width is along x and height along y.
+        """
         queries = check_points(points)
         check_previous(previous, queries)
         half = 0.5 * np.array([self.width_m, self.height_m, np.inf])
@@ -114,13 +120,13 @@ class PlaneShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance` for the whole half-space."""
+        """Return the signed distances to the whole half-space, see `Shape.signed_distance`."""
         return check_points(points)[..., 2].copy()
 
 
 @dataclass(frozen=True, slots=True)
 class EllipsoidShape(Convex):
-    """Ellipsoid about the origin with semi-axes along x, y, z."""
+    """Ellipsoid centred on the origin with semi-axes along x, y and z."""
 
     semi_axes_m: tuple[float, float, float]
 
@@ -129,7 +135,7 @@ class EllipsoidShape(Convex):
             check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; undecided on the medial disc across the shortest axis."""
+        """Find the nearest points, as specified by `Shape.closest`; see `_undecided`."""
         queries = check_points(points)
         before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
@@ -138,7 +144,7 @@ class EllipsoidShape(Convex):
             point = self._nearest(flat, np.broadcast_to(FRONT, flat.shape))
         else:
             starts = before.reshape(-1, 3)
-            # The level set has no slope at the centre, so it cannot be a start.
+            # The gradient vanishes at the centre, so the projection cannot start there.
             at_centre = np.linalg.norm(starts, axis=-1, keepdims=True) < EQUAL_DISTANCE_M
             starts = np.where(at_centre, FRONT * self.semi_axes_m, starts)
             min_axis_m = min(self.semi_axes_m)
@@ -171,11 +177,11 @@ class EllipsoidShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance`."""
+        """Return the signed distances, as specified by `Shape.signed_distance`."""
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate the ellipsoid as a `LevelSet` with support 1."""
+        """Evaluate the function that is zero on the ellipsoid, as a `LevelSet` with support 1."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -185,16 +191,17 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the ellipsoid as a `LevelAt` at a single point."""
+        """Evaluate the function of `_level` at a single point, as a `LevelAt`."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
         return value, (x * p, y * q, z * r), ((p, 0.0, 0.0), (0.0, q, 0.0), (0.0, 0.0, r)), 1.0
 
     def _undecided(self, queries: Floats) -> Bools:
-        """Return which queries (n, 3) have two equally near surface points.
+        """Return whether each query (n, 3) has several equally near surface points.
 
-        These are on a plane of symmetry, within the centres of curvature of the other two axes.
+        Such queries are in the plane through the centre, perpendicular to the shortest axis. They
+        are inside an ellipse that ends at the centres of curvature of the two other axes.
         """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
@@ -205,20 +212,20 @@ class EllipsoidShape(Convex):
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
-        """Return the global nearest surface points (n, 3).
+        """Return the global nearest surface points (n, 3) of queries (n, 3).
 
-        With the semi-axes e, the nearest point is x_i = e_i^2 q_i / (t + e_i^2), where t is the
-        largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to an
-        Ellipsoid, 2013). Newton's method is applied to the reciprocal norm, which is concave, so it
-        converges monotonically (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3). Queries on a
-        plane of symmetry are moved towards `sides` (n, 3) by a billionth of the shortest axis, to
-        avoid the poles.
+        With the semi-axes e_i, the nearest point to a query q is x_i = e_i^2 q_i / (t + e_i^2). t
+        is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to
+        an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the root of this sum,
+        which is concave in t, so it converges monotonically (Conn, Gould, Toint, Trust-Region
+        Methods, sec. 7.3). On a plane of symmetry the terms have poles. Queries there are therefore
+        moved by a billionth of the shortest axis in the directions `sides` (n, 3).
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
         towards = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
         moved = np.where(np.abs(queries) < nudge, nudge * towards, queries)
-        # Without a component across the shortest axis, the positive side is chosen.
+        # If a component is still zero, choose the positive side.
         moved = np.where(np.abs(moved) < 1e-3 * nudge, 1e-3 * nudge, moved)
         size, squares = np.abs(moved) * axes, axes**2
         root = (size - squares).max(axis=-1)
@@ -231,16 +238,17 @@ class EllipsoidShape(Convex):
             if not (np.abs(step) > 1e-15 * (np.abs(root) + squares.min())).any():
                 break
         foot = squares * moved / (root[:, None] + squares)
-        # Scale onto the surface, to remove the residual of the iteration.
+        # Scale the points onto the surface, which removes the residual of the iteration.
         return np.asarray(foot / np.linalg.norm(foot / axes, axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)
 class RoundedBoxShape(Convex):
-    """Box about the origin with rounded edges and corners.
+    """Box centred on the origin, with rounded edges and corners.
 
-    size_m: full extents along x, y, z, including the rounding. edge_radius_m: at most half the
-    smallest extent. The normal is continuous; the curvature is not.
+    size_m: full extents along x, y and z, including the rounding. edge_radius_m: radius of edges
+    and corners, at most half of the smallest extent. The normal is continuous along the surface;
+    the curvature is not. In the methods, the core is the box of all centres of this radius.
     """
 
     size_m: tuple[float, float, float]
@@ -252,12 +260,15 @@ class RoundedBoxShape(Convex):
         check_positive(edge_radius_m=self.edge_radius_m)
         if 2.0 * self.edge_radius_m > min(self.size_m):
             raise ValueError(
-                f"edge_radius_m: {self.edge_radius_m} is more than half the minimum of size_m, "
-                f"{min(self.size_m)}; reduce it"
+                f"edge_radius_m: {self.edge_radius_m} is more than half the minimum extent in "
+                f"size_m, {min(self.size_m)}; reduce edge_radius_m"
             )
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Implement `Shape.closest`; undecided inside where two faces are equally near."""
+        """Find the nearest points, as specified by `Shape.closest`.
+
+        They are ambiguous inside the box where two faces are equally near.
+        """
         queries = check_points(points)
         before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
@@ -294,22 +305,24 @@ class RoundedBoxShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Implement `Shape.signed_distance`."""
+        """Return the signed distances, as specified by `Shape.signed_distance`."""
         away = np.abs(check_points(points)) - self._core()
         outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,) of the box inside the rounding."""
+        """Return the half extents (3,) of the core, m."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return axis, sign and depth (n,) of the nearest core face, and whether it is ambiguous.
+        """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
-        With previous points, only faces at these points are considered. Otherwise the first of
-        equally near faces in the order z, y, x, -z, -y, -x is returned.
+        before: previous nearest points (n, 3), or None; with them, only faces at these points are
+        considered. Otherwise the first of equally near faces in the order z, y, x, -z, -y, -x is
+        chosen. Returns the axis (n,) and the sign (n,) of its normal, the distance from the face
+        (n,), and whether the choice is ambiguous (n,).
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x.
@@ -318,12 +331,12 @@ class RoundedBoxShape(Convex):
         if before is not None:
             out = (before - np.clip(before, -core, core)) / self.edge_radius_m
             allowed = np.concatenate([out, -out], axis=1)[:, [2, 1, 0, 5, 4, 3]] > 0.5
-            # A previous point off the surface is ignored.
+            # Ignore a previous point that is not on the surface.
             allowed |= ~allowed.any(axis=1, keepdims=True)
         first = margins.min(axis=1)
         tied = (margins < first[:, None] + EQUAL_DISTANCE_M).sum(axis=1) > 1
         chosen = np.where(allowed, margins, np.inf)
-        # The tolerance prevents that rounding errors choose between equally near faces.
+        # The tolerance ensures that rounding errors do not decide between equally near faces.
         face = (chosen <= chosen.min(axis=1, keepdims=True) + 1e-12).argmax(axis=1)
         depth = margins[np.arange(len(face)), face]
         return 2 - face % 3, np.where(face < 3, 1.0, -1.0), depth, tied
@@ -338,8 +351,8 @@ def _directions(
 ) -> tuple[Floats, Floats, Bools]:
     """Return unit directions and lengths of offsets from an axis or a centre, and which are zero.
 
-    across: coordinates that offsets may have. Zero offsets get the direction of the previous
-    points, or `FRONT`.
+    across: indices of the coordinates in which the offsets may differ from zero. For a zero offset,
+    the direction is that of the previous point, or else `FRONT`.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

@@ -1,10 +1,11 @@
 """Define the interface of shapes: nearest surface points with normals and curvature.
 
-Points are (3,) or (n, 3) arrays in the object's frame, m; results have the same leading shape.
-Normals point out of the object. Curvature is given as the shape operator W, a symmetric 3x3 matrix
-with W n = 0. Along the surface the normal changes by dn = W dp. The two other eigenvalues are the
-principal curvatures, positive where the object is convex (do Carmo, Differential Geometry of Curves
-and Surfaces, ch. 3).
+Points are arrays (3,) or (n, 3) in the frame of the object, m; results have the same leading shape.
+A query is a point for which the nearest surface point is sought. Normals point out of the object.
+Curvature is given as the shape operator W, a symmetric 3x3 matrix. It maps a small displacement dp
+along the surface to the change of the unit normal n: dn = W dp, and W n = 0. Its two other
+eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
+Differential Geometry of Curves and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -21,26 +22,28 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 EQUAL_DISTANCE_M = 1e-6
-"""Maximum difference of distances that are considered equal."""
+"""Maximum difference between two distances that are considered equal."""
 
 MAX_QUERY_M = 1e6
-"""Maximum distance of a query from the origin."""
+"""Maximum absolute coordinate of a query."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
-"""Direction that is chosen if all surface points are equally near and there is no previous point.
-It faces the user if the object is not rotated."""
+"""Direction in which the nearest point is chosen if several surface points are equally near and
+there is no previous point. It points to the user if the object is not rotated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
-    """Touchable surface points nearest to queries, with the queries' leading shape.
+    """Touchable surface points nearest to queries; arrays have the leading shape of the queries.
 
-    height_m: height of the query above the tangent plane at `point`, negative below it. It is the
-        signed distance, except past an end of the surface.
-    shape_operator: (..., 3, 3) at `point`, 1/m.
-    on_edge: whether `point` is on the rim of the touchable surface with the query past its end, or
-        on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
-    undecided: whether another point is equally near; `previous` or `FRONT` selected this one.
+    point, normal: nearest point, m, and unit normal there (..., 3).
+    height_m: height of the query above the tangent plane at `point`, negative below it. It equals
+        the signed distance, except past an end of the surface.
+    shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
+    on_edge: whether `point` is on the rim of the touchable surface and the query is past that rim,
+        or `point` is on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
+    undecided: whether another surface point is equally near, so that the previous point or `FRONT`
+        determined the choice.
     """
 
     point: Floats
@@ -55,11 +58,12 @@ class Shape(Protocol):
     """Interface of a solid with a touchable surface."""
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Return the nearest touchable points.
+        """Find the touchable surface points nearest to `points`.
 
-        previous: surface points of the previous queries, shaped as `points`; None for a new
-            contact. The local nearest point that continues them is returned as long as it exists,
-            even if another point is equally near, or, inside the object, nearer.
+        previous: nearest points of the previous queries, with the shape of `points`; None for a
+            new contact. They make the results continuous over time. The local nearest point that
+            continues a previous one is returned as long as it exists. This holds even if another
+            point is equally near, or, inside the object, nearer.
 
         Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
         `MAX_QUERY_M`.
@@ -67,15 +71,15 @@ class Shape(Protocol):
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distance (m) to the solid, negative inside; errors as `closest`."""
+        """Return the signed distance (m) to the solid, negative inside; raises as `closest`."""
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the maximum height of the object above its tangent plane at a point (3,), m.
+        """Return how far the object rises above its tangent plane at a surface point (3,), m.
 
-        Only the surface within `radius_m` of the point along that plane is considered; 0 where it
-        is not concave. Heights near the rim of that circle have a smaller weight, so that the
-        result is continuous.
+        Only the surface within `radius_m` of the point, measured along the plane, is considered.
+        The result is 0 where the object is not concave. Heights near the limit of the radius are
+        reduced, so that the result changes continuously with the point.
         """
         ...
 
@@ -86,16 +90,17 @@ class Convex:
     __slots__ = ()
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return 0: a convex solid is below its tangent planes."""
+        """Return 0, because a convex solid is never above its tangent planes."""
         return 0.0
 
 
 def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
     """Return the principal curvatures (..., 2), ascending, 1/m, and their directions (..., 2, 3).
 
-    The directions are unit tangents; at an umbilic point they are any perpendicular pair.
+    The directions are unit tangents. Where both curvatures are equal, they are any perpendicular
+    pair.
     """
-    # Shift the normal's eigenvalue, which is zero, away from the principal curvatures.
+    # The eigenvalue of the normal is zero; shift it above the principal curvatures.
     bound = 1.0 + np.linalg.norm(shape_operator, axis=(-2, -1))
     outer = normal[..., :, None] * normal[..., None, :]
     values, vectors = np.linalg.eigh(shape_operator + 2.0 * bound[..., None, None] * outer)
@@ -105,7 +110,8 @@ def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats
 def tightest_curvature(shape_operator: Floats) -> float:
     """Return the larger principal curvature (1/m) of a shape operator (3, 3).
 
-    It is computed from k1 + k2 (trace) and k1^2 + k2^2 (squared Frobenius norm).
+    It is computed from the sum of both curvatures (trace) and the sum of their squares (squared
+    Frobenius norm).
     """
     total = float(np.einsum("ii", shape_operator))
     squares = float(np.einsum("ij,ij", shape_operator, shape_operator))
@@ -113,10 +119,10 @@ def tightest_curvature(shape_operator: Floats) -> float:
 
 
 def projection_jacobian(found: Nearest) -> Floats:
-    """Return the derivative (..., 3, 3) of the nearest point by the query: (I + h W)^-1 P.
+    """Return the derivative (..., 3, 3) of the nearest point with respect to the query.
 
-    h is the height of the query and P projects onto the tangent plane. Raises LinAlgError at a
-    centre of curvature, where I + h W is singular.
+    It is (I + h W)^-1 P with the height h of the query and the shape operator W. P projects onto
+    the tangent plane. Raises LinAlgError at a centre of curvature, where I + h W is singular.
     """
     normal, operator = found.normal, found.shape_operator
     tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
@@ -125,18 +131,24 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Return points as floats (3,) or (n, 3); raise ValueError for invalid ones."""
+    """Return points as a float array (3,) or (n, 3); raise ValueError if they are invalid.
+
+    name: name of the argument in error texts.
+    """
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
         raise ValueError(f"{name}: expected shape (3,) or (n, 3), found {array.shape}")
     # A comparison with NaN is false, hence the double negation.
     if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
-        raise ValueError(f"{name}: contains NaN, infinity or positions beyond {MAX_QUERY_M:g} m")
+        raise ValueError(
+            f"{name}: contains NaN, infinity or positions beyond {MAX_QUERY_M:g} m; give finite "
+            "coordinates in metres"
+        )
     return array
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Return previous points as floats; raise ValueError if their shape is not that of `points`."""
+    """Return previous points as floats; raise ValueError if their shape differs from `points`."""
     if previous is None:
         return None
     array = check_points(previous, "previous")
@@ -153,15 +165,18 @@ def check_positive(**lengths_m: float) -> None:
 
 
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
-"""Function of points (n, 3) that returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and
-support (n,). It is zero on the surface and increases outwards."""
+"""Function f of points (n, 3) that describes a surface by f = 0 and increases outwards.
+
+It returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and support (n,). The support is a
+measure of how well f is defined at a point; 0 means that the surface is far away."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceProjections:
-    """Results of projections to the surface: points, normals (n, 3) and shape operators (n, 3, 3).
+    """Results of n projections of queries onto a surface.
 
-    steepness, support (n,): length of the level set's gradient, and its support. is_nearest (n,):
+    point, normal (n, 3): surface points, m, and normals. shape_operator (n, 3, 3): 1/m. steepness,
+    support (n,): length of the gradient of the `LevelSet`, and its support. is_nearest (n,):
     whether the projection converged to a local minimum of the distance.
     """
 
@@ -176,7 +191,8 @@ class SurfaceProjections:
 MAX_STEPS = 25
 MIN_EIGENVALUE = 0.02
 """Lower bound on the absolute eigenvalues of the reduced Hessian, which are 1 on a flat surface.
-Near a centre of curvature the full Newton step would be too long; beyond it, the sign changes."""
+They approach 0 near a centre of curvature, where a Newton step would be too long; beyond it, they
+are negative."""
 
 
 def descend(
@@ -184,10 +200,12 @@ def descend(
 ) -> SurfaceProjections:
     """Project `queries` (n, 3) to their nearest surface points, starting at `starts` (n, 3).
 
-    Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization, ch.
-    18). Each step moves to the surface along the gradient, and along the surface by the reduced
-    system with the Lagrangian's Hessian I + lambda H. Its eigenvalues are made positive, so that
-    each step is a descent. stride_m: maximum step. rest_m: step below which it has converged.
+    Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
+    Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
+    surface, and a part along the surface. The latter solves the reduced system with the Hessian of
+    the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). Its eigenvalues are made
+    positive, so that each step is a descent. stride_m: maximum step. rest_m: step below which the
+    method has converged.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -219,7 +237,7 @@ def descend(
         point[moving] = x + step
         normal[moving] = rotated / np.sqrt((rotated * rotated).sum(-1))[:, None]
         operator[moving] = weingarten
-        # Bounded eigenvalues converge slowly, so the last step must be much shorter.
+        # With bounded eigenvalues convergence is slow, so the last step must be much shorter.
         slow = values[:, 0] < MIN_EIGENVALUE
         resting = size <= np.where(slow, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
@@ -234,16 +252,16 @@ _IDENTITY = np.eye(3)
 
 Triple = tuple[float, float, float]
 LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
-"""`LevelSet` for a single point, with Python numbers."""
+"""Variant of `LevelSet` that is evaluated at a single point and uses Python numbers."""
 
 
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Project one query (3,) as `descend`, faster; the results have length one.
+    """Project one query (3,) by the method of `descend`; the results have length one.
 
-    The method is written out in the two tangent directions with Python numbers, because operations
-    on small arrays are slow.
+    The method is written out for the two tangent directions with Python numbers, which is faster
+    than operations on small arrays.
     """
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()
@@ -258,7 +276,7 @@ def descend_one(
         ox, oy, oz = qx - x, qy - y, qz - z
         multiplier = (ox * gx + oy * gy + oz * gz) / square
         fall = -value / length
-        # The Hessian's components in the tangent plane, and those between tangents and normal.
+        # Components of the Hessian in the tangent plane, then those between tangents and normal.
         h11, h12, h22 = _dot(e, he), _dot(f, he), _dot(f, hf)
         h1n, h2n = _dot((ux, uy, uz), he), _dot((ux, uy, uz), hf)
         slope = (
@@ -279,7 +297,7 @@ def descend_one(
             break
     basis = np.array([e, f])
     inner = np.array([[h11, h12], [h12, h22]]) / length
-    # The normal is rotated by the tangential part of the last step.
+    # Rotate the normal according to the tangential part of the last step.
     rotated = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
     return SurfaceProjections(
         np.array([[x, y, z]]),
@@ -292,7 +310,7 @@ def descend_one(
 
 
 def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
-    """Return two unit vectors that complete a unit vector to an orthonormal basis.
+    """Return two unit vectors that form an orthonormal basis with the unit vector (x, y, z).
 
     Source: Duff et al., Building an Orthonormal Basis, Revisited, 2017.
     """
@@ -305,9 +323,10 @@ def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
 def _downhill(
     b11: float, b12: float, b22: float, slope: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Solve a symmetric 2x2 system with bounded eigenvalues.
+    """Solve the symmetric 2x2 system of a Newton step, with its eigenvalues made positive.
 
-    Returns the Newton step and the smaller eigenvalue.
+    b11, b12, b22: entries of the matrix. slope: right-hand side. Returns the two components of the
+    step and the smaller eigenvalue of the original matrix.
     """
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     angle = 0.5 * atan2(2.0 * b12, b11 - b22)

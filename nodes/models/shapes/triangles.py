@@ -1,6 +1,7 @@
 """Check and refine triangle meshes, and compute their normals and nearest points.
 
-Vertices are (v, 3), m. Triangles are (t, 3) vertex numbers, counter-clockwise seen from outside.
+A mesh consists of vertices (v, 3), m, and triangles (t, 3), which contain the indices of their
+vertices, counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
-"""Minimum ratio of a triangle's height to its longest edge; below it, it is degenerate."""
+"""Ratio of its height to its longest edge below which a triangle counts as degenerate."""
 MAX_DIHEDRAL_RAD = np.radians(175.0)
-"""Maximum angle between the normals of neighbouring triangles; above it, they are folded."""
+"""Angle between the normals of neighbouring triangles above which they count as folded."""
 
 
 class MeshError(FlexsheetError, ValueError):
@@ -35,41 +36,54 @@ class MeshError(FlexsheetError, ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
 
-    Checked are shapes, size, vertex numbers, degenerate and repeated triangles, holes, edges of
-    more than two triangles, winding, parts that share a single vertex, folded neighbours and
-    orientation. Intersections of other triangles are slow to find, see `count_intersections`.
+    The errors found are wrong array shapes, size and vertex indices, degenerate and repeated
+    triangles, and holes. They also include edges of more than two triangles, inconsistent winding,
+    parts that share a single vertex, folded neighbours and wrong orientation. Intersections are not
+    searched, because that is slow; see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(
-            f"expected vertices (v, 3) and triangles (t, 3), found {vertices.shape} and "
-            f"{triangles.shape}"
+            f"the arrays of the mesh have the shapes {vertices.shape} and {triangles.shape}, "
+            "expected vertices (v, 3) and triangles (t, 3)"
         )
     if len(triangles) < 4:
-        raise MeshError(f"a mesh of {len(triangles)} triangles cannot bound a solid; complete it")
+        raise MeshError(
+            f"the mesh has {len(triangles)} triangles and cannot bound a solid, which has at least "
+            "4; complete the mesh"
+        )
     if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"{len(triangles)} triangles exceed the maximum of {MAX_TRIANGLES}; decimate the mesh"
+            f"the mesh has {len(triangles)} triangles, the maximum is {MAX_TRIANGLES}; simplify it"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise MeshError(
-            f"a triangle has a vertex number outside 0..{len(vertices) - 1}; export it again"
+            f"a triangle of the mesh has a vertex index outside 0..{len(vertices) - 1}; "
+            "export the mesh again"
         )
     if not np.isfinite(vertices).all():
-        raise MeshError("a vertex is NaN or infinite; export the mesh again")
+        raise MeshError("a vertex of the mesh is NaN or infinite; export the mesh again")
     flat = int(find_degenerate(vertices, triangles).sum())
     if flat:
-        raise MeshError(f"{flat} triangles are degenerate (no area); remove them")
+        raise MeshError(f"{flat} triangles of the mesh are degenerate (no area); remove them")
     _check_edges(triangles)
     _check_fans(triangles)
     folded = int((dihedrals_rad(vertices, triangles)[1] > MAX_DIHEDRAL_RAD).sum())
     if folded:
-        raise MeshError(f"{folded} pairs of neighbouring triangles are folded; repair them")
+        raise MeshError(
+            f"{folded} pairs of neighbouring triangles of the mesh are folded onto each other; "
+            "repair them"
+        )
     if volume_m3(vertices, triangles) <= 0.0:
-        raise MeshError("the mesh is inside out; reverse its triangles")
+        raise MeshError(
+            "the mesh is inside out: its triangles are clockwise seen from outside; reverse them"
+        )
 
 
 def triangulate_grid(rows: int, columns: int) -> Indices32:
-    """Return the triangles (t, 3) of a grid of points, counter-clockwise if rows are along +y."""
+    """Return the triangles (t, 3) that connect a grid of points, numbered row by row.
+
+    They are counter-clockwise if columns follow each other along +x and rows along +y.
+    """
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, above = corner + 1, corner + columns
     both = [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
@@ -77,7 +91,7 @@ def triangulate_grid(rows: int, columns: int) -> Indices32:
 
 
 def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
-    """Return which triangles (t,) have repeated or collinear vertices."""
+    """Return whether each triangle (t,) is degenerate: has repeated or collinear vertices."""
     corners = vertices[triangles]
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(-1).max(-1)
@@ -86,49 +100,63 @@ def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
 
 
 def half_edges(triangles: Indices) -> Indices:
-    """Return the directed edges (3 t, 2): first all triangles' first edges, then second, third."""
+    """Return the directed edges (3 t, 2) of the triangles, as pairs of vertex indices.
+
+    The first edges of all triangles are followed by their second, then by their third edges.
+    """
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Raise MeshError unless every edge occurs once in each direction."""
+    """Raise MeshError unless every edge has two triangles that use it in opposite directions."""
     run = half_edges(triangles)
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
     if open_edges:
         raise MeshError(
-            f"the surface is not closed: {open_edges} edges have one triangle; fill the holes"
+            f"the mesh is not closed: {open_edges} edges have only one triangle; fill the holes"
         )
     if crowded:
-        raise MeshError(f"{crowded} edges have more than two triangles; separate the parts there")
+        raise MeshError(
+            f"{crowded} edges of the mesh have more than two triangles; separate the parts there"
+        )
     twice = len(run) - len(np.unique(run, axis=0))
     if twice:
-        raise MeshError(f"winding is inconsistent along {twice} of {len(edges)} edges; unify it")
+        raise MeshError(
+            f"the triangle winding is inconsistent along {twice} of {len(edges)} edges of the "
+            "mesh; reverse triangles until neighbours agree"
+        )
 
 
 def _check_fans(triangles: Indices) -> None:
-    """Raise MeshError unless the triangles around each vertex form a single fan."""
+    """Raise MeshError unless the triangles around each vertex form a single closed fan.
+
+    Otherwise, parts of the surface touch each other at that vertex only.
+    """
     count = len(triangles)
     first, second = _neighbours(triangles)
-    # Corner c of triangle t has number c * count + t. At each end of an edge, the corners of its
-    # two triangles are connected.
+    # Corner c of triangle t has the index c * count + t. Build a graph of corners: at each end of
+    # an edge, the corners of the two adjacent triangles are connected.
     ends = [(first, (second + count) % (3 * count)), ((first + count) % (3 * count), second)]
     rows, columns = (np.concatenate(side) for side in zip(*ends, strict=True))
-    from scipy.sparse import coo_array  # imported here, since processes must start quickly
+    from scipy.sparse import coo_array  # imported late: scipy is slow to import
     from scipy.sparse.csgraph import connected_components
 
     joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
     fans = connected_components(joined, directed=False)[0]
     pinched = fans - len(np.unique(triangles))
     if pinched:
-        raise MeshError(f"parts of the surface touch in {pinched} single vertices; separate them")
+        raise MeshError(
+            f"parts of the mesh touch in {pinched} single vertices, without a common edge; "
+            "separate them"
+        )
 
 
 def unify_winding(triangles: Indices) -> Indices:
     """Reverse some triangles (t, 3) so that neighbours across edges have the same winding.
 
-    In each connected part the minority is reversed. On a surface without consistent winding, such
-    as a Möbius strip, `check_mesh` fails afterwards.
+    In each connected part, the winding of the majority is kept. If no consistent winding exists, as
+    on a Möbius strip, `check_mesh` fails afterwards.
     """
     count = len(triangles)
     run = half_edges(triangles)
@@ -163,7 +191,7 @@ def unify_winding(triangles: Indices) -> Indices:
 
 
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
-    """Return pairs of half-edges (row numbers of `half_edges`) of the same edge."""
+    """Return the two half-edges of each edge, as two arrays (e,) of row indices of `half_edges`."""
     run = half_edges(triangles)
     span = int(triangles.max()) + 1
     forward, backward = run[:, 0] * span + run[:, 1], run[:, 1] * span + run[:, 0]
@@ -174,16 +202,17 @@ def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
 
 
 def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return the triangles' unit normals (t, 3)."""
+    """Return the unit normals (t, 3) of the triangles."""
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return the vertices' unit normals (v, 3): angle-weighted means of the triangles' normals.
+    """Return unit normals (v, 3) at the vertices, to approximate a smooth surface.
 
-    Source: Thürmer and Wüthrich, 1998.
+    They are means of the normals of the adjacent triangles, weighted by the angles of these
+    triangles at the vertex (Thürmer and Wüthrich, 1998).
     """
     corners, normal = vertices[triangles], triangle_normals(vertices, triangles)
     total = np.zeros_like(vertices)
@@ -197,7 +226,10 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Return the edges (e, 2) of a closed mesh and the angles (e,) between their normals, rad."""
+    """Return the edges (e, 2) of a closed mesh and the angles (e,) across them, rad.
+
+    The angle is that between the normals of the two adjacent triangles.
+    """
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
     one, other = normal[first % count], normal[second % count]
@@ -206,7 +238,7 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Return the enclosed volume, m^3, negative for clockwise triangles."""
+    """Return the volume that a closed mesh encloses, m^3; negative for clockwise triangles."""
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
@@ -214,15 +246,15 @@ def volume_m3(vertices: Floats, triangles: Indices) -> float:
 def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
     """Divide the triangles until no edge is longer than `longest_m`.
 
-    A long edge is halved in both of its triangles, so that a closed mesh remains closed. Raises
-    MeshError for more than `MAX_TRIANGLES`.
+    A long edge is halved in both adjacent triangles, so that a closed mesh remains closed. Returns
+    the new vertices and triangles. Raises MeshError if there are more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
         edges, which = np.unique(run, axis=0, return_inverse=True)
         which = which.reshape(3, -1).T
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-        # Only a triangle's longest edge is halved, which preserves the triangles' shape.
+        # Halve only the longest edge of a triangle, which keeps the triangles well shaped.
         longest = which[np.arange(len(which)), length[which].argmax(axis=1)]
         halved = np.zeros(len(edges), dtype=bool)
         halved[longest[length[longest] > longest_m]] = True
@@ -234,13 +266,17 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
         triangles = np.concatenate(list(_split(triangles, middle[which])))
         if len(triangles) > MAX_TRIANGLES:
             raise MeshError(
-                f"dividing edges of up to {length.max():.3g} m into edges of {longest_m:.3g} m "
-                f"needs more than {MAX_TRIANGLES} triangles; increase the edge length"
+                f"the mesh has edges of up to {length.max():.3g} m; dividing them to at most "
+                f"{longest_m:.3g} m needs more than {MAX_TRIANGLES} triangles; increase the edge "
+                "length (smoothing_m of a mesh in a scene)"
             )
 
 
 def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
-    """Split the triangles at the midpoints (t, 3) of their edges; -1: the edge is not split."""
+    """Split the triangles at the midpoints of some of their edges; yield the parts.
+
+    middle (t, 3): vertex index of the midpoint of each edge; -1 if the edge is not split.
+    """
     cuts = (middle >= 0).sum(axis=1)
     yield triangles[cuts == 0]
     for i in range(3):
@@ -264,8 +300,9 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
-    An edge of one must pass through the interior of the other, and they must not share a vertex.
-    Triangles that only touch, or overlap in one plane, are not counted.
+    A pair is counted if an edge of one triangle passes through the interior of the other. The ends
+    of this edge must not be vertices of the other. Triangles that only touch, or overlap in one
+    plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -288,9 +325,10 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 
 
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
-    """Yield the pairs of overlapping balls (rows, columns) in batches.
+    """Yield the pairs of overlapping balls in batches, as two arrays of ball indices.
 
-    Balls of similar size are searched together, because the search radius is that of the largest.
+    centre (n, 3), radius (n,): balls. Balls of similar size are searched together, because the
+    search radius must be that of the largest ball.
     """
     from scipy.spatial import cKDTree
 
@@ -311,7 +349,9 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return which segments (n, 3) pass through the interior of their triangles (n, 3, 3).
+    """Return whether each segment from `start` to `end` (n, 3) passes through its triangle.
+
+    corners (n, 3, 3): one triangle for each segment, of which only the interior counts.
 
     Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
     """
@@ -332,9 +372,10 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return barycentric coordinates (n, 3) of the points nearest to points (n, 3) in triangles.
+    """Find the point of a triangle that is nearest to a given point, for n points (n, 3).
 
-    corners (n, 3, 3). Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
+    corners (n, 3, 3): one triangle for each point. Returns barycentric coordinates (n, 3). Source:
+    Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """
     a = corners[:, 0]
     first, second = corners[:, 1] - a, corners[:, 2] - a
