@@ -117,7 +117,7 @@ def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[s
         ({"shape": "mesh_file", "file": "a.stl"}, '"metres_per_unit" is missing'),
         (
             {"shape": "mesh_file", "file": "none.stl", "metres_per_unit": 1.0},
-            'object.geometry.file: "none.stl": cannot be read',
+            'object.geometry.file: "none.stl": the mesh file',
         ),
     ],
 )

@@ -43,7 +43,8 @@ SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""Every how many frames contain pixels. An odd number, so that both eyes' frames do in turn."""
+"""Interval, in frames, between frames with pixels. It is odd, so that both eyes' frames have them
+in turn."""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_LOAD_PER_CORE = 3.0

@@ -105,7 +105,7 @@ class MeasuredFinger:
         self._horizons_s = np.arange(0.0, PREDICTION_S + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
 
     def predict_path(self, at_ns: int, position_world: Floats) -> Floats:
-        """Return the predicted finger path (n, 3), given the true position (3,) at an exposure."""
+        """Measure the finger at its true position (3,); return its predicted path (n, 3)."""
         in_left = apply(self._left_from_world, position_world)
         in_right = apply(self._camera.right_from_left, in_left)
         pixels = [

@@ -50,7 +50,7 @@ class Range:
 
     def add(self, index: int, value: float) -> None:
         """Add a value to the interval `index`."""
-        # The negated comparison is also true for NaN, the initial value.
+        # The negated comparison is also true if the stored value is NaN, its initial value.
         if not value >= self.minimum[index]:
             self.minimum[index] = value
         if not value <= self.maximum[index]:

@@ -259,7 +259,7 @@ class Session:
         self._add_flow(topic, header, log_ns)
         if isinstance(message, Clocks) and header.clock_id == self.clock_id:
             self._table.update(message)
-        # Durations between timestamps of one clock need no conversion between hosts.
+        # Durations between two timestamps of one message need no conversion between clocks.
         seconds, index = self.seconds(log_ns), self.grid.index(log_ns)
         for event, exposure_ns, at_ns in list_events(message, header):
             if self._exposures.get(event) != exposure_ns:
@@ -388,7 +388,7 @@ class Session:
                     self.events.add(seconds, "scene", f'scene "{message.name}"')
             case EStop():
                 state = "engaged" if message.engaged else "released"
-                # An unchanged e-stop may be published again for late subscribers; that is no event.
+                # Ignore an unchanged e-stop, which is published again for late subscribers.
                 if self.estop.add(self.fine.index(log_ns), log_ns, state) or (
                     message.engaged and "estop" not in self.events.counts
                 ):
