@@ -354,7 +354,7 @@ class BagReader:
                 self._index_remaining_chunks(file)
         except OSError as error:
             raise BagError(
-                f"{self.path}: cannot read the bag: {error.strerror or error}; check the path"
+                f"{self.path}: cannot be read: {error.strerror or error}; check the path"
             ) from error
         self._check_topics()
 

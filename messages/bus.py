@@ -788,7 +788,7 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
             # ZeroMQ's thread may release the endpoint of a closed writer slightly later, so retry.
             if time.monotonic() > deadline_s:
                 raise BusError(
-                    f'topic "{topic.name}": {endpoint} is already in use by another process; '
+                    f'topic "{topic.name}": {endpoint} is in use by another process; '
                     "is the same launch file running already?"
                 ) from error
             time.sleep(0.01)
@@ -804,7 +804,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
         raise BusError(f'topic "{topic.name}": {endpoint}: the port must be in 1..65535')
     if transport == "ipc" and len(os.fsencode(address)) > IPC_PATH_BYTES:
         raise BusError(
-            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(address))} bytes; '
+            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(address))} bytes, '
             f"the system allows {IPC_PATH_BYTES}; choose a shorter folder for sockets"
         )
     if transport not in ("tcp", "ipc"):

@@ -89,11 +89,11 @@ def read_calibration(
     # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
         raise CalibrationFileError(
-            f"{path}: not a YAML file written by `{command}`: {str(error)[:200]}"
+            f"{path}: not YAML that `{command}` wrote: {str(error)[:200]}"
         ) from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(
-            f'{path}: does not contain the key "version", so it is not a calibration; run `{command}`'
+            f'{path}: does not contain the key "version": not a calibration; run `{command}`'
         )
     if content["version"] != version:
         raise CalibrationFileError(

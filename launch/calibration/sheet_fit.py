@@ -116,7 +116,7 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
     deviation = share * float(np.hypot(errors[0] / loading, errors[1] / falls))
     if share > 1.0 + 3.0 * deviation:
         raise SheetModelFitError(
-            f"column unloading: forces are {share:.2f} times those of loading; check that column"
+            f"column unloading: its force is {share:.2f} times that of loading; check the column"
         )
     # (1 - h) / (1 + h) is the ratio of the forces, and 2 h / (1 + h) the lost fraction of the
     # energy.
