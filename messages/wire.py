@@ -54,8 +54,10 @@ MAX_HEADER_BYTES = 1 << 20
 """Maximum size of the header frame; its decoded values can need up to 64 times as much memory."""
 
 MAX_ELEMENTS = 4096
-"""Maximum number of elements of an array or a map in the header.  A decoder allocates the stated
-length before it reads the elements, and arrays can be nested."""
+"""Maximum number of elements of an array or a map in the header frame.
+
+A decoder allocates the stated length before it reads the elements, and arrays can be nested.
+"""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
