@@ -1,9 +1,10 @@
-"""Define the apparatus: the true parameters of the simulation, as differences from the scene.
+"""Define the apparatus: the true parameters of the simulated hardware, relative to the scene.
 
-The scene is what the nodes believe. The apparatus is what is true, and only the simulator and the
-evaluation of experiments read it. All differences are zero, and all ratios one, in a nominal
-apparatus. Offsets are true value minus the scene's. Rotation offsets are rotation vectors about the
-world's axes (edge: the flange's axes), applied about the frame's own origin.
+The scene is what the nodes assume. The apparatus is the truth, which only the simulator and the
+evaluation of experiments read. In a nominal apparatus, which equals its scene, all offsets are zero
+and all ratios are one. An offset is the true value minus the scene's value. Rotation offsets are
+rotation vectors about the world's axes (for the edge: the flange's axes), applied about the frame's
+own origin.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Pair = tuple[Finite, Finite]
 Triple = tuple[Finite, Finite, Finite]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
-"""A relative deviation or a small angle; what is beyond it is a mistake in the file."""
+"""Relative deviation or small angle; a value outside this range indicates a mistake in the file."""
 
 SmallTriple = tuple[Small, Small, Small]
 SmallSix = tuple[Small, Small, Small, Small, Small, Small]
@@ -44,69 +45,79 @@ ZERO_6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class LensTruth(Part):
-    """Differences of a lens from the scene's (a camera's: from that of its device)."""
+    """Deviations of a lens from the scene's; for a camera, from that of its device."""
 
-    focal_ratio: NearOne = Field(default=1.0, description="true focal length over the scene's")
+    focal_ratio: NearOne = Field(
+        default=1.0, description="true focal length divided by the scene's focal length"
+    )
     centre_offset_px: Pair = (0.0, 0.0)
-    radial_offset: Pair = Field(default=(0.0, 0.0), description="of the distortion's k1 and k2")
+    radial_offset: Pair = Field(
+        default=(0.0, 0.0), description="true minus nominal distortion coefficients k1 and k2"
+    )
 
 
 class CameraTruth(Part):
-    """Differences of the stereo camera from the scene's."""
+    """Deviations of the simulated stereo camera from the one that the scene specifies."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
     left: LensTruth = Field(default_factory=LensTruth)
     right: LensTruth = Field(default_factory=LensTruth)
     right_position_offset_m: SmallTriple = Field(
-        default=ZERO_3, description="of the right camera, in its own frame"
+        default=ZERO_3, description="displacement of the right camera, in its own frame"
     )
     right_rotation_offset_rad: SmallTriple = ZERO_3
-    rate_hz: Positive | None = Field(default=None, description="null: the scene's")
+    rate_hz: Positive | None = Field(
+        default=None, description="true frame rate; null: the scene's frame rate"
+    )
     read_out_s: NonNegative | None = Field(
         default=None,
-        description="from the end of exposure to the message; null: the simulator's parameter",
+        description="time from the end of exposure to the message; null: the simulator's parameter",
     )
     skew_s: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
-        default=0.0, description="exposure of the right image minus that of the left, not reported"
+        default=0.0,
+        description="right image's exposure time minus the left one's, which is not reported",
     )
     exposure_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
-        default=0.0, description="standard deviation of the true exposure time about its stamp"
+        default=0.0,
+        description="standard deviation of the difference between exposure time and timestamp",
     )
     stamp_offset_s: Annotated[float, Field(ge=-0.1, le=0.1)] = Field(
-        default=0.0, description="true exposure time minus its stamp"
+        default=0.0, description="true time of the exposure minus its timestamp"
     )
 
 
 class ArmTruth(Part):
-    """Differences of one arm from the scene's, and how its controller behaves."""
+    """Deviations of one arm from the scene's arm, and the behaviour of its controller."""
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3
     edge_position_offset_m: SmallTriple = Field(
-        default=ZERO_3, description="of the clamped edge, in the flange's frame"
+        default=ZERO_3, description="displacement of the clamped edge, in the flange's frame"
     )
     edge_rotation_offset_rad: SmallTriple = ZERO_3
     joint_offsets_rad: SmallSix = Field(
-        default=ZERO_6, description="true joint angle minus that of the encoder"
+        default=ZERO_6, description="true joint angles minus the angles that the encoders report"
     )
     flange_compliance_m_per_n: Annotated[float, Field(ge=0, le=1e-2)] = Field(
-        default=0.0, description="displacement of the flange by the sheet's pull"
+        default=0.0, description="displacement of the flange per newton of the sheet's pull"
     )
     servo_lag_s: Positive | None = Field(
-        default=None, description="null: the simulator's parameter"
+        default=None,
+        description="lag of the arm behind its commands; null: the simulator's parameter",
     )
     command_latency_s: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="from the arrival of a set-point to its effect"
+        default=0.0, description="time from the arrival of a set-point until it takes effect"
     )
     controller_period_s: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
-        default=None, description="set-points take effect in such cycles; null: the simulator's"
+        default=None,
+        description="period in which set-points take effect; null: the simulator's parameter",
     )
     controller_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
-        default=0.0, description="standard deviation of each cycle's begin"
+        default=0.0, description="standard deviation of the start time of each cycle"
     )
     backlash_rad: Annotated[float, Field(ge=0, le=0.1)] | None = Field(
-        default=None, description="play of each gear; null: the simulator's parameter"
+        default=None, description="backlash of each joint's gear; null: the simulator's parameter"
     )
 
 
@@ -116,92 +127,105 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """Differences of the sheet from the scene's, and properties that the scene lacks."""
+    """Deviations of the sheet from the scene's, and properties that the scene lacks."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_gradient_ratio: tuple[Small, Small] = Field(
         default=(0.0, 0.0),
-        description="relative change of thickness from edge to edge, along x and y",
+        description="relative change of the thickness from one edge to the other, along x and y",
     )
     slack_width_offset_m: Small = 0.0
     clamp_slip_m: tuple[Share, Share] = Field(
-        default=(0.0, 0.0), description="rubber that the left and right clamp let through"
+        default=(0.0, 0.0),
+        description="length of rubber that slips through the left and right clamp",
     )
     density_kg_per_m3: NonNegative | None = Field(
-        default=None, description="null: the scene's; 0: without weight"
+        default=None, description="density of the rubber; null: the scene's density; 0: weightless"
     )
     friction_coefficient: NonNegative | None = Field(
-        default=None, description="between finger and sheet; null: touched rubber sticks"
+        default=None,
+        description="friction between finger and sheet; null: the finger does not slip",
     )
     hysteresis_ratio: Share = Field(
-        default=0.0, description="fraction of the stored energy that a cycle loses"
+        default=0.0, description="fraction of the stored energy that is lost in a loading cycle"
     )
     creep_ratio_per_decade: Share = Field(
-        default=0.0, description="relative loss of tension per decade of time"
+        default=0.0, description="relative loss of tension per tenfold increase of time"
     )
 
 
 class FingerTruth(Part):
-    """Differences of the finger, its marker and its motion from the nodes' assumptions.
+    """Deviations of the finger, its marker and its motion from the nodes' assumptions.
 
-    The finger's frame has its origin at the pad's contact point (the fingertip of all messages), x
-    along the finger towards the hand, z from the pad to the nail, y = z x x.
+    Finger frame: origin at the contact point of the fingertip pad (the fingertip of all messages),
+    x along the finger towards the hand, z from the pad to the nail, y = z x x (cross product).
     """
 
     radius_offset_m: Small = 0.0
     marker_from_pad_m: SmallTriple = Field(
-        default=ZERO_3, description="centre of the marker in the finger's frame"
+        default=ZERO_3,
+        description="true position of the marker's centre, in the finger's frame",
     )
     marker_shape: Literal["ball", "disc"] = Field(
         default="ball", description="disc: flat on the nail, seen as an ellipse"
     )
     marker_tilt_rad: tuple[Finite, Finite] = Field(
-        default=(0.0, 0.0), description="of the disc's normal from z, about the finger's x and y"
+        default=(0.0, 0.0),
+        description="tilt of the disc's normal from z, about the finger's x and y axes",
     )
     finger_tilt_rad: tuple[Finite, Finite] = Field(
         default=(0.0, 0.0),
-        description="of the finger from the simulator's direction, about the world's x and y",
+        description="tilt of the finger from its nominal direction, about the world's x and y",
     )
-    tremor_frequency_hz: Positive = Field(default=10.0, description="middle of the band")
-    tremor_width_hz: Positive = Field(default=4.0, description="whole width of the band")
+    tremor_frequency_hz: Positive = Field(
+        default=10.0, description="centre of the tremor's frequency band"
+    )
+    tremor_width_hz: Positive = Field(
+        default=4.0, description="total width of the tremor's frequency band"
+    )
     tremor_rms_m: NonNegative | None = Field(
-        default=None, description="per axis, on paths with tremor; null: the path's own"
+        default=None,
+        description="rms tremor per axis, on paths with tremor; null: the value of the path",
     )
     voluntary_bandwidth_hz: Annotated[float, Field(ge=0.2, le=20)] = Field(
-        default=1.2, description="upper end of the slow unsteadiness"
+        default=1.2, description="upper frequency limit of slow random finger motion"
     )
     hand_mass_kg: Positive | None = Field(
-        default=None, description="null: the finger follows its path whatever it feels"
+        default=None,
+        description="mass of the hand; null: contact forces do not move the finger off its path",
     )
     hand_damping_ns_per_m: NonNegative | None = None
     hand_stiffness_n_per_m: NonNegative | None = None
 
 
 class EyesTruth(Part):
-    """Offsets of the true eyes from the tracked eyes, or from the scene's."""
+    """Deviations of the true eye positions from the tracked ones, or from those in the scene."""
 
     centre_offset_m: SmallTriple = ZERO_3
     interocular_offset_m: Small = 0.0
     sway_m: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.0, description="standard deviation per axis of the head's slow motion"
+        default=0.0, description="standard deviation per axis of the slow head motion"
     )
-    sway_frequency_hz: Positive = Field(default=0.3, description="highest frequency of the sway")
+    sway_frequency_hz: Positive = Field(
+        default=0.3, description="highest frequency of the head motion"
+    )
 
 
 class ProjectorTruth(Part):
-    """Differences of the projector from the scene's."""
+    """Deviations of the projector from the scene's projector."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
     lens: LensTruth = Field(default_factory=LensTruth)
     latency_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
-        default=0.0, description="true time of light minus the renderer's display_latency_s"
+        default=0.0,
+        description="actual display latency minus the renderer's assumed display_latency_s",
     )
 
 
 class Devices(Part):
-    """Device parts of the scene from which the differences are counted."""
+    """Devices of the scene to which the deviations refer."""
 
     camera: StereoCamera
     arms: Arms
@@ -212,16 +236,17 @@ class Devices(Part):
 
 
 class Apparatus(Message):
-    """True devices of the simulator, as differences from a scene."""
+    """True parameters of the simulated hardware, as deviations from a scene."""
 
-    scene: str = Field(description="name of the scene")
+    scene: str = Field(description="name of the scene to which the deviations refer")
     scene_id: str | None = Field(
-        default=None, description="identity of its object and devices; null: only the name counts"
+        default=None,
+        description="hash of the scene's object and devices; null: only the name is compared",
     )
-    origin: str = Field(default="file", description="origin, as text for users")
+    origin: str = Field(default="file", description="origin of the values, as text for users")
     nominal: Devices | None = Field(
         default=None,
-        description="devices from which the differences are counted; null: those of the scene",
+        description="devices to which the deviations refer; null: those of the scene",
     )
     camera: CameraTruth = Field(default_factory=CameraTruth)
     arms: ArmsTruth = Field(default_factory=ArmsTruth)
@@ -232,9 +257,9 @@ class Apparatus(Message):
 
 
 def identify_scene(scene: Scene) -> str:
-    """Return 16 digits that identify a scene's object and devices.
+    """Return a hash (16 digits) that identifies a scene's object and devices.
 
-    What a calibration changes has no influence, so that a calibrated scene keeps its identity.
+    Values that a calibration replaces are not included, so that a calibrated scene keeps its hash.
     """
     values = {
         "name": scene.name,
@@ -262,7 +287,7 @@ def devices_of(scene: Scene) -> Devices:
 
 
 def nominal_apparatus(scene: Scene) -> Apparatus:
-    """Return the apparatus that equals its scene."""
+    """Return an apparatus without deviations from the scene."""
     return Apparatus(
         scene=scene.name,
         scene_id=identify_scene(scene),

@@ -1,4 +1,4 @@
-"""Define the calibration file of the arms' bases, which `flexsheet calibrate arms` writes."""
+"""Define the calibration file of the poses of the arms' bases, from `flexsheet calibrate arms`."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ class ArmPoseFit(Part):
 
     name: str
     used: bool
-    reason: str = Field(description="why the pose was left out; empty if used")
+    reason: str = Field(description="reason why the pose was left out; empty if it was used")
     shift_m: NonNegative = Field(
-        description="distance of the measured board from that by the joints"
+        description="distance between the board poses from the camera and from the joints"
     )
     rotation_rad: NonNegative
-    rms_px: NonNegative = Field(description="reprojection error of the corners by the joints")
+    rms_px: NonNegative = Field(
+        description="reprojection error of the corners, with the pose computed from the joints"
+    )
 
 
 class ArmBase(Part):
-    """Pose of one arm's base, and its uncertainty as standard deviations."""
+    """Pose of one arm's base, with its uncertainty as standard deviations."""
 
     world_from_base: Pose
     flange_from_board: Pose
@@ -43,8 +45,8 @@ class ArmBase(Part):
         "world's axes (rad), then translation (m)"
     )
     jackknife_ratio: NonNegative = Field(
-        description="scatter of fits without one pose, over that by the covariance; above 1 the "
-        "covariance was multiplied by its square"
+        description="scatter of the fits that leave out one pose, divided by the scatter that the "
+        "covariance predicts; if above 1, the covariance was multiplied by its square"
     )
     max_change_m: NonNegative = Field(
         description="maximum change of the base's position when one pose is left out"
@@ -54,14 +56,14 @@ class ArmBase(Part):
         description="standard deviation of one coordinate of a corner"
     )
     arm_sigma_m: NonNegative = Field(
-        description="error of the flange's position by the joints, per axis"
+        description="standard deviation per axis of the flange position computed from the joints"
     )
     arm_sigma_rad: NonNegative
     poses: tuple[ArmPoseFit, ...]
 
 
 class ArmsCalibration(Part):
-    """Calibration of the arms' bases; an arm that was not measured is null."""
+    """Calibration of the poses of both arms' bases; an arm that was not measured is null."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -74,13 +76,13 @@ class ArmsCalibration(Part):
 
 
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; FileWriteError if the disk refuses it."""
+    """Write the calibration file; raises FileWriteError if it cannot be written."""
     title = f"Bases of the arms of scene {calibration.scene}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_arms_calibration(path: Path) -> ArmsCalibration:
-    """Read the calibration file; CalibrationFileError if it is invalid."""
+    """Read the calibration file; raises CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate arms"
     return read_calibration(
         ArmsCalibration, path, version=ARMS_CALIBRATION_VERSION, command=command

@@ -1,8 +1,8 @@
 """Define array fields whose element type and shape are part of the message's type.
 
 A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``.  The common types
-have names (``Vector3``, ``Transform``, ...).  Validation does not copy a valid array, so a
-subscriber reads the memory that came from the socket.
+have names (``Vector3``, ``Transform``, ...).  A valid array is not copied by the validation, so a
+subscriber reads the memory that was received from the socket.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 Dimension = int | str
-"""A fixed length, or the name of a variable one; equal names in one array mean equal lengths."""
+"""Length of an axis: fixed, or the name of a variable length; equal names mean equal lengths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +36,10 @@ class ArraySpec:
     finite: bool = True
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return `value` as an array of this type; ValueError for another type or shape.
+        """Return `value` as an array of this type; raises ValueError for another type or shape.
 
-        Arrays must have the exact dtype, because a silent float64 -> float32 would lose digits.
-        Nested lists, as in a scene file, are converted.
+        Arrays must have the exact dtype, because a silent conversion from float64 to float32 would
+        lose digits. Nested lists, as in a scene file, are converted.
         """
         expected = _dtype(self.dtype)
         if isinstance(value, np.ndarray):
@@ -49,7 +49,7 @@ class ArraySpec:
         elif isinstance(value, (list, tuple)):
             array = _convert_lists(value, expected)
         else:
-            raise ValueError(f"{type(value).__name__} is not an array of {expected}")
+            raise ValueError(f"{type(value).__name__} cannot be used as an array of {expected}")
         if not _has_shape(array.shape, self.shape):
             raise ValueError(f"array of shape {array.shape}, expected {self.describe_shape()}")
         if not array.flags.c_contiguous:
@@ -71,7 +71,7 @@ class ArraySpec:
         array_type, has_shape, all_finite = np.ndarray, _has_shape, _all_finite
 
         def validate(value: object) -> NDArray[Any]:
-            """Accept a valid array at once; otherwise run the full validation."""
+            """Accept a valid array quickly; otherwise run the full validation."""
             if (
                 type(value) is array_type
                 and value.dtype is expected
@@ -130,8 +130,8 @@ def _convert_lists(value: list[Any] | tuple[Any, ...], expected: np.dtype[Any]) 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
     """Return whether no element is NaN or infinite.
 
-    A sum is NaN or infinite if an element is.  For few elements it is faster than numpy's test.
-    It may overflow for finite elements, which numpy then decides.
+    A sum is NaN or infinite if an element is.  For few elements, a sum is faster than numpy's test.
+    A sum of finite elements may overflow; then numpy's test decides.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):
         return True

@@ -1,18 +1,19 @@
-"""Read and write bags: MCAP files of the messages' bytes on the wire, with schemas and times.
+"""Read and write bags: MCAP files of messages as serialized for transport, with schemas and times.
 
 This module defines what MCAP leaves to the application:
 
 - Profile "flexsheet"; one schema per message type (JSON Schema); one channel per topic, encoding
   "flexsheet/2", with the type's fingerprint in the channel's metadata.
-- `log_time` is when the recorder received the message, `publish_time` is the header's source
-  stamp; both in ns of a monotonic clock, not since 1970.
-- The data of a message are its frames: uint32 number of frames, four zero bytes, and a uint64
-  length per frame.  Then the frames follow, each padded with zeros to a multiple of eight, which
-  aligns arrays for reading in place.  All numbers are little-endian.
+- `log_time` is when the recorder received the message, `publish_time` is the source timestamp of
+  the message's header; both in ns of a monotonic clock, not since 1970.
+- The data of one message are its frames (byte strings of a ZeroMQ multipart message): uint32
+  number of frames, four zero bytes, and a uint64 length per frame.  Then the frames follow, each
+  padded with zeros to a multiple of eight bytes, so that arrays are aligned and can be read without
+  a copy.  All numbers are little-endian.
 
-A writer flushes its data to the disk every second.  A reader scans the records and does not need
-the index at the end.  A file that a crash has truncated ends earlier, and `BagReader.complete` is
-false.
+A writer flushes its data to the disk every second.  A reader scans the records from the start and
+does not need the index at the end.  A file that was truncated by a crash can therefore be read up
+to the truncation; `BagReader.complete` is then false.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
 MAX_SUMMARY_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 256 << 20
-"""Maximum uncompressed chunk; a writer closes a chunk with the message that exceeds 1 MiB."""
+"""Maximum uncompressed size of a chunk; a writer starts a new chunk after 1 MiB."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
@@ -67,7 +68,7 @@ class BagError(FlexsheetError):
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:
-    """Encode the frames of one recorded message; the layout is in the module's docstring."""
+    """Encode the frames of one message for the bag; the module's docstring specifies the layout."""
     lengths = [len(frame) for frame in frames]
     parts: list[Any] = [struct.pack(f"<II{len(lengths)}Q", len(lengths), 0, *lengths)]
     for frame, length in zip(frames, lengths, strict=True):
@@ -81,13 +82,15 @@ def split_frames(data: bytes) -> list[memoryview]:
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
     if not count or offset > len(view):
-        raise WireError("malformed", "recorded data are not frames")
+        raise WireError("malformed", "the recorded bytes are not a message's frames")
     frames = []
     for length in struct.unpack_from(f"<{count}Q", view, 8):
         frames.append(view[offset : offset + length])
         offset += length + -length % 8
     if offset != len(view):
-        raise WireError("malformed", f"recorded frames: expected {offset} bytes, found {len(view)}")
+        raise WireError(
+            "malformed", f"the recorded frames have {len(view)} bytes, expected {offset}"
+        )
     return frames
 
 
@@ -95,8 +98,8 @@ class BagWriter:
     """Writer of one bag, a context manager; its methods must be called from one thread.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
-    compress: compress chunks of about 1 MiB by zstd; without it, images take less time and more
-        disk space.
+    compress: whether to compress chunks of about 1 MiB by zstd.  Without compression, writing
+        images takes less time and more disk space.
 
     A separate thread flushes the file to the disk every second (fsync).  A killed process therefore
     loses at most the last second, and a power failure slightly more.
@@ -145,13 +148,13 @@ class BagWriter:
         self._flusher.start()
 
     def write(self, topic: Topic, message: Message, header: Header, log_time_ns: int) -> None:
-        """Encode and record a message."""
+        """Serialize a message and record it."""
         self.write_frames(topic, encode(message, header), header, log_time_ns)
 
     def write_frames(
         self, topic: Topic, frames: Sequence[Any], header: Header, log_time_ns: int
     ) -> None:
-        """Record an encoded message."""
+        """Record a message that is already serialized into frames."""
         data = join_frames(frames)
         with self._writing():
             self._writer.add_message(
@@ -219,14 +222,14 @@ class BagWriter:
             try:
                 self.flush()
             except BagError:
-                return  # stored in _failure; the next call raises it again
+                return  # The error is stored in _failure; the next call raises it again.
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """Hold the lock of the open file, and convert disk errors to BagError."""
         with self._lock:
             if self._file.closed:
-                raise BagError(f"{self.path}: the bag is closed")
+                raise BagError(f"{self.path}: cannot write, because the bag is closed")
             try:
                 if self._failure is not None:
                     raise self._failure
@@ -255,7 +258,7 @@ class BagWriter:
 
 @dataclass(slots=True)
 class Chunk:
-    """Position of a chunk, its range of log time, and the log times of its messages per channel."""
+    """Position and time range of a chunk, and the log times of its messages by channel."""
 
     offset: int
     length: int
@@ -266,7 +269,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """Recorded type of one channel's messages, and their migration to the current type."""
+    """Decoder of one channel: its recorded message type, and the migration to the current type."""
 
     topic: Topic
     recorded_type: str
@@ -278,7 +281,7 @@ class ChannelDecoder:
 class TopicInfo:
     """Summary of one topic in a bag.
 
-    readable: whether the recorded type is the current one, or can be migrated to it.
+    readable: whether the recorded message type is the current one or can be migrated to it.
     """
 
     name: str
@@ -290,7 +293,7 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentInfo:
-    """File that is attached to a bag, and its position there."""
+    """Description of a file that is attached to a bag, with its position in the bag."""
 
     name: str
     media_type: str
@@ -303,7 +306,7 @@ class AttachmentInfo:
 class BagInfo:
     """Summary of a bag; times are on the recorder's clock.
 
-    problem: why the bag is not complete.
+    problem: reason why the bag is incomplete; empty for a complete bag.
     """
 
     path: Path
@@ -321,8 +324,8 @@ class BagInfo:
 class BagReader:
     """Reader of a complete or truncated bag; iterates over (topic, message, header, log_time_ns).
 
-    topics: names; None: all.  start_ns, end_ns: range of log time without its end.  Messages are in
-    the order of log time.
+    topics: names of the topics to read; None: all.  start_ns, end_ns: range of log time to read;
+    `end_ns` itself is excluded.  Messages are yielded in the order of log time.
     """
 
     def __init__(
@@ -350,11 +353,13 @@ class BagReader:
                 self._scan(file)
                 self._index_remaining_chunks(file)
         except OSError as error:
-            raise BagError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+            raise BagError(
+                f"{self.path}: cannot be read: {error.strerror or error}; check the path"
+            ) from error
         self._check_topics()
 
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
-        """Yield decoded messages of the current types; `messages.migrations` converts older ones.
+        """Yield decoded messages; messages of older types are migrated by `messages.migrations`.
 
         Raises BagError for a topic whose recorded type has no migration.
         """
@@ -420,11 +425,11 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return the names of the recorded topics and of their types."""
+        """Return the names of the recorded topics, mapped to those of their types."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
-        """Return the newest attachment of that name; raises BagError if there is none."""
+        """Return the newest attachment of this name; raises BagError if there is none."""
         for one in reversed(self.attachments):
             if one.name == name:
                 with self.path.open("rb") as file:
@@ -436,7 +441,7 @@ class BagReader:
         )
 
     def info(self) -> BagInfo:
-        """Return the summary of the whole bag, independent of the selection."""
+        """Return the summary of the whole bag; the selected topics and times do not limit it."""
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
             for channel_id, stamps in chunk.times_ns.items():
@@ -470,7 +475,7 @@ class BagReader:
         )
 
     def _scan(self, file: IO[bytes]) -> None:
-        """Index the records up to the first truncated or invalid one."""
+        """Index the records of the file, up to the first truncated or invalid one."""
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
@@ -492,7 +497,7 @@ class BagReader:
                 )
                 break
             if first and opcode != Opcode.HEADER:
-                raise BagError(f"{self.path}: not a bag; its first record is not a header")
+                raise BagError(f"{self.path}: not a bag: its first record is not an MCAP header")
             try:
                 self._index_record(file, opcode, offset, length)
             except BagError:
@@ -500,17 +505,17 @@ class BagReader:
             # The parsers raise unspecified errors on invalid bytes: struct.error, ValueError, ...
             except Exception as error:
                 if first:
-                    raise BagError(f"{self.path}: its header is damaged: {error}") from error
+                    raise BagError(f"{self.path}: the MCAP header is damaged: {error}") from error
                 self.problem = f"damaged record at byte {offset}: {type(error).__name__}: {error}"
             first = False
             offset += length
             if opcode == Opcode.FOOTER:
                 if _read_at(file, offset, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                    self.problem = f"truncated in its last bytes, at {offset} of {size}"
+                    self.problem = f"truncated in its last bytes, after {offset} of {size}"
                 self.complete = not self.problem
                 break
         if first:
-            raise BagError(f"{self.path}: {self.problem}; it contains no record")
+            raise BagError(f"{self.path}: {self.problem}; the bag contains no readable record")
 
     def _index_record(self, file: IO[bytes], opcode: int, offset: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
@@ -532,13 +537,14 @@ class BagReader:
         ):
             return
         if length > MAX_SUMMARY_RECORD_BYTES:
-            raise ValueError(f"a record of {length} bytes")
+            raise ValueError(f"a record states the impossible length of {length} bytes")
         stream = ReadDataStream(BytesIO(_read_at(file, offset, length)))
         if opcode == Opcode.HEADER:
             profile = mcap_records.Header.read(stream).profile
             if profile != PROFILE:
                 raise BagError(
-                    f'{self.path}: an MCAP file of profile "{profile[:40]}", not of flexsheet'
+                    f'{self.path}: MCAP file has profile "{profile[:40]}", expected "flexsheet"; '
+                    "give a bag recorded by flexsheet"
                 )
         elif opcode == Opcode.CHANNEL:
             self._add_channel(mcap_records.Channel.read(stream))
@@ -553,15 +559,15 @@ class BagReader:
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
 
     def _add_channel(self, channel: mcap_records.Channel) -> None:
-        """Store a channel under the current name of its topic."""
+        """Store a channel; a renamed topic is stored under its current name."""
         channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
         self.channels[channel.id] = channel
 
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks of a truncated bag whose channels or message times are unknown.
 
-        The message indexes after the last chunk may be truncated.  A damaged chunk
-        raises an error when its messages are read.
+        The message index after the last chunk may be truncated.  A damaged chunk raises an error
+        only when its messages are read.
         """
         for chunk in self.chunks:
             last = chunk is self.chunks[-1]
@@ -593,7 +599,7 @@ class BagReader:
         except Exception as error:
             raise BagError(
                 f"{self.path}: damaged chunk at byte {chunk.offset}: {type(error).__name__}: "
-                f"{error}; `flexsheet bag recover` saves the others"
+                f"{error}; `flexsheet bag recover` saves the other chunks"
             ) from error
 
     def _check_topics(self) -> None:
@@ -623,11 +629,11 @@ class BagReader:
         return find_migration(topic.message, fingerprint, recorded)
 
     def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
-        """Return the decoder of a channel; BagError if its type has no migration."""
+        """Make the decoder of a channel; raises BagError if its message type has no migration."""
         if channel.topic not in TOPICS:
             raise BagError(
-                f'{self.path}: topic "{channel.topic}" does not exist any more; '
-                "`BagReader.frames` returns its bytes"
+                f'{self.path}: topic "{channel.topic}" does not exist any more in this version; '
+                "`BagReader.frames` returns its bytes without decoding"
             )
         migration = self._find_migration(channel)
         if migration is None:
@@ -646,7 +652,7 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the current name of a channel's message type."""
+    """Return the current name of a channel's message type, which may have been renamed."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 
@@ -667,7 +673,10 @@ def info(path: Path | str) -> BagInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """Result of `recover`: recovered messages, damaged chunks, and messages of unknown channels."""
+    """Result of `recover`.
+
+    orphan_messages: number of messages whose channel is unknown, so that they are lost.
+    """
 
     messages: int
     attachments: int
@@ -685,8 +694,8 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: called with the number of chunks done, and of all.  Raises BagError if nothing is
-    readable, or if the new file exists or cannot be written.
+    progress: called with the number of chunks that are done, and the total number.  Raises BagError
+    if nothing is readable, or if the new file exists or cannot be written.
     """
     reader = BagReader(path_in)
     path_out = Path(path_out)
@@ -741,7 +750,7 @@ def recover(
             writer.finish()
     except FileExistsError:
         raise BagError(
-            f"{path_out}: the file exists already; a bag cannot be overwritten"
+            f"{path_out}: the file exists already; a bag cannot be overwritten, give a new name"
         ) from None
     except OSError as error:
         with suppress(OSError):
@@ -765,14 +774,14 @@ def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
 
 
 def _decompress(chunk: mcap_records.Chunk) -> bytes:
-    """Decompress a chunk's records; ValueError for another size than stated, or a too large one.
+    """Decompress a chunk; raises ValueError if its size is too large or not as its header states.
 
-    A few compressed bytes can expand to any number, so at most the stated size is decompressed.
+    A few compressed bytes can expand to a huge amount, so at most the stated size is decompressed.
     """
     stated = chunk.uncompressed_size
     if stated > MAX_CHUNK_BYTES:
         raise ValueError(
-            f"uncompressed size of {stated} bytes; at most {MAX_CHUNK_BYTES} are allowed"
+            f"its header states {stated} uncompressed bytes; the limit is {MAX_CHUNK_BYTES}"
         )
     match chunk.compression:
         case "":
@@ -781,16 +790,18 @@ def _decompress(chunk: mcap_records.Chunk) -> bytes:
             with zstandard.ZstdDecompressor().stream_reader(chunk.data) as packed:
                 data = packed.read(stated + 1)
         case other:
-            raise ValueError(f"unknown compression {other[:40]!r}; expected zstd or none")
+            raise ValueError(f"its compression is {other[:40]!r}; expected zstd or none")
     if len(data) != stated:
-        raise ValueError(f"uncompressed size is not {stated} bytes, as stated")
+        raise ValueError(
+            f"its uncompressed size differs from the {stated} bytes that its header states"
+        )
     return data
 
 
 def _parse_attachment(body: bytes) -> mcap_records.Attachment:
-    """Decode an attachment; raises ValueError if its check sum is wrong."""
+    """Decode an attachment; raises ValueError if its checksum is wrong."""
     if zlib.crc32(memoryview(body)[:-4]) != int.from_bytes(body[-4:], "little"):
-        raise ValueError("the check sum of an attachment is wrong")
+        raise ValueError("an attachment is damaged: its checksum is wrong")
     attachment: mcap_records.Attachment = mcap_records.Attachment.read(
         ReadDataStream(BytesIO(body))
     )

@@ -1,4 +1,4 @@
-"""Define the base class of messages, and their header."""
+"""Define the base class of messages, and the header that is sent with each of them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True, slots=True)
 class StampMark:
-    """Annotation of a field that is a time on the clock of the header's stamps."""
+    """Annotation of a field that is a time on the clock of the header's timestamps."""
 
 
 Stamp = Annotated[int, StampMark()]
-"""Time in ns on the clock of the header; 0: none.
+"""Timestamp in ns on the clock of the message's header; 0: none.
 
-A subscriber with another clock receives these fields converted to its own.  A duration is an `int`.
+A subscriber with another clock receives these fields converted to its own clock.  A duration is an
+`int`.
 """
 
 
@@ -43,14 +44,15 @@ class MessagePart(BaseModel):
 class Header:
     """Header of one message.
 
-    sequence: number of the message from its writer, from 1; a gap is a loss.
-    source_ns: time of the measurement on the clock `clock_id`; the middle of the exposure for
-        everything that derives from an image.
-    publish_ns: time when the message was passed to the socket, same clock.
-    clock_id: clock of both stamps; stamps of different clocks must not be subtracted.
+    sequence: sequence number of the message among those of its writer, from 1; a gap is a loss.
+    source_ns: time of the measurement on the clock `clock_id`; for everything that is derived from
+    an
+      image, the midpoint of the exposure.
+    publish_ns: time when the message was passed to the socket, on the same clock.
+    clock_id: clock of both timestamps; timestamps of different clocks must not be subtracted.
     writer: name of the node that published.
     epoch: time when the writer started, ns on the same clock.  It distinguishes a restart from a
-        loss, and rejects older messages.
+      loss, and is used to reject older messages.
     plan: hash of the writer's plan; empty in bags of the first wire protocol.
     """
 
@@ -65,7 +67,7 @@ class Header:
 
 @cache
 def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
-    """Return the names of the message's fields of type `Stamp`."""
+    """Return the names of the message's fields that are timestamps (of type `Stamp`)."""
     return tuple(
         name
         for name, field in message_type.model_fields.items()
@@ -84,7 +86,7 @@ def compute_fingerprint(message_type: type[Message]) -> bytes:
 
 
 def _remove_descriptions(schema: object) -> object:
-    """Return a JSON Schema without titles and descriptions; fields of these names remain."""
+    """Return a JSON Schema without titles and descriptions; fields with these names remain."""
     if isinstance(schema, dict):
         return {
             key: _remove_descriptions(value)

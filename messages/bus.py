@@ -1,13 +1,13 @@
-"""Publish and subscribe by one ZeroMQ socket each in the asyncio loop.
+"""Publish and subscribe by ZeroMQ sockets in the asyncio loop.
 
 A publisher binds and subscribers connect, in any order; either side may be restarted.  A subscriber
-reads its plain (not asyncio) sockets in a callback of the loop and calls the handler there.  This
-has the smallest latency of the designs in `benchmarks/messaging.py`.  No pending `recv` exists
-whose cancellation could lose a message.
+reads plain (not asyncio) sockets in a callback of the loop and calls the handler there, which has
+the smallest latency of the designs in `benchmarks/messaging.py`.  No `recv` is ever pending, so no
+cancelled `recv` can lose a message.
 
-A subscriber has one socket per host, which identifies the host of each message.  It accepts from a
-host only messages of the writers that run there.  Beyond loopback, sockets are bound and connected
-with keys only (`flexsheet.messages.security`).
+A subscriber has one socket per host, which identifies the host of each message.  From each host it
+accepts only messages of the writers that run there.  Sockets that other computers can reach are
+bound and connected with keys only (`flexsheet.messages.security`).
 
 ZeroMQ's file descriptor is edge-triggered: it signals that a state changed, not that a message is
 ready, and any call on the socket can clear the signal.  So each callback reads until the socket is
@@ -58,13 +58,13 @@ BIND_TIMEOUT_S = 1.0
 IPC_CLOSING_S = 0.02
 MAX_EXCESS_BYTES = 256 << 20
 MAX_SUBSCRIPTION_BYTES = 512
-"""Size limit of the frames that a publisher receives; the largest ends a CURVE handshake."""
+"""Size limit of the frames that a publisher receives; the largest one ends a CURVE handshake."""
 
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
 MAX_PAST_CLOCKS = 16
 
-# Plain numbers, because operations on Python's enumerations take longer than ZeroMQ's calls.
+# Plain integers, because operations on Python's enumerations take longer than ZeroMQ's calls.
 EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 NOBLOCK, NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -72,11 +72,11 @@ _log = logging.getLogger("flexsheet.bus")
 
 
 HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
-"""Publishers send heartbeats by tcp only, since ipc reports the end of a process.
+"""Publishers send heartbeats over tcp only, because ipc reports the end of a process by itself.
 
-Subscribers send none: libzmq 4.3.5 aborts the process when a heartbeat is due after the publisher
-has disconnected while its messages still fill the queue.  A subscriber that is busy for seconds
-answers none and would be disconnected; so publishers send none by ipc.
+Subscribers send none: libzmq 4.3.5 aborts the process if a heartbeat is due after the publisher has
+disconnected while its messages still fill the queue.  A subscriber that is busy for seconds does
+not answer heartbeats and would be disconnected, so publishers send none over ipc.
 """
 
 TCP_KEEPALIVE_OPTIONS = {
@@ -87,10 +87,10 @@ TCP_KEEPALIVE_OPTIONS = {
     zmq.TCP_MAXRT: 5000,
     zmq.CONNECT_TIMEOUT: 2000,
 }
-"""Kernel probes by which a subscriber detects within 5 s that the publisher's host has gone.
+"""TCP keep-alive probes by which a subscriber detects within 5 s that the publisher's host is gone.
 
-A host that restarted meanwhile is detected at once.  The publisher's heartbeats are not enough:
-libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
+If that host has restarted meanwhile, it is detected at once.  The publisher's heartbeats are not
+enough: libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
@@ -103,7 +103,7 @@ MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAI
 
 
 class BusError(FlexsheetError, RuntimeError):
-    """A socket cannot be opened; the text names topic and endpoint."""
+    """Raised if a socket cannot be opened; the text names the topic and the endpoint."""
 
     code = "bus"
     remedy = "Another graph has the endpoint. End that graph, or run `flexsheet doctor --sweep`."
@@ -118,10 +118,10 @@ class Counts(Protocol):
 
 
 def compute_queue_length(topic: Topic) -> int:
-    """Return the length of the queue at each end of a connection.
+    """Return the length (messages) of the queue at each end of a connection.
 
-    A full queue drops the newest message.  On `latest` topics the queue therefore lasts for half a
-    second at the topic's highest rate.  On other topics memory limits it.
+    A full queue drops the newest message.  On `latest` topics the queue therefore holds half a
+    second of messages at the topic's highest rate.  On other topics only memory limits it.
     """
     if topic.delivery is Delivery.LATEST and topic.rate_hz is not None:
         length = round(QUEUE_S * topic.rate_hz[1])
@@ -132,9 +132,9 @@ def compute_queue_length(topic: Topic) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Endpoint to which a subscriber connects, and the writer expected there; None: any.
+    """Endpoint to which a subscriber connects, and the writer that is expected there (None: any).
 
-    host: the host whose key must answer at a tcp endpoint, if there are keys.
+    host: the host whose key a tcp endpoint must prove, if keys are used.
     """
 
     endpoint: str
@@ -145,14 +145,14 @@ class Source:
 class Publisher:
     """Publisher of one topic.
 
-    A latched topic and keys need a running loop.
+    It needs a running asyncio loop if the topic is latched or keys are used.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" is a free port).
-    keys: only hosts of this ring may connect by tcp; None: tcp is bound to loopback only.
+    keys: only hosts of this key ring may connect over tcp; None: tcp is bound to loopback only.
     on_refused: called with a text for each connection that was refused or closed; without a
         running loop, on a separate thread.
-    local: the process's bus.  Its readers get messages without serialization, and the socket is
-        used only while another process has subscribed; needs a running loop.
+    local: bus inside this process.  Its readers get messages without serialization, and the socket
+        is used only while another process has subscribed; needs a running loop.
     """
 
     def __init__(
@@ -183,8 +183,8 @@ class Publisher:
             raise
 
     def _open(self, bind: Sequence[str]) -> None:
-        # Only an XPUB socket can be read.  Reading it lets ZeroMQ free the memory of ended
-        # connections even if nothing is sent.
+        # Only an XPUB socket can be read. Reading it lets ZeroMQ free the memory of ended
+        # connections even if no message is sent.
         is_read = self._latched or self._keys is not None or self._channel is not None
         self._loop = asyncio.get_running_loop() if is_read else None
         self._socket = _open_socket(zmq.XPUB if is_read else zmq.PUB, self.topic)
@@ -194,7 +194,8 @@ class Publisher:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
             if self._by_tcp:
                 ConnectionGuard.watch(self._socket, self._on_closed_by_guard)
-            # Endpoints that are bound before the keys are set need no key, so ipc comes first.
+            # Endpoints that are bound before the keys are set need no key, so ipc endpoints are
+            # bound first.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
                 if endpoint.startswith("tcp:"):
                     for option, value in HEARTBEATS.items():
@@ -212,7 +213,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket if the key of this host or of one in the ring has changed."""
+        """Reopen the socket if the key of this host or of another one in the ring has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
@@ -234,7 +235,7 @@ class Publisher:
             self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
-        # ZeroMQ drops the message for a subscriber whose queue is full, which counts it as a gap.
+        # If a subscriber's queue is full, ZeroMQ drops the message for it; it counts a gap.
         send = self._socket.send
         if len(frames) == 1:
             send(frames[0], NOBLOCK)
@@ -253,7 +254,7 @@ class Publisher:
     def _serve_late_subscribers(self) -> None:
         """Read a batch of subscriptions; resend the last message if one of them is new.
 
-        XPUB reports the first subscription and the end of the last one.
+        An XPUB socket reports only the first subscription and the end of the last one.
         """
         if self._socket.closed or self._loop is None:
             return
@@ -267,18 +268,18 @@ class Publisher:
                 break
         if found and self._last is not None:
             self._send(self._last)
-            # `_send` may have cleared the event of another subscription.
+            # `_send` may have cleared the event of another subscription, so check again.
             drained = False
         if not drained and not self._loop.is_closed():
             self._loop.call_soon(self._serve_late_subscribers)
 
     def _on_closed_by_guard(self, address: str, reason: str) -> None:
-        """Report a closed connection, on the loop if there is one; called on the guard's thread."""
+        """Report a connection that the guard closed; called on the guard's thread."""
         text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
         if self._loop is None:
             self._on_refused(text)
             return
-        # After the end of the loop, no handler for the report is left.
+        # After the end of the loop there is no handler left to report to.
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_refused, text)
 
@@ -289,11 +290,12 @@ class Publisher:
             self._channel.forget()
 
     def close(self) -> None:
-        """Release the endpoints; messages sent before are still delivered for half a second."""
+        """Release the endpoints; messages sent before are delivered for half a second more."""
         if self._socket.closed:
             return
         for endpoint in self.endpoints:
-            # ZeroMQ does not remove the file, which no other publisher can own before the close.
+            # ZeroMQ does not remove the socket file. No other publisher can own it before the
+            # close.
             if endpoint.startswith(IPC):
                 Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
         self._close_socket(unbind=False)
@@ -318,18 +320,18 @@ class Subscriber:
     """Subscriber of one topic, which calls `on_message(message, header)` on the loop's thread.
 
     connect: the endpoints of all writers; a writer may start later or restart.  A `Source` also
-        names the writer expected there, and the host whose key must answer.
+      names the writer expected there, and the host whose key the endpoint must prove.
     counts: counters of superseded, lost and rejected messages.
     on_problem: called with a text for losses (the 1st, 2nd, 4th, 8th, ...; not on `latest` topics,
-        which may lose messages), and for the first rejection of each cause.  Also called for an
-        exception in `on_message`, after which the subscriber continues.
-    on_handshake_failed: called with the problem of each failed handshake; None: `on_problem`.
-    raw: call `on_message(frames, header)` with every message, independent of the
-        topic's delivery; the fields are not validated.
+      which may lose messages), and for the first rejection of each cause.  Also called for an
+      exception in `on_message`, after which the subscriber continues.
+    on_handshake_failed: called with a text for each failed handshake; None: `on_problem` is called.
+    raw: call `on_message(frames, header)` with every message, whatever the topic's delivery; the
+      fields are not validated.
     keys: keys of this host and the others; None: tcp connects to loopback only.
-    plan: accept only messages of this plan; None: of any plan.
+    plan: hash of the plan whose messages are accepted; None: messages of any plan.
     message_filter: called with each valid message before `on_message`.
-    local: the process's bus, by which writers of the same process are read; not with `raw`.
+    local: bus inside this process, by which writers of the same process are read; not with `raw`.
     """
 
     def __init__(
@@ -399,7 +401,7 @@ class Subscriber:
             connection.close()
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reconnect to hosts whose key has changed, or to all if this host's key has changed."""
+        """Reconnect to hosts whose keys have changed; to all if this host's key has changed."""
         for connection in self._connections:
             if (
                 isinstance(connection, _HostConnection)
@@ -411,7 +413,7 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Read the envelope and count lost messages; None if it is rejected or a repetition."""
+        """Read a message's envelope and count lost messages; None if it is rejected or repeated."""
         try:
             envelope = read_envelope(frames, self.topic)
         except WireError as error:
@@ -420,7 +422,7 @@ class Subscriber:
         return envelope if self.accept_header(envelope.header, writers) else None
 
     def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool:
-        """Check a message's header and count lost messages; False for a rejected or repeated one.
+        """Check a header and count lost messages; return False if it is rejected or repeated.
 
         writers: the writers expected at the endpoint; None: any.
         """
@@ -450,7 +452,9 @@ class Subscriber:
         elif lost < 0:
             if not (self._latched and lost == -1):
                 self.reject(
-                    WireError("replayed", f"message {header.sequence} of {header.writer} repeated")
+                    WireError(
+                        "replayed", f"message {header.sequence} of {header.writer} arrived again"
+                    )
                 )
             return False
         return True
@@ -479,7 +483,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message; report the first of each cause."""
+        """Count a rejected message; report only the first rejection of each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
@@ -497,10 +501,10 @@ class Subscriber:
 
 
 class _Writer:
-    """Newest epoch and sequence number of a writer, to reject older messages as replayed.
+    """Newest start time (epoch) and sequence number of a writer, to reject replayed older messages.
 
-    A restart on the same clock has a later epoch.  A restart after a reboot has a new clock, and
-    its former clocks are rejected.
+    A writer that restarts on the same clock has a later epoch.  After a reboot of its host it has a
+    new clock identifier, and messages of its former clocks are rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
@@ -512,13 +516,13 @@ class _Writer:
     def update(self, header: Header) -> int:
         """Return the number of messages lost before this one.
 
-        A negative number means an old message; -1: the newest one again.  Raises WireError for a
-        message from before the writer's newest start.
+        A negative number marks an old message; -1 marks a repetition of the newest one.  Raises
+        WireError for a message that was sent before the writer's latest restart.
         """
         if header.clock_id != self.clock_id:
             if header.clock_id in self.past_clocks:
                 raise WireError(
-                    "replayed", f"the message of {header.writer} is older than its host's start"
+                    "replayed", f"a message of {header.writer} was sent before its host restarted"
                 )
             self.past_clocks.append(self.clock_id)
             self.clock_id = header.clock_id
@@ -528,7 +532,9 @@ class _Writer:
                 self.sequence = header.sequence
             return lost
         elif header.epoch < self.epoch:
-            raise WireError("replayed", f"the message of {header.writer} is older than its start")
+            raise WireError(
+                "replayed", f"a message of {header.writer} was sent before its last restart"
+            )
         self.epoch, self.sequence = header.epoch, header.sequence
         return 0
 
@@ -569,7 +575,7 @@ class _HostConnection:
 
     @property
     def secured(self) -> bool:
-        """Return whether the connection uses keys."""
+        """Return whether the connection is encrypted and authenticated by keys."""
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:
@@ -579,9 +585,9 @@ class _HostConnection:
         self._socket = _open_socket(zmq.SUB, topic)
         try:
             if self._raw:
-                # A recorder has low priority and may pause for seconds on a busy computer.  With a
-                # full queue the publisher's heartbeats would be unread, the publisher would
-                # disconnect, and libzmq would abort as `HEARTBEATS` describes.
+                # A recorder has low priority and may pause for seconds on a busy computer. If its
+                # queue were full, it could not read the publisher's heartbeats. The publisher would
+                # then disconnect, and libzmq would abort the process as described at `HEARTBEATS`.
                 self._socket.setsockopt(zmq.RCVHWM, 0)
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             if self.secured:
@@ -605,7 +611,7 @@ class _HostConnection:
             self.close()
             raise
         self._loop.add_reader(self._socket.fileno(), self._read)
-        # The calls above can have cleared the first signal.
+        # The calls above may have cleared the first signal.
         self._loop.call_soon(self._read)
 
     def close(self) -> None:
@@ -623,7 +629,7 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Schedule a new connection after ZeroMQ has ended one permanently; a loop callback.
+        """Schedule a new connection after ZeroMQ has permanently ended one; a loop callback.
 
         ZeroMQ does so after a rejected key and after corrupted data.
         """
@@ -663,14 +669,14 @@ class _HostConnection:
                 self._loop.call_soon(self._read)
 
     def _deliver_newest(self) -> bool:
-        """Deliver the newest message of each writer, without validating the others.
+        """Deliver the newest message of each writer; skip the older ones without validating them.
 
-        The first message is delivered at once if it is younger than half a period.
+        If the first message is younger than half a period, it is delivered at once.
         """
         newest: dict[str, Envelope] = {}
         drained = False
         for number in range(BATCH):
-            # Reading the events costs less than the exception of a `recv` without a message.
+            # Checking for events takes less time than the exception of a `recv` without a message.
             if number and not self._has_more():
                 drained = True
                 break
@@ -683,11 +689,12 @@ class _HostConnection:
                 continue
             header = envelope.header
             if not number and 0 <= time.monotonic_ns() - header.publish_ns < self._fresh_ns:
-                # No newer message can have arrived yet, so the events need not be read first.
-                # With stamps of another clock an older message may be delivered before a newer.
+                # No newer message can have arrived yet, so the socket's events need not be checked
+                # first. With timestamps of another clock, an older message may be delivered before
+                # a newer one.
                 self._deliver(envelope)
                 continue
-            # The removal makes the order that of arrival.
+            # Remove the superseded entry first, so that the dictionary stays in order of arrival.
             self._subscriber.counts.dropped += newest.pop(header.writer, None) is not None
             newest[header.writer] = envelope
         for envelope in newest.values():
@@ -740,18 +747,19 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.LINGER: LINGER_MS,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 500,
-        # Connections without a handshake are closed.
+        # ZeroMQ closes connections that do not complete the handshake in this time.
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }
     if kind == zmq.SUB:
-        # A larger frame makes ZeroMQ end the connection permanently without a report.  So frames
-        # that only exceed the topic's limit are received, rejected and counted.
+        # If a frame exceeds MAXMSGSIZE, ZeroMQ ends the connection permanently without a report.
+        # Frames that exceed the topic's limit only slightly are therefore received, rejected and
+        # counted.
         options[zmq.MAXMSGSIZE] = topic.max_bytes + MAX_EXCESS_BYTES
         options |= TCP_KEEPALIVE_OPTIONS
     else:
-        # A publisher receives subscriptions and handshakes; `ConnectionGuard` bounds their sum, so
-        # the queue needs no limit.  If a queue is full when its sender disconnects, libzmq 4.3.5
-        # aborts the process at the next heartbeat.
+        # A publisher receives only subscriptions and handshakes. `ConnectionGuard` bounds their
+        # total, so the queue needs no limit. If a queue is full when its sender disconnects, libzmq
+        # 4.3.5 aborts the process at the next heartbeat.
         options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
         options[zmq.RCVHWM] = 0
     for option, value in options.items():
@@ -760,7 +768,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
-    """Bind the socket and return the endpoint with its actual port."""
+    """Bind the socket and return the endpoint with the port number that was assigned."""
     _check_endpoint(topic, endpoint)
     if keys is None:
         _refuse_beyond_loopback(topic, endpoint)
@@ -777,11 +785,11 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
                     f'topic "{topic.name}": {endpoint} cannot be bound: {error.strerror}; '
                     "check that its folder or address exists on this host"
                 ) from error
-            # ZeroMQ's thread releases the endpoint of a closed writer a little later.
+            # ZeroMQ's thread may release the endpoint of a closed writer slightly later, so retry.
             if time.monotonic() > deadline_s:
                 raise BusError(
                     f'topic "{topic.name}": {endpoint} is in use by another process; '
-                    "the same launch file may be running already"
+                    "is the same launch file running already?"
                 ) from error
             time.sleep(0.01)
     bound: str = opened.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -789,7 +797,7 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 
 
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for endpoints that ZeroMQ accepts silently or reports unclearly."""
+    """Raise BusError for an invalid endpoint that ZeroMQ accepts silently or reports unclearly."""
     transport, _, address = endpoint.partition("://")
     port = address.rpartition(":")[2]
     if transport == "tcp" and port != "*" and not (port.isdecimal() and 0 < int(port) < 1 << 16):
@@ -806,7 +814,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for a tcp endpoint beyond loopback; called without keys."""
+    """Raise BusError for a tcp endpoint that other hosts can reach; called if there are no keys."""
     transport, _, address = endpoint.partition("://")
     if transport != "tcp":
         return
@@ -823,7 +831,7 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
 
 
 def _ipc_is_served(endpoint: str) -> bool:
-    """Return whether a process listens at the path; binding would replace its socket."""
+    """Return whether a process listens at the ipc path; binding would take over its path."""
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):
         return False
@@ -831,7 +839,8 @@ def _ipc_is_served(endpoint: str) -> bool:
         try:
             probe.connect(path)
         except ConnectionRefusedError:
-            # The file is left by a killed publisher, or a closing publisher will remove it.
+            # The file was left by a killed publisher, or a publisher that is closing will remove
+            # it.
             time.sleep(IPC_CLOSING_S)
             return False
         except OSError:

@@ -1,4 +1,4 @@
-"""Decide from a launcher's message whether a computer is too busy for its nodes, and why."""
+"""Decide from a launcher's message whether its computer is too busy for its nodes, and why."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
-"""Maximum load per core, for computers that cannot measure how long their nodes wait."""
+"""Maximum load per core, used if a computer cannot measure how long its nodes wait."""
 
 BUSY_REMEDY = (
     "end other programs, give the graph more cores, or start fewer nodes; "
@@ -20,7 +20,7 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return one sentence on why a computer is busy; empty if it is not."""
+    """Return one sentence that says why a computer is busy; empty if it is not busy."""
     if not is_busy(host):
         return ""
     if host.cpu is None:
@@ -31,7 +31,7 @@ def describe_busy(host: HostStatus) -> str:
 
 
 def describe_pressure(cpu: CpuPressure) -> str:
-    """Return which node waits for a processor, for how long, and which programs use the cores."""
+    """Say which node waits for a processor, for how long, and which programs use the cores."""
     waits = f"{cpu.node} waits for a processor {cpu.wait_ratio:.0%} of the time"
     if not cpu.programs:
         return waits

@@ -1,4 +1,4 @@
-"""Define the stereo calibration file, from `flexsheet calibrate stereo` for the triangulator."""
+"""Define the stereo calibration file, which `flexsheet calibrate stereo` writes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "number
 
 
 class Board(Part):
-    """Chessboard, or ChArUco board with markers in its white squares.
+    """Calibration board: a chessboard, or a ChArUco board with markers in its white squares.
 
     columns, rows: numbers of inner corners, for both kinds.
     """
@@ -37,7 +37,7 @@ class Board(Part):
     )
     dictionary: str | None = Field(
         default=None,
-        description="OpenCV's name of the markers' dictionary: DICT_4X4_50; ChArUco only",
+        description="OpenCV's name of the marker dictionary, such as DICT_4X4_50; ChArUco only",
     )
 
 
@@ -47,7 +47,7 @@ class PairResidual(Part):
     left: str
     right: str
     used: bool
-    reason: str = Field(description="why the pair was left out; empty if used")
+    reason: str = Field(description="reason why the pair was left out; empty if it was used")
     left_rms_px: NonNegative | None
     right_rms_px: NonNegative | None
     stray_corners: int = Field(
@@ -59,19 +59,20 @@ class PairResidual(Part):
 
 
 class Uncertainty(Part):
-    """Uncertainty of the rig, as standard deviations of a normal error.
+    """Uncertainty of the stereo camera, as standard deviations of normally distributed errors.
 
-    It is the common offset of all fingertips, not the scatter of single ones.
+    It describes the offset that all measured fingertips have in common, not the scatter of single
+    ones.
     """
 
     corner_sigma_px: NonNegative = Field(
         description="standard deviation of one coordinate of a corner"
     )
     jackknife_ratio: NonNegative = Field(
-        description="scatter of fits without some of the pairs, over that by the covariance; "
-        "above 1 the covariance was multiplied by its square"
+        description="scatter of fits that leave out some pairs, divided by the scatter that the "
+        "covariance predicts; if above 1, the covariance was multiplied by its square"
     )
-    working_distance_m: Positive = Field(description="depth of the next two values")
+    working_distance_m: Positive = Field(description="depth to which the next two values apply")
     depth_std_m: NonNegative = Field(
         description="error of a fingertip along the left camera's optical axis"
     )
@@ -83,7 +84,7 @@ class Uncertainty(Part):
 
 
 class StereoCalibration(Part):
-    """Calibration of a stereo rig: both lenses and the transform between them."""
+    """Calibration of a stereo camera: both lenses and the transform between them."""
 
     version: Literal[2] = 2
     device: str
@@ -119,12 +120,12 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
 
 
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; FileWriteError if the disk refuses it."""
+    """Write the calibration file; raises FileWriteError if it cannot be written."""
     title = f"Stereo calibration of {calibration.device}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_calibration(path: Path) -> StereoCalibration:
-    """Read the calibration file; CalibrationFileError if it is invalid."""
+    """Read the calibration file; raises CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate stereo"
     return read_calibration(StereoCalibration, path, version=CALIBRATION_VERSION, command=command)

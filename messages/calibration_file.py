@@ -24,21 +24,21 @@ MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(FlexsheetError, ValueError):
-    """An invalid calibration file; the text names file, key and remedy."""
+    """Raised for an invalid calibration file; the text names file, key and remedy."""
 
     code = "calibration-file"
     remedy = "Calibrate again, or give another calibration file."
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """A calibration of another camera or sheet than the scene's."""
+    """Raised if a calibration is of another device (camera, sheet, ...) than the scene's."""
 
     code = "calibration-mismatch"
     remedy = "Give the calibration of the scene's device, or the scene of the calibration."
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
-    """Write the file; an existing file is replaced only by a complete one.
+    """Write a calibration file; an existing file is only replaced when the new one is complete.
 
     title: first comment line.  comment: second comment line, such as the command; may be empty.
     """
@@ -54,17 +54,17 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
 
 
 def _parse(path: Path) -> Any:
-    """Return the values of a file; YAMLError for one that no calibration command has written."""
+    """Parse a YAML file; raises YAMLError if no calibration command can have written it."""
     with path.open("rb") as file:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
-        raise YAMLError(f"more than {MAX_CALIBRATION_BYTES} bytes")
+        raise YAMLError(f"the file has more than {MAX_CALIBRATION_BYTES} bytes")
     text = data.decode()
     depth = 0
     for event in YAML(typ="safe").parse(text):
-        # A few aliases can expand to any number of values.
+        # A few aliases could expand to any number of values.
         if isinstance(event, AliasEvent):
-            raise YAMLError("an alias (*), which calibrations do not contain")
+            raise YAMLError("the file contains a YAML alias (*), which calibrations never do")
         depth += isinstance(event, CollectionStartEvent)
         depth -= isinstance(event, CollectionEndEvent)
         if depth > MAX_CALIBRATION_DEPTH:
@@ -75,10 +75,10 @@ def _parse(path: Path) -> Any:
 def read_calibration(
     kind: type[Calibration], path: Path, *, version: int, command: str
 ) -> Calibration:
-    """Read a calibration of one kind.
+    """Read a calibration file of one kind.
 
-    command: the command that writes it, for errors.  Raises CalibrationFileError for a file that is
-    absent, foreign, of another version or incomplete.
+    command: the command that writes such files, for errors.  Raises CalibrationFileError for a file
+    that is missing, incomplete, of another kind or of another version.
     """
     try:
         content = _parse(path)
@@ -86,7 +86,7 @@ def read_calibration(
         raise CalibrationFileError(
             f"{path}: cannot be read: {error.strerror}; give a file that `{command}` wrote"
         ) from error
-    # Invalid numbers and dates make the parser raise undocumented errors.
+    # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
         raise CalibrationFileError(
             f"{path}: not YAML that `{command}` wrote: {str(error)[:200]}"
@@ -97,7 +97,7 @@ def read_calibration(
         )
     if content["version"] != version:
         raise CalibrationFileError(
-            f"{path}: version: expected {version}, found {content['version']!r}; "
+            f"{path}: key version: expected {version}, found {content['version']!r}; "
             f"calibrate again with `{command}`"
         )
     try:

@@ -9,7 +9,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Interface of a monotonic clock; stamps of clocks with equal `id` may be subtracted."""
+    """Interface of a monotonic clock; timestamps of clocks with equal `id` may be subtracted."""
 
     @property
     def id(self) -> str: ...
@@ -18,7 +18,7 @@ class Clock(Protocol):
 
 
 def read_boot_id() -> str:
-    """Return the kernel's random identifier of this boot; CLOCK_MONOTONIC starts with the boot."""
+    """Return the kernel's random identifier of this boot, since which CLOCK_MONOTONIC counts."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
@@ -35,7 +35,7 @@ def read_namespace_offset() -> str:
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC of this host, which all its processes share."""
+    """The clock CLOCK_MONOTONIC of this host, which all its processes share."""
 
     def __init__(self) -> None:
         self._id = f"{host_name()}-{read_boot_id()[:8]}{read_namespace_offset()}"
@@ -63,5 +63,5 @@ class VirtualClock:
         return self._now_ns
 
     def move_to(self, now_ns: int) -> None:
-        """Set the time; an earlier time is ignored."""
+        """Set the time; an earlier time than the current one is ignored."""
         self._now_ns = max(self._now_ns, now_ns)

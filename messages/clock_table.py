@@ -1,4 +1,4 @@
-"""Convert stamps of other hosts' clocks to the local clock when a message arrives.
+"""Convert timestamps of other hosts' clocks to the local clock when a message arrives.
 
 After the conversion, ages and predictions do not depend on the host that sent the message.
 """
@@ -15,11 +15,11 @@ from flexsheet.messages.types import ClockOffset, Clocks
 M = TypeVar("M", bound=Message)
 
 MAX_STAMP_AHEAD_NS = 20_000_000
-"""Maximum time by which a measured clock may be ahead of the local one."""
+"""Maximum time by which timestamps of another clock may lie in the future of the local clock."""
 
 
 class ClockTable:
-    """Offsets of the other hosts' clocks, from the newest `Clocks` message of the clock node."""
+    """Table of the offsets of other hosts' clocks, from the newest `Clocks` message."""
 
     def __init__(self, clock_id: str) -> None:
         self._own = clock_id
@@ -28,12 +28,12 @@ class ClockTable:
         self.offsets: dict[str, ClockOffset] = {}
 
     def update(self, clocks: Clocks) -> None:
-        """Replace all offsets by those of a message."""
+        """Replace all offsets by those in a message from the clock node."""
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return why stamps of a clock are not accurate enough; empty if they are."""
+        """Return why timestamps of a clock are not accurate enough; empty if they are."""
         if clock_id == self._own:
             return ""
         offset = self.offsets.get(clock_id)
@@ -49,10 +49,10 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return the shift of a stamp near `at_ns` to the local clock, ns; None: unknown.
+        """Return the shift (ns) of timestamps near `at_ns` to the local clock; None: unknown.
 
-        at_ns: publication time of the message on that clock.  One shift for all stamps of a message
-        preserves their differences.
+        at_ns: publication time of the message on that clock.  All timestamps of a message get the
+        same shift, which preserves their differences.
         """
         offset = self.offsets.get(clock_id)
         if offset is None:
@@ -62,9 +62,9 @@ class ClockTable:
         return -offset.offset_ns - round(since_ns * drift / (1.0 + drift))
 
     def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
-        """Return message and header with stamps of the local clock, and `find_problem` of theirs.
+        """Convert a message and header to the local clock; return also `find_problem` of theirs.
 
-        For a clock without a measured offset, the message counts as published on arrival.
+        If the offset of a clock is not measured, the message counts as published on arrival.
         """
         clock_id = header.clock_id
         if clock_id == self._own:
@@ -85,7 +85,7 @@ class ClockTable:
 
 
 def shift_stamps(message: M, shift_ns: int) -> M:
-    """Return the message with its `Stamp` fields shifted; a stamp of 0 means none and remains."""
+    """Return the message with its timestamps shifted; a timestamp of 0 means none and remains 0."""
     moved = {
         name: max(1, value + shift_ns)
         for name in find_stamp_fields(type(message))

@@ -1,13 +1,14 @@
-"""Close tcp connections to publishers that send more than a subscriber does.
+"""Close tcp connections to publishers over which a peer sends more than a subscriber does.
 
-A ZeroMQ publisher stores every subscription that a peer sends, at about 45 times its size, within
-the call that sends the next message.  That call does not return while more subscriptions arrive.
-ZeroMQ has no option that limits their number or the frames of one message.
+A ZeroMQ publisher stores every subscription that a peer sends, in about 45 times its size.  It does
+so within the call that sends the next message, and that call does not return while more
+subscriptions arrive.  ZeroMQ has no option that limits the number of subscriptions or the frames of
+one message.
 
-A subscriber of this package sends a handshake, one subscription and one answer to each heartbeat.
-So a thread counts the bytes that the kernel received on each accepted connection (TCP_INFO), and
-closes a connection that received more.  The thread sleeps until data arrives (edge-triggered
-epoll).  It needs no processor time while peers are silent.
+A subscriber of this package sends only a handshake, one subscription and one answer to each
+heartbeat.  So a thread counts the bytes that the kernel received on each accepted connection
+(TCP_INFO), and closes a connection that received more.  The thread sleeps until data arrives
+(edge-triggered epoll), so it needs no processor time while peers are silent.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 MAX_BYTES_AT_ONCE = 4096
-"""A CURVE handshake and a subscription have 900 bytes."""
+"""Bytes that a connection may receive at once; a CURVE handshake and a subscription have 900."""
 
 MAX_BYTES_PER_S = 256
-"""An encrypted answer to a heartbeat has 40 bytes, once per second."""
+"""Further bytes per second; an encrypted answer to a heartbeat has 40, once per second."""
 
 MAX_CONNECTIONS_PER_ADDRESS = 64
-"""Connections of a publisher per address: nodes of a computer, its recorder and its tools."""
+"""Maximum connections of a publisher from one address: a computer's nodes, recorder and tools."""
 
 EXCLUSION_S = 1.0
-"""Time for which new connections of an address that sent too much are refused."""
+"""Time for which new connections are refused from an address that sent too much."""
 
 RECEIVE_BUFFER_BYTES = 16_384
 """Receive buffer of a connection; its content is still read after the connection is closed."""
@@ -46,12 +47,12 @@ THREAD_NAME = "connection guard"
 TCP_INFO_FORMAT, TCP_INFO_BYTES_RECEIVED = "=Q", 128
 
 OnRefused = Callable[[str, str], None]
-"""Called on the guard's thread with the peer's address and the reason."""
+"""Callback on the guard's thread, with the peer's address and the reason of the refusal."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Publisher:
-    """Monitor socket of a publisher, and its callback for closed connections."""
+    """Monitor socket of a publisher, and the callback for its closed connections."""
 
     monitor: zmq.Socket[bytes]
     on_refused: OnRefused
@@ -59,7 +60,7 @@ class _Publisher:
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """Accepted connection; its two addresses identify it although file descriptors are reused."""
+    """Accepted connection; identified by its two addresses, because file descriptors are reused."""
 
     publisher: _Publisher
     local: tuple[object, ...]
@@ -71,7 +72,7 @@ class _Connection:
         return str(self.remote[0])
 
     def open(self, fd: int) -> socket.socket | None:
-        """Return a duplicate of the descriptor `fd`; None if it is another connection now."""
+        """Return a duplicate of the descriptor `fd`; None if another connection uses it now."""
         try:
             opened = socket.socket(fileno=os.dup(fd))
         except OSError:
@@ -97,11 +98,11 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor the future connections of a socket until its monitor is disabled."""
+        """Monitor all future connections of a socket, until its monitor is disabled."""
         publisher.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         events = int(zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)
         monitor = publisher.get_monitor_socket(events, f"inproc://accepted-{next(cls._numbers)}")
-        # ZeroMQ signals by the descriptor only after all earlier commands have been read.
+        # ZeroMQ signals on the descriptor only after all earlier events have been read.
         monitor.getsockopt(zmq.EVENTS)
         with cls._lock:
             guard = cls._present
@@ -159,7 +160,7 @@ class ConnectionGuard:
         self._check(fd)
 
     def _count(self, new: _Connection) -> int:
-        """Count the other connections of an address; remove those that have ended."""
+        """Count the other connections from the same address; forget those that have ended."""
         number = 0
         for fd, known in list(self._connections.items()):
             if known.publisher is new.publisher and known.address == new.address:

@@ -8,7 +8,7 @@ from typing import ClassVar
 class FlexsheetError(Exception):
     """Base class of errors that a user can correct.
 
-    code: name of the error for `flexsheet explain`.  remedy: action for the user.
+    code: name of the error for `flexsheet explain`.  remedy: what the user can do.
     exit_code: exit status of a command that ends with this error.
     """
 
@@ -17,5 +17,5 @@ class FlexsheetError(Exception):
     exit_code: int = 1
 
     def __str__(self) -> str:
-        """Return the text; a KeyError would return its representation."""
+        """Return the error text; without this method, a KeyError would return it in quotes."""
         return Exception.__str__(self)

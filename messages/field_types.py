@@ -13,7 +13,7 @@ from flexsheet.messages.arrays import ArraySpec
 
 
 def describe_field_type(field: FieldInfo) -> str:
-    """Return a field's type as text; models are links to their sections."""
+    """Return a field's type as Markdown text; models are links to their sections."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):
             return _array(extra)

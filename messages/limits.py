@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
 A field's name ends in its unit, and each unit has a limit.  A few names have a limit of their own.
-The limits are wide: they exclude only numbers that no apparatus of this kind has, and that would
-break the nodes' arithmetic.
+The limits are wide. They only exclude numbers that no hardware of this kind has, and that could
+cause overflow or other numerical faults in the nodes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 MAX_LENGTH_M = 10.0
-"""Size of a room."""
+"""The size of a room."""
 
 MAX_ANGLE_RAD = 7.0
 """A full rotation plus a margin for rounding."""
@@ -25,20 +25,20 @@ MAX_ANGLE_RAD = 7.0
 MAX_DURATION_S = 86_400.0
 MAX_RATE_HZ = 10_000.0
 MAX_IMAGE_PX = 16_384.0
-"""OpenGL's largest texture on common devices; larger than any camera or projector."""
+"""Largest OpenGL texture on common devices; larger than the image of any camera or projector."""
 
 MAX_STRESS_PA = 1.2e12
-"""Young's modulus of diamond."""
+"""Young's modulus of diamond, the stiffest material."""
 
 MAX_FORCE_N = 10_000.0
 MAX_SPEED_M_PER_S = 10.0
-"""Speed of the fastest strokes of a hand."""
+"""Speed of the fastest movements of a hand."""
 
 MAX_TOOL_SPEED_M_PER_S = 2.2
 """Maximum speed of the RV-1A with all joints together (its specification)."""
 
 MAX_STRETCH_RATIO = 10.0
-"""Larger than the stretch at which natural rubber breaks."""
+"""More than the stretch at which natural rubber breaks."""
 
 MAX_NUMBER = 1e9
 """Maximum magnitude of a number without a unit."""
@@ -85,20 +85,20 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""Maximum magnitudes by the suffix of a name; longer suffixes first."""
+"""Maximum magnitude by the suffix of a field's name; longer suffixes come first."""
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""Minimum values of positive fields; a fraction of the resolution of any device."""
+"""Minimum value of positive fields by suffix; a fraction of the resolution of any device."""
 
 MIN_POSITIVE = 1e-9
-"""Minimum value of positive fields without such a unit."""
+"""Minimum value of positive fields whose unit is not in `MIN_BY_UNIT`."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""Maximum error of an element of R Rᵀ for a rotation matrix R: 0.05 mm at half a metre."""
+"""Maximum error of an element of R R^T for a rotation matrix R; 0.05 mm at half a metre."""
 
 
 class LimitedModel(BaseModel):
-    """Base model that checks numbers against the limits of their units, and 4x4 transforms."""
+    """Base model that checks numbers against their units' limits, and transforms for rigidity."""
 
     @field_validator("*", mode="after")
     @classmethod
@@ -144,7 +144,7 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 @cache
 def find_max_magnitude(name: str) -> float:
-    """Return the maximum magnitude of a field's numbers."""
+    """Return the maximum magnitude of the numbers in a field, from the field's name."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
     return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
@@ -152,7 +152,7 @@ def find_max_magnitude(name: str) -> float:
 
 @cache
 def find_min_positive(name: str) -> float:
-    """Return the minimum value of a positive field."""
+    """Return the minimum value of a positive field, from the field's name."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
 
@@ -169,7 +169,7 @@ def _refuses_zero(model: type[BaseModel], name: str) -> bool:
 
 
 def _constraints(field: FieldInfo, annotation: Any) -> Iterator[Any]:
-    """Yield the constraints of a field, and of the members of an optional one."""
+    """Yield the constraints of a field, including those of the members of an optional type."""
     yield from field.metadata
     for member in get_args(annotation):
         if get_origin(member) is Annotated:

@@ -1,9 +1,10 @@
 """Deliver messages between the nodes of one process without serialization.
 
-A publisher passes each message to the readers in its process, and sends it on its socket only while
-another process has subscribed.  Readers apply the same checks as to messages from sockets: writer,
-plan, order, types, shapes and ranges.  As on the wire, arrays of at most `INLINE_BYTES` are copied,
-since a sender may reuse them; larger arrays are shared, and all are read-only for the readers.
+A publisher passes each message to the readers (subscribers) in its process, and sends it on its
+socket only while another process has subscribed.  Readers apply the same checks as to messages from
+sockets: writer, plan, order, types, shapes and ranges.  Arrays of at most `INLINE_BYTES` are copied
+as for a socket, because a sender may reuse them.  Larger arrays are shared.  All arrays are
+read-only for the readers.
 
 A handler runs in a callback of the loop after that of the sender, never inside `send`.
 """
@@ -24,7 +25,7 @@ from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, ge
 
 
 class LocalEnvelope(Envelope):
-    """Message for the readers in its process, which is copied and validated at most once."""
+    """Message for the readers in the sender's process; it is copied and validated at most once."""
 
     __slots__ = ("_error", "_message")
 
@@ -35,7 +36,7 @@ class LocalEnvelope(Envelope):
         self.fields = {name: _share(value) for name, value in original.__dict__.items()}
 
     def open(self) -> Message:
-        """Return the validated message, the same object for all readers; raises WireError."""
+        """Return the validated message, the same object for every reader; raises WireError."""
         if self._error is not None:
             raise self._error
         if self._message is None:
@@ -48,7 +49,7 @@ class LocalEnvelope(Envelope):
 
 
 def _share(value: Any) -> Any:
-    """Return a field's value with read-only arrays, and with message parts as maps."""
+    """Return a field's value with read-only arrays, and with message parts as dictionaries."""
     if isinstance(value, np.ndarray):
         array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
         array.flags.writeable = False
@@ -73,7 +74,7 @@ def _count_array_bytes(value: Any) -> int:
 
 
 class LocalReceiver(Protocol):
-    """Checks and handler of a subscriber, which are the same for messages from sockets."""
+    """Interface of a subscriber: its checks and handler, which are the same as for sockets."""
 
     topic: Topic
     counts: Any
@@ -83,7 +84,7 @@ class LocalReceiver(Protocol):
 
 
 class LocalChannel:
-    """Messages of one writer on one topic within its process."""
+    """Channel for the messages of one writer on one topic, inside its process."""
 
     def __init__(self) -> None:
         self._readers: list[LocalConnection] = []
@@ -102,7 +103,7 @@ class LocalChannel:
         if size > topic.max_bytes:
             raise WireError(
                 "size",
-                f"{envelope.codec.name}: arrays of {size} bytes, at most {topic.max_bytes} "
+                f"{envelope.codec.name}: the arrays have {size} bytes, at most {topic.max_bytes} "
                 "are allowed",
             )
         if latched:
@@ -111,7 +112,7 @@ class LocalChannel:
             reader.put(envelope)
 
     def forget(self) -> None:
-        """Discard the stored message for late readers."""
+        """Discard the message that is stored for late readers."""
         self._last = None
 
     def add(self, reader: LocalConnection) -> None:
@@ -125,22 +126,23 @@ class LocalChannel:
 
 
 class LocalBus:
-    """Channels of a process, by the endpoints at which its publishers bind."""
+    """Channels of one process, found by the endpoints at which its publishers bind."""
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first of these endpoints that has one."""
+        """Return the channel of the first of these endpoints that has one; None if none has."""
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 
 class LocalConnection:
-    """Connection of a subscriber to the writers of its own process.
+    """Connection of a subscriber to the writers in its own process.
 
-    writers: the names that these writers may have; None: any.
-    max_waiting: length of the queue.  A full queue refuses the newest message, like a socket's; the
-        subscriber counts it as a gap.
+    writers: names that these writers may have; None: any.
+    max_waiting: length of the queue.  A full queue refuses the newest message, as a socket does;
+    the
+      subscriber counts it as a gap.
     """
 
     def __init__(
@@ -162,13 +164,13 @@ class LocalConnection:
         return self._loop is None
 
     def open(self) -> None:
-        """Start to receive; needs a running loop."""
+        """Start to receive messages; needs a running loop."""
         self._loop = asyncio.get_running_loop()
         for channel in self._channels:
             channel.add(self)
 
     def close(self) -> None:
-        """Stop to receive; messages in the queue are discarded."""
+        """Stop receiving; messages in the queue are discarded."""
         for channel in self._channels:
             channel.remove(self)
         self._waiting.clear()
@@ -183,7 +185,7 @@ class LocalConnection:
             self._loop.call_soon(self._read)
 
     def _read(self) -> None:
-        """Deliver the messages that waited when the callback began."""
+        """Deliver the messages that were queued when the callback began."""
         self._scheduled = False
         accepted: list[LocalEnvelope] = []
         while self._waiting:

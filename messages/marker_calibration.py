@@ -1,4 +1,4 @@
-"""Define the marker's calibration file, from `flexsheet calibrate marker` for the triangulator."""
+"""Define the marker's calibration file, which `flexsheet calibrate marker` writes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MARKER_CALIBRATION_VERSION = 1
 
 
 class MarkerCalibration(Part):
-    """Position of the marker on a finger, with its uncertainty."""
+    """Position of the marker on a finger, with its uncertainty, for the triangulator."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -26,10 +26,12 @@ class MarkerCalibration(Part):
     source: str = Field(description="file of the touches, or scene of the simulator")
     scene: str = Field(description="name of the scene in which the finger was calibrated")
     marker_from_pad_m: FingerLengths = Field(
-        description="centre of the marker from the pad's contact point, in the finger's frame"
+        description="marker's centre relative to the pad's contact point, finger's frame"
     )
     standard_deviations_m: tuple[NonNegative, NonNegative, NonNegative]
-    point_offset_m: FingerLengths = Field(description="common error of the touched points, world")
+    point_offset_m: FingerLengths = Field(
+        description="error that all touched points have in common, world frame"
+    )
     residual_rms_m: NonNegative
     max_residual_m: NonNegative
     touches: Annotated[int, Field(ge=1)]
@@ -37,7 +39,7 @@ class MarkerCalibration(Part):
 
 
 def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
-    """Raise CalibrationMismatchError unless the calibration is of this scene."""
+    """Raise CalibrationMismatchError unless the calibration was made in this scene."""
     if calibration.scene != scene.name:
         raise CalibrationMismatchError(
             f'scene: the marker was calibrated in scene "{calibration.scene}", not in '
@@ -48,13 +50,13 @@ def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
 def save_marker_calibration(
     calibration: MarkerCalibration, path: Path, *, comment: str = ""
 ) -> None:
-    """Write the calibration file; FileWriteError if the disk refuses it."""
+    """Write the calibration file; raises FileWriteError if it cannot be written."""
     title = f"Calibration of a finger's marker, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_marker_calibration(path: Path) -> MarkerCalibration:
-    """Read the calibration file; CalibrationFileError if it is invalid."""
+    """Read the calibration file; raises CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate marker"
     return read_calibration(
         MarkerCalibration, path, version=MARKER_CALIBRATION_VERSION, command=command

@@ -1,8 +1,8 @@
 """Define the method families of the nodes, and the choice of methods in a scene.
 
-A method family is a set of interchangeable methods for one task (`nodes/methods.py`); this module
-defines their names.  `flexsheet tune SCENE` writes a scene's `methods`.  A node's parameter with
-the value `auto` uses them; another value overrides them.
+A method family is a set of interchangeable methods for one task (`nodes/methods.py`).  This module
+defines their names.  `flexsheet tune SCENE` writes the `methods` of a scene.  A node's parameter
+with the value `auto` uses them; any other value overrides them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
 class SoftBodyChoice(BaseModel):
-    """Method of the soft body and spacing of its mesh."""
+    """Method for the deformation of the soft body, and vertex spacing of its surface mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -33,7 +33,7 @@ class SoftBodyChoice(BaseModel):
 
 
 class Methods(BaseModel):
-    """A scene's choice for each method family; None: the node's default."""
+    """Method that a scene chooses from each method family; None: the node's default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -45,12 +45,13 @@ class Methods(BaseModel):
     correction: Correction | None = None
     soft_body: SoftBodyChoice | None = None
     compliance: ComplianceMode | None = Field(
-        default=None, description="rendering of the object's force; constant_stretch: none"
+        default=None,
+        description="how the sheet renders the object's force; constant_stretch: it does not",
     )
 
 
 def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:
-    """Return the value of a node's parameter; for `auto` the scene's choice, else the default."""
+    """Return a node's method; `auto` means the scene's choice, or the default if there is none."""
     if parameter != "auto":
         return parameter
     return default if by_scene is None else by_scene

@@ -1,13 +1,13 @@
 """Migrate messages from bags that were recorded before a message type changed.
 
 Every bag contains the JSON Schemas of its messages.  Recorded fields remain valid if a type only
-gained fields with defaults, values of a literal, or members of a union; `is_compatible` compares
-the two schemas.
+gained fields with defaults, values of a literal, or members of a union; `is_compatible` checks this
+by comparing the two schemas.
 
 A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`, a removed
 field one in `REMOVED_FIELDS`.  They apply to every recorded version of the type.  Any other change
 needs a line in `MIGRATIONS`: the type, its former fingerprint (`flexsheet bag info --json`), and a
-function from the recorded fields to those of the next version.
+function that converts the recorded fields to those of the next version.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Schema = Mapping[str, Any]
 
 
 RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
-"""Former and current names of topics."""
+"""Mapping from former to current names of topics."""
 
 RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
-"""Former and current names of message types."""
+"""Mapping from former to current names of message types."""
 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
@@ -57,7 +57,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""Former and current field names, by message, message part or calibration."""
+"""Mapping from former to current field names, by message, message part or calibration."""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -78,7 +78,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("Methods", "sheet_force"): {"cubic": "scaled"},
 }
-"""Former and current literal values, by model and current field name."""
+"""Mapping from former to current literal values, by model and current field name."""
 
 SHEET_REASONS = {
     "": "ok",
@@ -93,7 +93,7 @@ SHEET_REASONS = {
     "sheet turned too far about its normal; lift the finger": "beyond_spin",
     "hollow place: the flat sheet rests on its rim": "concave_contact",
 }
-"""Former texts of `SheetTarget.reason` and current literals."""
+"""Mapping from former texts of `SheetTarget.reason` to current literals."""
 
 
 def _convert_sheet_reason(recorded: str) -> str:
@@ -109,16 +109,16 @@ def _convert_sheet_reason(recorded: str) -> str:
 TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
     ("SheetTarget", "reason"): _convert_sheet_reason,
 }
-"""Functions from a former text to the current literal, by model and current field name."""
+"""Functions that convert a former text to the current literal, by model and current field name."""
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {"Methods": frozenset({"kinematics"})}
-"""Removed fields, by model."""
+"""Names of removed fields, by model."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 
 
 def _add_stroke_duration(fields: Fields) -> Fields:
-    """Add a stroke's moving time, which older messages contain in the path's label only."""
+    """Add the moving time of a stroke, which older messages contain only in the path's label."""
     found = _STROKE_LABEL.fullmatch(fields["path_label"])
     return {**fields, "path_stroke_s": None if found is None else float(found[1])}
 
@@ -135,9 +135,10 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
 def find_migration(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
-    """Return the function from recorded fields to those of the current type; None if there is none.
+    """Return the function that converts recorded fields to the current type; None if there is none.
 
-    fingerprint: of the recorded type, hexadecimal.  recorded_schema: JSON Schema from the bag.
+    fingerprint: fingerprint of the recorded type, hexadecimal.  recorded_schema: JSON Schema from
+    the bag.
     """
     if fingerprint == compute_fingerprint(message_type).hex():
         return _unchanged
@@ -151,7 +152,7 @@ def find_migration(
 
 
 def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
-    """Return the recorded schema with current names."""
+    """Replace former names in a recorded schema by current ones."""
     parts = recorded.get("$defs", {})
     if not isinstance(parts, Mapping):
         return recorded
@@ -160,7 +161,7 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Return a recorded schema with the literals to which its text fields are converted."""
+    """Replace text fields in a recorded schema by the literals that replaced their texts."""
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
@@ -177,7 +178,7 @@ def _is_text(schema: Any) -> bool:
 
 
 def _rename_part(model: str, schema: Any) -> Any:
-    """Return one model's schema with its renamed properties and literal values."""
+    """Replace former property names and literal values in the schema of one model."""
     if not isinstance(schema, Mapping) or not isinstance(schema.get("properties"), Mapping):
         return schema
     names, removed = RENAMED_FIELDS.get(model, {}), REMOVED_FIELDS.get(model, frozenset())
@@ -193,7 +194,7 @@ def _rename_part(model: str, schema: Any) -> Any:
 
 
 def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
-    """Return a field's schema with current literal values, in it and in its options."""
+    """Replace former literal values in a field's schema, including those in its options."""
     if not values or not isinstance(schema, Mapping):
         return schema
     renamed = dict(schema)
@@ -207,9 +208,9 @@ def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
 
 
 def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
-    """Return the recorded fields of a model and of its nested models with current names.
+    """Rename the recorded fields of a model and of its nested models to current names.
 
-    A calibration file contains the fields of a calibration.
+    Calibration files contain the fields of a calibration and are converted by this function, too.
     """
     names = RENAMED_FIELDS.get(model.__name__, {})
     renamed: Fields = {}
@@ -232,7 +233,7 @@ def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
 
 
 def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
-    """Return the recorded fields of a part, or of each part of a list, with current names."""
+    """Rename the recorded fields of a part, or of each part in a list, to current names."""
     if model is not None and isinstance(value, dict):
         return rename_fields(model, value)
     if model is not None and isinstance(value, list):
@@ -241,20 +242,20 @@ def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the one model that an annotation allows; None for none or several."""
+    """Return the only model that an annotation allows; None if it allows none or several."""
     options = [annotation, *get_args(annotation)]
     models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
     return models[0] if len(models) == 1 else None
 
 
 def is_compatible(recorded: Schema, current: Schema) -> bool:
-    """Return whether all values that the recorded schema allows are valid by the current one."""
+    """Return whether all values that the recorded schema allows are valid in the current one."""
     try:
         return _Comparison(recorded.get("$defs", {}), current.get("$defs", {})).is_compatible(
             recorded, current
         )
     except (KeyError, TypeError, AttributeError, RecursionError):
-        return False  # damaged: not a JSON Schema, or an endless one
+        return False  # The schema is damaged: not a JSON Schema, or without end.
 
 
 def _unchanged(fields: Fields) -> Fields:
@@ -262,7 +263,7 @@ def _unchanged(fields: Fields) -> Fields:
 
 
 class _Comparison:
-    """Comparison of two schemas with their parts; each pair of parts is compared once."""
+    """The schema is damaged: it is not a JSON Schema, or it contains itself."""
 
     def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
         self._old_parts, self._new_parts = old_parts, new_parts
@@ -274,7 +275,7 @@ class _Comparison:
             return bool(old == new)
         pair = id(old), id(new)
         if pair not in self._known:
-            # A schema that contains itself is endless, and no message has such a schema.
+            # A schema that contains itself never ends, and no message has such a schema.
             self._known[pair] = False
             self._known[pair] = self._fit(old, new)
         return self._known[pair]
@@ -303,7 +304,7 @@ class _Comparison:
 
 
 def _resolve(schema: Any, parts: Schema) -> Any:
-    """Follow a chain of references; TypeError for a cycle."""
+    """Follow a chain of references in a schema; raises TypeError for a cycle."""
     for _ in range(len(parts) + 1):
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema
@@ -316,7 +317,7 @@ def _options(schema: Schema) -> list[Any]:
 
 
 def _allowed_values(schema: Schema) -> set[Any]:
-    """Return the allowed literal values; {None} if the schema does not restrict them."""
+    """Return the literal values that a schema allows; {None} if it does not restrict them."""
     if "const" in schema:
         return {schema["const"]}
     return set(schema["enum"]) if "enum" in schema else {None}

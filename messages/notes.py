@@ -1,4 +1,4 @@
-"""Define the remedies for notes of nodes, which `flexsheet explain` prints."""
+"""Define the phrases that nodes report, and their remedies, which `flexsheet explain` prints."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row 
 
 
 class NodeNote(Enum):
-    """Notes, reasons and warnings of nodes that need an action.
+    """Notes, reasons and warnings of nodes that require an action of the user.
 
-    phrase: constant part of the text, which the writers of the note use. remedy: what to do.
+    phrase: constant part of the text; nodes that report the note use it. remedy: what the user can
+    do.
     """
 
     COMPUTER_BUSY = (
@@ -225,7 +226,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "sheet_stiffness": "the sheet is not as stiff as the scene states",
     "arm_not_following": "the arm does not do the commanded motion",
 }
-"""Findings by the cause that a self-check suspects."""
+"""Sentences for the causes that a self-check of a node suspects."""
 
 SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
@@ -237,7 +238,7 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",
 }
-"""Remedies by the cause that a self-check suspects."""
+"""Remedies for the causes that a self-check of a node suspects."""
 
 _SHOWN_UNITS = {
     "m": ("mm", 1e3),
@@ -249,7 +250,7 @@ _SHOWN_UNITS = {
 
 
 def describe_self_check(check: SelfCheck) -> str:
-    """Format a suspected cause with its numbers."""
+    """Describe a suspected cause with the measured and the expected value."""
     unit, scale = _SHOWN_UNITS[check.unit]
     subject = f"{check.subject}: " if check.subject else ""
     return (

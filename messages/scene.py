@@ -25,11 +25,11 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Part(MessagePart, LimitedModel):
-    """Base class of the parts of scenes and calibrations, with limits for each unit."""
+    """Base class of the parts of scenes and calibrations; checks limits for each unit."""
 
 
 class Pose(Part):
-    """Pose of a frame in another; roll, pitch, yaw are rotations about fixed x, y, z, in order."""
+    """Pose of a frame in its parent; roll, pitch, yaw: rotations about fixed x, y, z, in order."""
 
     position_m: Vector3
     rpy_rad: Vector3
@@ -43,9 +43,9 @@ class Material(Part):
 
 
 class Cylinder(Part):
-    """Solid circular cylinder, axis along the object frame's x, centred on its origin.
+    """Solid circular cylinder whose axis is x of the object frame, centred on the origin.
 
-    The user touches its side, not its ends.
+    The user touches its curved surface, not its flat ends.
     """
 
     shape: Literal["cylinder"] = "cylinder"
@@ -68,7 +68,7 @@ class Ellipsoid(Part):
 
 
 class Plane(Part):
-    """Half-space below z = 0 of the object frame, with a touchable rectangle about the origin."""
+    """Half-space below z = 0 of the object frame; a rectangle about the origin can be touched."""
 
     shape: Literal["plane"] = "plane"
     width_m: Positive = Field(description="along x")
@@ -97,8 +97,8 @@ class RoundedBox(Part):
 class Mesh(Part):
     """Smooth solid that approximates a closed triangle mesh.
 
-    The scene message contains the mesh, so every node on every host has the same one.  A scene file
-    gives the mesh's file as `shape: mesh_file`; see `launch/objects/meshes.py`.
+    The scene message contains the whole mesh, so that all nodes on all hosts use the same one.  A
+    scene file names the mesh's file with `shape: mesh_file`; see `launch/objects/meshes.py`.
     """
 
     shape: Literal["mesh"] = "mesh"
@@ -114,19 +114,22 @@ Geometry = Annotated[
 
 
 class StripSupport(Part):
-    """Fixed skin on the side that faces away from the user."""
+    """Support that fixes the surface of a soft object on the side that faces away from the user."""
 
     kind: Literal["strip"] = "strip"
     angle_rad: Positive = Field(
-        description="full angle of the fixed skin's normals about the line from the user"
+        description="twice the maximum angle between the normal of fixed surface points and the "
+        "direction away from the user"
     )
 
 
 class BaseSupport(Part):
-    """Fixed skin at the lowest part, as of an object on a table."""
+    """Support that fixes the lowest part of the surface, as for an object on a table."""
 
     kind: Literal["base"] = "base"
-    height_m: Positive = Field(description="height of the fixed skin above the lowest point")
+    height_m: Positive = Field(
+        description="height above the lowest point up to which the surface is fixed"
+    )
     down_world: tuple[Finite, Finite, Finite] = Field(
         default=(0.0, 0.0, -1.0), description="direction downwards, of any length except zero"
     )
@@ -141,7 +144,7 @@ class BaseSupport(Part):
 
 
 class SpherePatchSupport(Part):
-    """Fixed skin within a sphere, as by a clamp."""
+    """Support that fixes the surface within a sphere, like a clamp."""
 
     kind: Literal["sphere_patch"] = "sphere_patch"
     centre_m: Vector3 = Field(description="object frame")
@@ -149,7 +152,7 @@ class SpherePatchSupport(Part):
 
 
 class BoxPatchSupport(Part):
-    """Fixed skin within a box along the object frame's axes."""
+    """Support that fixes the surface within a box along the axes of the object frame."""
 
     kind: Literal["box_patch"] = "box_patch"
     min_m: Vector3 = Field(description="object frame")
@@ -169,7 +172,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Appearance(Part):
-    """Colour and texture of the object; the texture moves with the skin and shows its strain.
+    """Colour and texture of the object; the texture moves with the surface and so shows its strain.
 
     `texture: image` needs an image; a scene file gives its file as `image_file` (see
     `launch/objects/textures.py`).
@@ -180,7 +183,8 @@ class Appearance(Part):
     )
     texture: Literal["none", "speckle", "grid", "image"] = "none"
     texture_pitch_m: Positive = Field(
-        default=0.008, description="approximate distance of the grid's lines or the speckles"
+        default=0.008,
+        description="approximate distance between the lines of the grid, or between the speckles",
     )
     image: ColorImage | None = Field(
         default=None,
@@ -196,9 +200,9 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """Virtual object, which is rigid without a material.
+    """Virtual object; without a material it is rigid.
 
-    `support_angle_rad: x` in a scene file means `support: {kind: strip, angle_rad: x}`.
+    `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
@@ -207,14 +211,17 @@ class VirtualObject(Part):
     support: Support | None = Field(
         default=None,
         discriminator="kind",
-        description="fixed part of the skin; null only for a rigid object",
+        description="fixed part of the object's surface; null only for a rigid object",
     )
     appearance: Appearance = Appearance()
 
     @model_validator(mode="after")
     def _check_support(self) -> Self:
         if self.material is not None and self.support is None:
-            raise ValueError("support is missing: a soft object needs a fixed part of its skin")
+            raise ValueError(
+                "support is missing: a soft object needs a fixed part of its surface; "
+                "add for example support: {kind: strip, angle_rad: 1.57}"
+            )
         return self
 
     @model_validator(mode="before")
@@ -232,7 +239,7 @@ class VirtualObject(Part):
 
     @property
     def support_angle_rad(self) -> float:
-        """Return the angle of the fixed strip; raises UnfitGeometryError for another support."""
+        """Return the angle of the fixed strip; raises UnfitGeometryError for other supports."""
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
                 'object.support.kind: expected "strip", found '
@@ -244,7 +251,9 @@ class VirtualObject(Part):
 class SheetSpec(Part):
     """Rubber sheet, clamped at its left and right edges (x), free at top and bottom (y)."""
 
-    width_m: Positive = Field(description="slack distance between the clamped edges")
+    width_m: Positive = Field(
+        description="distance between the clamped edges when the sheet is unstretched"
+    )
     height_m: Positive = Field(description="length of a clamped edge")
     thickness_m: Positive
     young_modulus_pa: Positive
@@ -253,8 +262,8 @@ class SheetSpec(Part):
     )
     hysteresis_ratio: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.0,
-        description="fraction of the loading's energy that the rubber loses in a cycle; corrects "
-        "the rendered force, a sheet calibration replaces it",
+        description="fraction of the loading energy that the rubber loses in a cycle, by which the "
+        "rendered force is corrected; a sheet calibration replaces it",
     )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
@@ -265,32 +274,32 @@ class SheetSpec(Part):
 
 
 class ArmSpec(Part):
-    """One RV-1A: pose of its base, and of its edge of the sheet on the flange.
+    """RV-1A robot arm: pose of its base, and of its edge of the sheet on its flange.
 
-    Sheet frame: x from the left edge to the right, y along the edges, z towards the user.
+    Sheet frame: x from the left edge to the right edge, y along the edges, z towards the user.
     """
 
     world_from_base: Pose
     flange_from_edge: Pose = Field(
-        description="pose of the clamped edge's centre in the flange's frame, axes like the sheet's"
+        description="pose of the clamped edge's centre in the flange frame; axes as the sheet frame"
     )
 
 
 class Arms(Part):
-    """Both arms and their common limits."""
+    """Both robot arms and their common limits."""
 
     left: ArmSpec
     right: ArmSpec
     max_tool_speed_m_per_s: Positive
     min_distance_m: Positive = Field(description="minimum distance between the two flanges")
     workspace_min_m: Vector3 = Field(
-        description="lower corner of the box that limits the flanges, world"
+        description="lower corner of the box that limits the flanges, world frame"
     )
     workspace_max_m: Vector3
 
 
 class Lens(Part):
-    """Pinhole camera with Brown's distortion (k1, k2, p1, p2, k3), OpenCV's convention, px."""
+    """Pinhole camera with Brown's distortion (k1, k2, p1, p2, k3) as defined by OpenCV, px."""
 
     fx_px: Positive
     fy_px: Positive
@@ -300,7 +309,7 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """Stereo rig; camera frames have x right, y down, z along the optical axis (OpenCV)."""
+    """Stereo camera; both camera frames have x right, y down, z along the optical axis (OpenCV)."""
 
     device: str
     width_px: Annotated[int, Field(gt=0)]
@@ -311,11 +320,12 @@ class StereoCamera(Part):
         default=None, description="gain in units of the device; null: the device's setting"
     )
     read_noise_levels: Positive = Field(
-        default=1.5, description="standard deviation of a dark pixel, in levels of 255"
+        default=1.5,
+        description="standard deviation of the noise of a dark pixel, in grey levels (0 to 255)",
     )
     photons_per_level: Positive = Field(
         default=40.0,
-        description="photons per level; level L has the shot noise sqrt(L / photons_per_level)",
+        description="photons per grey level; level L has shot noise sqrt(L / photons_per_level)",
     )
     left: Lens
     right: Lens
@@ -324,7 +334,7 @@ class StereoCamera(Part):
 
 
 class Projector(Part):
-    """Projector with the lens model of a camera; z is along the light."""
+    """Projector with the lens model of a camera; z of its frame points along the projection."""
 
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
@@ -333,7 +343,7 @@ class Projector(Part):
 
 
 class Eyes(Part):
-    """Viewpoint V; each eye is half the interocular distance away along x."""
+    """Midpoint between the user's eyes; each eye is half the interocular distance away along x."""
 
     centre_world_m: Vector3
     interocular_m: NonNegative
@@ -352,15 +362,16 @@ class Finger(Part):
 
     radius_m: Positive
     direction_world: tuple[Finite, Finite, Finite] = Field(
-        default=(0.0, -0.5, 0.866), description="from the tip along the finger to the hand"
+        default=(0.0, -0.5, 0.866),
+        description="direction from the fingertip along the finger to the hand",
     )
     marker_from_pad_m: FingerLengths = Field(
         default=(0.0, 0.0, 0.0),
-        description="centre of the marker in the finger's frame; a marker calibration replaces it",
+        description="marker's centre in the finger's frame; a marker calibration replaces it",
     )
     max_speed_m_per_s: Positive
     volume_min_m: Vector3 = Field(
-        description="lower corner of the box of possible fingertips, world"
+        description="lower corner of the box of possible fingertip positions, world frame"
     )
     volume_max_m: Vector3
 
@@ -369,14 +380,14 @@ class Finger(Part):
         x, y, z = self.direction_world
         if math.hypot(y, z) < 0.1 * math.hypot(x, y, z) or not math.hypot(x, y, z):
             raise ValueError(
-                f"direction_world {self.direction_world} is along the world's x axis, or zero; "
-                "give the direction from the tip to the hand"
+                f"direction_world {self.direction_world} must not be zero or along the world's x "
+                "axis; give the direction from the fingertip to the hand"
             )
         return self
 
 
 class WorkingRange(Part):
-    """Range of the user's actions over which limits and charts are computed."""
+    """Range of the user's finger motion for which limits and charts are computed."""
 
     push_depth_m: Positive
     tilt_rad: Positive
@@ -384,41 +395,46 @@ class WorkingRange(Part):
 
 
 class Tolerances(Part):
-    """Maximum errors; each method family is tuned against one of them."""
+    """Tolerances of the errors; each family of methods is tuned to meet one of them."""
 
-    image_m: Positive = Field(description="displacement of the image from the eye's viewpoint")
+    image_m: Positive = Field(description="displacement of the image as seen from the eye")
     fingertip_m: Positive
-    skin_m: Positive = Field(description="skin displacement outside 1.5 finger radii")
+    skin_m: Positive = Field(
+        description="error of surface displacements, beyond 1.5 finger radii from the contact"
+    )
     force_ratio: Positive
     sheet_position_m: Positive
-    latency_s: Positive = Field(description="from exposure to the commands of the arms, 95 %")
+    latency_s: Positive = Field(
+        description="time from exposure to the arms' commands, 95th percentile"
+    )
     light_latency_s: Positive = Field(
         default=0.06,
-        description="from exposure to light, 95 %; people notice an image that is 45 ms later than "
-        "the touch (Vogels 2004), which is itself up to 15 ms late",
+        description="time from exposure to display of the image, 95th percentile; people notice an "
+        "image 45 ms after the touch (Vogels 2004), which is itself up to 15 ms late",
     )
 
 
 class Scene(Message):
-    """Scene that all nodes of a graph share."""
+    """Scene that all nodes of a graph share: object, devices, working range and tolerances."""
 
     name: str
     object: VirtualObject
     sheet: SheetSpec
     arms: Arms
     camera: StereoCamera
-    projector: Projector | None = Field(default=None, description="null: no image is drawn")
+    projector: Projector | None = Field(default=None, description="null: no image is projected")
     eyes: Eyes
     finger: Finger
     working_range: WorkingRange
     tolerances: Tolerances
     methods: Methods = Field(
-        default_factory=Methods, description="methods for parameters with the value `auto`"
+        default_factory=Methods,
+        description="methods that nodes use if their parameter has the value `auto`",
     )
 
 
 class UnfitGeometryError(FlexsheetError, ValueError):
-    """An object of a shape that is not supported."""
+    """Raised for an object shape that a command or method does not support."""
 
     code = "unfit-geometry"
     remedy = "Choose an object of a supported shape."
@@ -435,14 +451,14 @@ def require_cylinder(scene: Scene) -> Cylinder:
 
 
 class MissingPartError(FlexsheetError, ValueError):
-    """A scene without a part that is needed."""
+    """Raised for a scene that lacks a part that is needed."""
 
     code = "missing-part"
     remedy = "Add the part to the scene file, or leave out the node or command that needs it."
 
 
 def require_projector(scene: Scene) -> Projector:
-    """Return the scene's projector; raises MissingPartError for a scene without image."""
+    """Return the scene's projector; raises MissingPartError if the scene has none."""
     if scene.projector is None:
         raise MissingPartError(f'scene "{scene.name}": projector is missing, so it has no image')
     return scene.projector
@@ -460,5 +476,7 @@ def require_material(scene: Scene) -> Material:
 def require_support(scene: Scene) -> Support:
     """Return the fixed part of the object's skin; raises MissingPartError without one."""
     if scene.object.support is None:
-        raise MissingPartError(f'scene "{scene.name}": object.support is missing')
+        raise MissingPartError(
+            f'scene "{scene.name}": object.support is missing; a soft object needs it'
+        )
     return scene.object.support

@@ -2,8 +2,9 @@
 
 Every host has one CURVE key pair.  The secret key is in a file that only its owner may read; the
 public keys of all hosts are in the launch file.  A bound socket accepts only the keys of hosts of
-the plan; ZeroMQ requests that decision by ZAP, in the event loop.  A connecting socket requires the
-key of one host.  Each end of a connection can therefore identify the host of the other end.
+the plan.  ZeroMQ asks for that decision by its authentication protocol (ZAP), in the event loop.  A
+connecting socket requires the key of one host.  Each end of a connection can therefore identify the
+host of the other end.
 
 Keys are written in Z85, 40 characters.
 """
@@ -37,7 +38,7 @@ RefusalHandler = Callable[[str], None]
 
 
 class SecurityError(FlexsheetError, RuntimeError):
-    """An invalid or missing key; the text names file or host, and the remedy."""
+    """Raised for an invalid or missing key; the text names the file or host, and the remedy."""
 
     code = "keys"
     remedy = (
@@ -55,13 +56,13 @@ def make_key_pair() -> tuple[str, str]:
 
 
 def derive_public_key(secret: str) -> str:
-    """Return the public key of a secret key."""
+    """Compute the public key that belongs to a secret key."""
     public: bytes = zmq.curve_public(secret.encode())
     return public.decode()
 
 
 def is_key(text: str) -> bool:
-    """Return whether a text is a key in Z85."""
+    """Return whether a text is a valid Z85 key."""
     try:
         return len(text) == KEY_LENGTH and len(z85.decode(text.encode("ascii"))) == CURVE_KEY_BYTES
     except (ValueError, KeyError, struct.error):
@@ -69,9 +70,9 @@ def is_key(text: str) -> bool:
 
 
 def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
-    """Write a secret key that only its owner can read; SecurityError for an existing file.
+    """Write a secret key to a file that only its owner can read.
 
-    replace: whether an existing file is replaced.
+    replace: whether to replace an existing file; otherwise SecurityError is raised for it.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = path.with_suffix(".part")
@@ -83,7 +84,7 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
         if replace:
             part.rename(path)
         else:
-            # A link, unlike a rename, does not replace an existing file.
+            # Unlike a rename, a link does not replace an existing file.
             os.link(part, path)
     except FileExistsError as error:
         raise SecurityError(
@@ -97,13 +98,13 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
 
 
 def read_secret(path: Path) -> str:
-    """Read a secret key; SecurityError unless its file is private to this user and valid."""
+    """Read a secret key; raises SecurityError unless its file is valid and private to this user."""
     try:
         with path.open() as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
                 raise SecurityError(
-                    f"{path}: belongs to another user; create a key: flexsheet keys new"
+                    f"{path}: belongs to another user; create your own key: flexsheet keys new"
                 )
             if status.st_mode & 0o077:
                 raise SecurityError(
@@ -124,7 +125,7 @@ def read_secret(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeyChange:
-    """Changes by a reload: of this host's own key, and of the keys of other hosts."""
+    """Keys that a reload changed: whether this host's own key, and which other hosts' keys."""
 
     own: bool
     hosts: frozenset[str]
@@ -133,7 +134,7 @@ class KeyChange:
 class KeyRing:
     """Key pair of one host, and the public keys of all hosts.
 
-    file: JSON of {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
+    file: JSON file with {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
     """
 
     def __init__(self, file: Path) -> None:
@@ -145,7 +146,7 @@ class KeyRing:
         self.reload()
 
     def get_public_key(self, host: str) -> str:
-        """Return the public key of a host; SecurityError if it has none."""
+        """Return the public key of a host; raises SecurityError if it has none."""
         key = self.public.get(host)
         if key is None:
             raise SecurityError(f'host "{host}" has no key in the launch file')
@@ -156,9 +157,9 @@ class KeyRing:
         return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
-        """Read the files again if they have changed; return the changes, or None without any.
+        """Read the files again if they have changed; return the changed keys, if any.
 
-        Raises SecurityError for invalid files; the keys are then unchanged.
+        Raises SecurityError for invalid files; the keys then remain unchanged.
         """
         try:
             ring = json.loads(self._file.read_text())
@@ -187,22 +188,22 @@ class KeyRing:
         return change
 
     def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
-        """Restrict endpoints that the socket binds from now on to hosts of this ring."""
+        """Require authentication: endpoints bound after this call accept this ring's hosts only."""
         opened.setsockopt(zmq.CURVE_SERVER, 1)
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
         opened.setsockopt(zmq.ZAP_DOMAIN, domain)
-        # Without this option, a missing authenticator would admit every peer.
+        # Without this option, every peer would be admitted if the authenticator were missing.
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
-        """Restrict endpoints to which the socket connects from now on to one host."""
+        """Require authentication: endpoints connected after this call must belong to a host."""
         opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
 
 
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
-    """Write the file of a `KeyRing` atomically."""
+    """Write the file that `KeyRing` reads, atomically."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
     write_file(file, text)
 
@@ -210,7 +211,7 @@ def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, st
 class ZapAuthenticator:
     """Handler of ZeroMQ's authentication requests (ZAP); one per process while it is needed.
 
-    Each bound socket has its own domain, with a key ring and a handler of refusals.
+    Each bound socket has its own ZAP domain, with a key ring and a handler of refusals.
     """
 
     _present: ClassVar[ZapAuthenticator | None] = None
@@ -236,7 +237,7 @@ class ZapAuthenticator:
 
     @classmethod
     def unregister(cls, domain: bytes) -> None:
-        """Remove a domain; close the handler after the last one."""
+        """Remove a ZAP domain; close the handler after the last one."""
         if cls._present is None:
             return
         cls._present._domains.pop(domain, None)
@@ -247,7 +248,7 @@ class ZapAuthenticator:
     def _close(self) -> None:
         if not self._loop.is_closed():
             self._loop.remove_reader(self._socket.fileno())
-        # `close` alone would release the name later, in ZeroMQ's thread.
+        # `close` alone would release the endpoint's name later, in ZeroMQ's thread.
         self._socket.unbind(ZAP_ENDPOINT)
         self._socket.close(linger=0)
 
@@ -261,7 +262,7 @@ class ZapAuthenticator:
             self._socket.send_multipart(self.reply(request))
 
     def reply(self, request: list[bytes]) -> list[bytes]:
-        """Return the frames of the answer to a request: 200 and the host's name, or 400."""
+        """Return the answer to a ZAP request: 200 and the host's name, or 400."""
         version, number, domain, address, _, mechanism, *credentials = request
         keys, on_refused = self._domains.get(domain, (None, lambda _: None))
         host, reason = None, "it uses no key"
@@ -277,7 +278,7 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return mtime (ns), inode and size of a file, to detect changes; None without a file."""
+    """Return mtime (ns), inode and size of a file, to detect changes; None if it is missing."""
     try:
         status = path.stat()
     except FileNotFoundError:

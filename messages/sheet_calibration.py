@@ -1,4 +1,4 @@
-"""Define the sheet's calibration file, from `flexsheet calibrate sheet` for the planner."""
+"""Define the sheet's calibration file, which `flexsheet calibrate sheet` writes for the planner."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ Axis = Annotated[NDArray[np.float64], ArraySpec("<f8", ("entries",))]
 Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths", "xs", "ys"))]
 
 NOMINAL_RATIO = 0.02
-"""Maximum relative difference of the nominal sizes of calibration and scene."""
+"""Maximum relative difference between the nominal sizes of a calibration and of the scene."""
 
 
 class Fitted(Part):
-    """Fitted number with its standard deviation (normal errors)."""
+    """Fitted value with its standard deviation (normally distributed errors)."""
 
     value: NonNegative
     standard_deviation: NonNegative
 
 
 class LeftOutRow(Part):
-    """Outlier row, by its line in the file (from 1)."""
+    """Measured row that was excluded as an outlier; `line` is its line in the file, from 1."""
 
     line: Annotated[int, Field(ge=1)]
-    residual_ratio: float = Field(description="measured over fitted force, minus one")
+    residual_ratio: float = Field(description="measured force divided by fitted force, minus one")
 
 
 class SheetTable(Part):
-    """Measured over fitted force; linear in stretch and position, cubic in depth."""
+    """Measured force divided by fitted force; linear in stretch and position, cubic in depth."""
 
-    stretch_ratios: Axis = Field(description="edge distance over the nominal width")
+    stretch_ratios: Axis = Field(description="edge distance divided by the nominal width")
     depths_m: Axis
     xs_m: Axis
     ys_m: Axis
@@ -51,14 +51,14 @@ class SheetTable(Part):
 
 
 class SheetCalibration(Part):
-    """Calibration of a sheet."""
+    """Calibration of a sheet: fitted parameters of the force model, and the measured range."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
     code_version: str
     source: str = Field(description="file of the measurements, or scene of the simulator")
     nominal_width_m: Positive = Field(
-        description="slack width of the scene's sheet, to which stretch ratios refer"
+        description="unstretched width of the scene's sheet, to which stretch ratios refer"
     )
     height_m: Positive
     thickness_m: Positive
@@ -66,12 +66,14 @@ class SheetCalibration(Part):
     modulus_thickness_n_per_m: Fitted
     slack_width_m: Fitted
     cubic_ratio: Fitted = Field(
-        description="cubic term of the slack sheet's force, over that of ideal rubber"
+        description="cubic term of the unstretched sheet's force, divided by that of ideal rubber"
     )
-    mooney_ratio: Fitted | None = Field(default=None, description="C2/(C1+C2); null: not fitted")
+    mooney_ratio: Fitted | None = Field(
+        default=None, description="Mooney-Rivlin constants C2/(C1+C2); null: not fitted"
+    )
     hysteresis_ratio: Fitted | None = Field(
         default=None,
-        description="fraction of the loading's energy that a cycle loses; null: not measured",
+        description="fraction of the loading energy that is lost in a cycle; null: not measured",
     )
     rows: Annotated[int, Field(ge=1)]
     left_out: tuple[LeftOutRow, ...]
@@ -84,7 +86,7 @@ class SheetCalibration(Part):
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
-    """Raise CalibrationMismatchError unless the calibrated sheet has the sizes of the scene's."""
+    """Raise CalibrationMismatchError if the calibrated sheet's size differs from the scene's."""
     sizes = (
         ("width_m", calibration.nominal_width_m, sheet.width_m),
         ("height_m", calibration.height_m, sheet.height_m),
@@ -98,13 +100,13 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
 
 
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; FileWriteError if the disk refuses it."""
+    """Write the calibration file; raises FileWriteError if it cannot be written."""
     title = f"Calibration of a sheet, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_sheet_calibration(path: Path) -> SheetCalibration:
-    """Read the calibration file; CalibrationFileError if it is invalid."""
+    """Read the calibration file; raises CalibrationFileError if it is invalid."""
     command = "flexsheet calibrate sheet"
     return read_calibration(
         SheetCalibration, path, version=SHEET_CALIBRATION_VERSION, command=command

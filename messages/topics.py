@@ -1,4 +1,4 @@
-"""Define the table of topics.
+"""Define the table of topics: names, message types, delivery, rates and access.
 
 Ports, recorder, health checks, command line and documentation use this table.  A new topic needs
 one new row.
@@ -17,7 +17,7 @@ from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
-    """Delivery of messages to a slow or late subscriber.
+    """Kind of delivery of messages to a slow or late subscriber.
 
     latest: only the newest message; older ones are dropped and counted.
     every: all messages in order through a bounded queue; an overflow is counted as an error.
@@ -31,13 +31,13 @@ class Delivery(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One row of the table.
+    """Topic, one row of the table.
 
-    rate_hz: expected range, for health checks; None: the topic is published on change.
+    rate_hz: expected range, for health checks; None: the topic is published when its value changes.
     logged: whether it is recorded by default.
     many_writers: whether any number of nodes may publish it; otherwise exactly one.
     max_bytes: maximum size of a message, checked at both ends.
-    open_to_tools: whether command-line tools may publish a topic with many writers.
+    open_to_tools: whether command-line tools may publish it, if it has many writers.
     """
 
     name: str
@@ -115,14 +115,14 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
 class UnknownTopicError(FlexsheetError, KeyError):
-    """Unknown name of a topic; the text suggests a similar one."""
+    """Raised for an unknown topic name; the text suggests a similar one."""
 
     code = "unknown-topic"
     remedy = "`flexsheet topic list` prints all names."
 
 
 def find_topic(name: str) -> Topic:
-    """Return the topic of that name; raises UnknownTopicError with the most similar name."""
+    """Return the topic of this name; raises UnknownTopicError with the most similar name."""
     try:
         return TOPICS[name]
     except KeyError:

@@ -1,7 +1,10 @@
 """Define the messages of all topics except the scene (`flexsheet.messages.scene`).
 
-Positions and directions are in the world frame unless the name contains another frame.  A field
-marks an unknown quantity; arrays never contain NaN.
+Positions and directions are in the world frame unless the name contains another frame.  A quantity
+that may be unknown has a field that says so; arrays never contain NaN.
+
+"Sheet" is the rubber sheet that two robot arms hold in front of the user.  Its target pose follows
+the user's fingertip over the virtual object.
 """
 
 from __future__ import annotations
@@ -39,17 +42,20 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 
 
 class StereoPair(Message):
-    """Pair of images; the header's source stamp is the middle of the exposure.
+    """Stereo image pair; the header's source timestamp is the midpoint of the exposure.
 
-    For cameras without a common trigger, it is the middle between both exposures.
+    For cameras without a common trigger, it is midway between the midpoints of both exposures.
     """
 
     device: str
     exposure_s: NonNegative
     skew_s: Finite = Field(
-        default=0.0, description="measured time of the right exposure minus that of the left, s"
+        default=0.0,
+        description="measured time of the right exposure minus time of the left exposure, s",
     )
-    dropped_frames: int = Field(ge=0, description="frames that the device has lost since its start")
+    dropped_frames: int = Field(
+        ge=0, description="number of frames that the camera has lost since its start"
+    )
     left_origin_px: tuple[int, int] = Field(
         default=(0, 0), description="column and row of the left image's first pixel on the sensor"
     )
@@ -71,20 +77,23 @@ FingertipReason = Literal[
     "too_fast",
     "unconfirmed",
 ]
-"""Why an image pair gave no fingertip: no marker; a marker in one view only; several candidates; a
-marker merged with another light; blurred; overexposed; outside the finger's volume; rays that do
-not intersect; faster than a finger; too few detections for a track."""
+"""Reason why an image pair gave no fingertip, in the order of the values.
+
+No marker; a marker in one view only; several candidates; a marker merged with another light source;
+blurred; overexposed; outside the finger's volume; rays of the two views do not intersect; faster
+than a finger; too few detections for a track.
+"""
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
-"""State of the track: none; tentative; confirmed by this image pair; predicted only."""
+"""State of the tracking: no track; tentative; confirmed by this image pair; predicted only."""
 
 
 class Fingertip(Message):
-    """Fingertip at the exposure, and its predicted path.
+    """Fingertip position at the camera's exposure, and its predicted path.
 
-    If `valid` is false, `reason` gives the cause, and while `state` is "coasting" the tracked state
-    is predicted from the last valid one.  `measured_world_m` is the triangulated point of this
-    image pair, unfiltered.
+    If `valid` is false, `reason` gives the cause.  While `state` is "coasting", the tracked
+    position and velocity are predicted from the last valid ones.  `measured_world_m` is the
+    unfiltered triangulated point of this image pair.
     """
 
     valid: bool
@@ -92,9 +101,9 @@ class Fingertip(Message):
     reason: FingertipReason
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
-    covariance: Matrix6 = Field(description="covariance of (position, velocity), m and m/s")
+    covariance: Matrix6 = Field(description="covariance matrix of position (m) and velocity (m/s)")
     predicted_path_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
-        description="predicted fingertip at the exposure and every prediction_step_s after it, m"
+        description="predicted positions at the exposure and every prediction_step_s later, m"
     )
     prediction_step_s: Positive
     measured_world_m: Vector3
@@ -119,59 +128,69 @@ SheetReason = Literal[
     "past_sheet_height",
     "concave_contact",
 ]
-"""Why the sheet does not follow the finger; with "concave_contact" it follows at a distance."""
+"""Reason why the sheet does not follow the finger; "concave_contact": it follows at a distance."""
 
 
 class SheetTrajectory(MessagePart):
-    """Motion of the sheet after its target, while no newer target arrives.
+    """Motion of the sheet after the time of its target, for as long as no newer target arrives.
 
-    The sheet keeps the target's twist, and then decelerates evenly to rest.
+    The sheet keeps the target's velocity (twist) for `keep_s`, then decelerates uniformly to rest.
     """
 
-    keep_s: float = Field(ge=0.0, le=0.2, description="time for which the twist is kept")
-    brake_s: float = Field(gt=0.0, le=0.2, description="duration of the deceleration after it")
+    keep_s: float = Field(
+        ge=0.0, le=0.2, description="time for which the target's velocity is kept, s"
+    )
+    brake_s: float = Field(
+        gt=0.0, le=0.2, description="duration of the uniform deceleration that follows, s"
+    )
 
 
 class SheetTarget(Message):
-    """Target pose and velocity of the sheet at `valid_at_ns`.
+    """Target pose and velocity of the sheet at the time `valid_at_ns`.
 
-    The sheet frame is at the sheet's centre: x from the left edge to the right, z towards the user.
-    For another time, a consumer extrapolates by the twist, or follows the trajectory.
+    The origin of the sheet frame is the sheet's centre; x points from the left edge to the right, z
+    towards the user.  For another time, a consumer extrapolates with the velocity (twist), or
+    follows `trajectory`.
     """
 
     phase: Phase
     reason: SheetReason = Field(description='why the sheet stops or waits; otherwise "ok"')
     valid_at_ns: Stamp = Field(
-        description="time of the target, on the clock of the header's stamps"
+        description="time of this pose, on the clock of the header's timestamps"
     )
     world_from_sheet: Transform
     twist_world: Vector6 = Field(
-        description="linear velocity (m/s) of the centre, then angular velocity (rad/s)"
+        description="linear velocity of the sheet's centre (m/s), then angular velocity (rad/s)"
     )
-    stretch_ratio: Positive = Field(description="distance of the edges over the slack width")
+    stretch_ratio: Positive = Field(
+        description="distance between the clamped edges divided by the unstretched width"
+    )
     trajectory: SheetTrajectory | None = Field(
         default=None,
-        description="motion that both arms may follow from valid_at_ns; None: they extrapolate",
+        description="motion after valid_at_ns; None: both arms extrapolate with the velocity",
     )
     contact_world_m: Vector3 = Field(description="contact point on the undeformed object")
     normal_world: Vector3
-    contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
-    push_depth_m: NonNegative = Field(description="depth of the finger in the undeformed object")
+    contact_sheet_m: Vector2 = Field(description="contact point on the sheet (x, y), sheet frame")
+    push_depth_m: NonNegative = Field(
+        description="depth of the fingertip below the surface of the undeformed object"
+    )
     normal_offset_m: Finite = Field(
         default=0.0,
-        description="distance of the sheet's surface behind the object's tangent plane, where it "
-        "has the object's force; negative: in front of it. The edges are further behind by the sag",
+        description="distance of the sheet's surface behind the object's tangent plane, at which "
+        "the sheet exerts the object's force on the finger; negative: in front. The clamped edges "
+        "are further behind by the sag of the sheet",
     )
 
 
 ArmMode = Literal[
     "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
 ]
-"""Mode of an arm; "starting": no answer since the start of its bridge."""
+"""Operating mode of an arm; "starting": the arm has not answered since its bridge started."""
 
 
 class ArmState(Message):
-    """State of one arm; the source stamp is the time of the joint measurement."""
+    """State of one arm; the source timestamp is the time of the joint measurement."""
 
     side: Side
     mode: ArmMode
@@ -202,38 +221,43 @@ class ArmState(Message):
     command_age_s: NonNegative | None = Field(
         description="age of the sheet target in use; None: no target"
     )
-    target_source_ns: Stamp = Field(description="exposure of the image behind that target; 0: none")
+    target_source_ns: Stamp = Field(
+        description="exposure of the image from which that target was computed; 0: none"
+    )
     trajectory_ends_ns: Stamp = Field(
         default=0,
         description="time until which the arm may follow that target's trajectory; 0: not at all",
     )
-    command_sent_ns: Stamp = Field(description="time of the newest command; 0: never")
+    command_sent_ns: Stamp = Field(description="time of the newest command to the arm; 0: none")
     edge_distance_m: NonNegative | None = Field(
-        description="distance between both edges; None: unknown"
+        description="distance between both clamped edges of the sheet; None: unknown"
     )
     edge_force_n: NonNegative | None
-    cycle_s: NonNegative = Field(description="duration of the last exchange with the arm")
+    cycle_s: NonNegative = Field(
+        description="duration of the last exchange of data with the arm's controller"
+    )
     servo_lag_s: NonNegative | None = Field(
-        default=None, description="lag of the arm behind its commands, in use; None: unknown"
+        default=None,
+        description="assumed time by which the arm lags behind its commands; None: unknown",
     )
     servo_lag_uncertainty_s: NonNegative | None = Field(
         default=None,
-        description="standard deviation of the measured lag; None: the lag is not measured",
+        description="standard deviation of the measured servo lag; None: the lag is not measured",
     )
 
 
 class ArmLatency(Message):
-    """Mean latency of one arm over its last sheet targets, while it follows them."""
+    """Mean latency of one arm over its most recent sheet targets, while it follows them."""
 
     side: Side
     latency_s: Finite = Field(
-        description="time from the exposure until the first command with its target, plus the "
+        description="time from the exposure until the first command that follows from it, plus the "
         "arm's measured lag"
     )
 
 
 class Skin(Message):
-    """Skin of the soft body at rest, published once per object; normals point outwards."""
+    """Surface mesh of the soft body at rest, published once per object; normals point outwards."""
 
     mesh_id: str
     vertices_world_m: Points3
@@ -244,7 +268,7 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The response of the skin to the finger."""
+    """Deformation and force by which the soft body responds to the finger."""
 
     mesh_id: str
     method: str
@@ -255,10 +279,11 @@ class SoftBody(Message):
     force_curve: ForceCurve = Field(
         default_factory=lambda: np.zeros((0, 2)),
         description="force of the object at the finger, with or without contact: rows of depth (m) "
-        "and force (N), both from 0 and never falling; empty: unknown",
+        "and force (N), both starting at 0 and non-decreasing; empty: unknown",
     )
     prediction_horizon_s: NonNegative = Field(
-        default=0.0, description="time from the exposure to the predicted finger of this response"
+        default=0.0,
+        description="time from the exposure to the predicted finger position of this response, s",
     )
     displacement_world_m: Points3
 
@@ -267,7 +292,7 @@ class Eye(Message):
     """Position of the user's eyes from a head tracker; without one, the scene's `eyes` are used."""
 
     valid: bool = Field(
-        description="false: the eyes are not detected; the other fields are the last valid ones"
+        description="false: the eyes are not detected; the other fields hold the last valid values"
     )
     centre_world_m: Vector3 = Field(description="midpoint between both eyes")
     right_world: Vector3 = Field(
@@ -277,7 +302,7 @@ class Eye(Message):
 
 
 class Display(Message):
-    """Settings of the renderer, from console or experiment; latched."""
+    """Display settings for the renderer, published by the console or an experiment; latched."""
 
     correction: Correction
     stereo: StereoMode
@@ -294,27 +319,30 @@ class Display(Message):
         default=0, ge=0, description="attach pixels to each nth frame; 0: none"
     )
     label: str = Field(
-        default="", description="label of each frame that is drawn with these settings"
+        default="", description="label that is copied to each frame drawn with these settings"
     )
 
 
 class Frame(Message):
-    """Frame for the projector; the source stamp is the exposure behind its content."""
+    """Image for the projector; the source timestamp is that of the camera image it is based on."""
 
     number: int
     correction: Correction
     stereo: StereoMode
     label: str
-    eyes_world_m: EyePair = Field(description="left and right eye, m")
+    eyes_world_m: EyePair = Field(description="positions of the left and right eye, m")
     world_from_sheet: Transform
     pushed_point_world_m: Vector3
-    predicted_to_ns: Stamp = Field(description="time for which the frame was drawn")
+    predicted_to_ns: Stamp = Field(
+        description="expected display time, for which the positions were predicted"
+    )
     draw_s: NonNegative
     late_frames: int = Field(
         ge=0, description="frames that were displayed more than half a period later than predicted"
     )
     eye: Literal["both", "left", "right"] = Field(
-        default="both", description="eye of the frame; left or right if frames alternate"
+        default="both",
+        description="eye for which the frame is drawn; left or right if frames alternate",
     )
     drawn_ns: Stamp = Field(
         default=0, description="time when the graphics card had finished the frame"
@@ -323,15 +351,16 @@ class Frame(Message):
         default=0, description="time when the window showed the frame; 0: no window"
     )
     light_ns: Stamp = Field(
-        default=0, description="middle of the display time, measured; without a window: assumed"
+        default=0,
+        description="midpoint of the frame's display, measured; assumed if there is no window",
     )
     shaped_for_ns: Stamp = Field(
         default=0,
-        description="time of the finger that deforms the object; 0: the object is at rest",
+        description="time of the finger position that deforms the object; 0: the object is at rest",
     )
     fingertip_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
         default_factory=lambda: np.zeros((0, 3)),
-        description="predicted finger at `predicted_to_ns`, m; no row: unknown",
+        description="predicted fingertip position at `predicted_to_ns`, m; no row: unknown",
     )
     occluded_fraction: NonNegative = Field(
         default=0.0,
@@ -343,26 +372,26 @@ class Frame(Message):
 
 
 class EStop(Message):
-    """Emergency stop by software, which bridges latch; `engaged` false resets it at rest."""
+    """Emergency stop by software, which the arm bridges latch; `engaged` false resets it."""
 
     engaged: bool
     reason: str
 
 
 class Recording(Message):
-    """Start or stop of a recording, for recorders with `start_paused`; a start opens a new bag."""
+    """Command to start or stop recording, for recorders with `start_paused`."""
 
     running: bool
 
 
 class Bookmark(Message):
-    """Marked time in a bag, which is the source stamp."""
+    """Label for a time in a bag; that time is the source timestamp."""
 
     label: str = Field(max_length=200)
 
 
 class Arming(Message):
-    """Operator's command to arm the arms, or (`ready` false) to stop them and relax the sheet.
+    """Operator's command to arm the robot arms or (`ready` false) to stop and relax the sheet.
 
     After any stop the arms rest until the next command.
     """
@@ -372,56 +401,65 @@ class Arming(Message):
 
 
 class PortStatus(MessagePart):
-    """Statistics of one port of a node: rate over the last second, counts since its start."""
+    """Statistics of one port of a node: rate over the last second, counts since the start."""
 
     topic: str
     rate_hz: NonNegative
-    age_s: NonNegative | None = Field(description="age of the newest message by its source stamp")
+    age_s: NonNegative | None = Field(
+        description="age of the newest message since its source timestamp, s"
+    )
     messages: int = Field(ge=0)
     dropped: int = Field(
         ge=0, description="messages superseded, or lost by an overflow, before the node read them"
     )
-    gaps: int = Field(ge=0, description="messages lost in transport, by sequence numbers")
+    gaps: int = Field(
+        ge=0, description="messages lost in transport, according to their sequence numbers"
+    )
     rejected: int = Field(ge=0, description="messages that are malformed or of another type")
 
 
 class ClockEcho(MessagePart):
-    """Newest ping from another clock."""
+    """Reply to the newest ping that a clock node received from another clock."""
 
     clock_id: str
-    sent_ns: int = Field(ge=0, description="publish stamp of the ping, on its own clock")
+    sent_ns: int = Field(ge=0, description="publish timestamp of the ping, on its own clock")
     received_ns: int = Field(
         ge=0, description="time of its arrival, on the clock of this message's header"
     )
 
 
 class ClockPing(Message):
-    """Ping between the clock nodes of two hosts.
+    """Ping between the clock nodes of two hosts, to measure the offset of their clocks.
 
-    An echo, the header's publish stamp and the time of arrival are the four stamps of a round trip.
+    The two times in an echo, the header's publish timestamp and the time of arrival are the four
+    timestamps of a round trip.
     """
 
     echoes: tuple[ClockEcho, ...]
 
 
 class ClockOffset(MessagePart):
-    """Time of another clock minus that of the header's clock, at `at_ns` of the latter."""
+    """Time of another clock minus time of the header's clock, at the time `at_ns` of the latter."""
 
     clock_id: str
     at_ns: int = Field(ge=0)
     offset_ns: int
     uncertainty_s: NonNegative = Field(description="maximum error of the offset")
-    drift_ratio: Finite = Field(description="rate of the other clock over the header's, minus one")
-    resets: int = Field(ge=0, description="number of detected steps of the clock")
+    drift_ratio: Finite = Field(
+        description="rate of the other clock divided by that of the header's clock, minus one"
+    )
+    resets: int = Field(ge=0, description="number of detected jumps of the clock")
 
 
 class Clocks(Message):
     """Offsets of the other clocks, from a host's clock node for the nodes of that host."""
 
     max_offset_uncertainty_s: Positive = Field(
-        description="limit of the uncertainty above which no arm moves"
+        description="uncertainty of an offset (s) above which no arm moves"
     )
-    max_drift_ratio: Positive = Field(description="maximum relative rate between two clocks")
+    max_drift_ratio: Positive = Field(
+        description="maximum relative difference between the rates of two clocks"
+    )
     offsets: tuple[ClockOffset, ...]
 
 
@@ -433,21 +471,26 @@ SuspectedCause = Literal[
     "arm_not_following",
     "sheet_stiffness",
 ]
-"""Explanation of a residual: the stereo camera is not where the scene says; one of its two cameras
-has moved against the other; the marker is not at the assumed offset from the finger's pad; an arm
-lags more or less than configured; an arm does not do the commanded motion; the calibrated sheet is
-not as stiff as the scene states."""
+"""Suspected cause of a deviation, in the order of the values.
+
+The stereo camera is not where the scene says; one of its two cameras has moved against the other;
+the marker is not at the assumed offset from the finger's pad; an arm lags more or less than
+configured; an arm does not execute the commanded motion; the sheet's calibrated stiffness differs
+from the scene's.
+"""
 
 
 class SelfCheck(MessagePart):
-    """Residual that shows continuously whether what a node assumes is still true."""
+    """Check of one assumption of a node: a measured value is compared with the expected one."""
 
     cause: SuspectedCause
     subject: str = Field(default="", description="device concerned, if there are several")
     unit: Literal["m", "s", "px", "rad", "N/m"]
-    value: Finite = Field(description="measured, mean over some seconds")
+    value: Finite = Field(description="measured value, averaged over several seconds")
     expected: Finite = Field(description="value if everything is as assumed")
-    threshold: Positive = Field(description="maximum deviation of an apparatus in tolerance")
+    threshold: Positive = Field(
+        description="maximum deviation of hardware that is within tolerance"
+    )
     suspected: bool = Field(description="true: the deviation exceeds the threshold persistently")
 
 
@@ -464,7 +507,7 @@ class Status(Message):
     outputs: tuple[PortStatus, ...]
     errors: int = Field(ge=0)
     last_error: str
-    note: str = Field(description="note of the node, one line")
+    note: str = Field(description="message of the node to the operator, one line")
     plan_hash: str
     clock_id: str = ""
     clock_offsets: tuple[ClockOffset, ...] = Field(
@@ -473,11 +516,11 @@ class Status(Message):
     execution_log: Annotated[NDArray[np.int64], ArraySpec("<i8", ("steps", 4))] = Field(
         default_factory=lambda: np.zeros((0, 4), np.int64),
         description="handler calls since the last status (in the first seconds: since the start) "
-        "in order, for `bag verify`. Columns: input from 0, or timer -1, -2, ...; sequence of the "
-        "message; epoch of its writer; time of the call, ns",
+        "in order, for `bag verify`. Columns: index of the input from 0, or of the timer as -1, "
+        "-2, ...; message's sequence number; its writer's epoch; time of the call, ns",
     )
     self_checks: tuple[SelfCheck, ...] = Field(
-        default=(), description="residuals of the node that have data"
+        default=(), description="checks of the node that already have data"
     )
     changed_parameters: str = Field(
         default="{}", description="parameters changed since the start, as a JSON object"
@@ -493,7 +536,7 @@ class ParameterChange(Message):
 
 
 class NodeProcess(MessagePart):
-    """State of a node's process, from its launcher."""
+    """State of a node's process, as seen by the launcher that started it."""
 
     name: str
     state: Literal["starting", "ready", "exited"] = Field(
@@ -504,7 +547,7 @@ class NodeProcess(MessagePart):
 
 
 class NodeOmission(MessagePart):
-    """Node of the launch file that is not started."""
+    """Node of the launch file that is not started, with the reason."""
 
     name: str
     reason: Literal["rigid_object", "no_image", "no_reader", "no_writer"] = Field(
@@ -514,7 +557,7 @@ class NodeOmission(MessagePart):
 
 
 class HostKey(MessagePart):
-    """Public key of a host, as another host has it."""
+    """Public key of a host, as the reporting host has it."""
 
     host: str
     key: str
@@ -524,17 +567,19 @@ class ProgramCpu(MessagePart):
     """Processor time of all processes with one name."""
 
     name: str = Field(description="name of the node, or of another program")
-    cores: NonNegative = Field(description="processor time over elapsed time")
+    cores: NonNegative = Field(description="processor time divided by elapsed time")
 
 
 class CpuPressure(MessagePart):
-    """Waiting time of a computer's nodes for a free processor, over the last seconds.
+    """Time for which the nodes of a computer wait for a free processor, over the last seconds.
 
     It covers nodes with a `nice` value below 10.
     """
 
     busy: bool = Field(description="`wait_ratio` is above a quarter")
-    wait_ratio: NonNegative = Field(description="maximum waiting time of a node over elapsed time")
+    wait_ratio: NonNegative = Field(
+        description="longest waiting time of a node divided by the elapsed time"
+    )
     node: str = Field(description="node with this waiting time")
     programs: tuple[ProgramCpu, ...] = Field(
         default=(),
@@ -551,14 +596,18 @@ class HostStatus(Message):
     code: str = Field(description="commit of the code; + marks local changes")
     python: str
     uptime_s: NonNegative
-    load_ratio: NonNegative = Field(description="load of the last minute over the number of cores")
+    load_ratio: NonNegative = Field(
+        description="load average of the last minute divided by the number of cores"
+    )
     disk_free_bytes: int = Field(ge=0, description="free space for bags, or in the working folder")
     memory_free_bytes: int = Field(ge=0)
     nodes: tuple[NodeProcess, ...]
     omitted: tuple[NodeOmission, ...] = Field(
         default=(), description="nodes of the launch file that are not started"
     )
-    missing_devices: tuple[str, ...] = Field(description="missing devices of its nodes")
+    missing_devices: tuple[str, ...] = Field(
+        description="devices that its nodes need and that are missing"
+    )
     software: str = Field(
         default="", description="versions of software that must agree between hosts"
     )
@@ -578,20 +627,24 @@ class FingerPath(Message):
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
     positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
-    wander_m: NonNegative = Field(description="standard deviation of the slow human error")
-    tremor_m: NonNegative = Field(description="amplitude of 8-12 Hz tremor")
+    wander_m: NonNegative = Field(
+        description="standard deviation of slow random position errors of the hand, m"
+    )
+    tremor_m: NonNegative = Field(
+        description="amplitude of the simulated hand tremor at 8-12 Hz, m"
+    )
     joined_by: PathJoin = Field(
         default="rounded_lines",
         description="rounded_lines: points are corners, rounded over +-40 ms; spline: points "
         "are samples of a smooth motion that begins and ends at rest",
     )
     stroke_s: Positive | None = Field(
-        default=None, description="duration of motion, if the path is a stroke of the experiment"
+        default=None, description="duration of the motion, if the path is a stroke of an experiment"
     )
 
 
 class TwinFinger(Message):
-    """True fingertip at the source stamp."""
+    """True position of the simulated fingertip at the source timestamp."""
 
     path_label: str
     path_done: bool
@@ -604,7 +657,7 @@ class TwinFinger(Message):
 
 
 class TwinArms(Message):
-    """True joint angles and flange poses of both arms at the source time stamp."""
+    """True joint angles and flange poses of both simulated arms at the source timestamp."""
 
     joints_left_rad: Vector6
     joints_right_rad: Vector6
@@ -616,13 +669,15 @@ Viewpoint = Literal["centre", "left", "right"]
 
 
 class TwinEye(Message):
-    """Image of a measuring camera at V or at an eye, and the expected image."""
+    """Image that a simulated camera sees from an eye's viewpoint, and the expected image."""
 
     label: str
     correction: Correction
     viewpoint: Viewpoint = Field(
         default="centre", description="midpoint between the eyes, or one eye"
     )
-    metres_per_px: Positive = Field(description="size of a pixel on the imaginary screen")
+    metres_per_px: Positive = Field(
+        description="size of a pixel in the plane of the imaginary screen"
+    )
     seen: ColorImage
     expected: ColorImage

@@ -2,22 +2,23 @@
 
 The header frame is one msgpack array of eleven elements:
 
-    protocol     "flexsheet/2"
-    type         name of the message's class
-    fingerprint  8 bytes of the hash of its JSON Schema, see `messages.base.compute_fingerprint`
-    sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
-    fields       a map; nested parts are maps, tuples arrays, numpy arrays extension types:
-                 type 1  dtype and shape, then the elements (an array of at most 1 KiB)
-                 type 2  dtype and shape only; the elements are the next frame
+  protocol     "flexsheet/2"
+  type         name of the message's class
+  fingerprint  8 bytes of the hash of its JSON Schema, see `messages.base.compute_fingerprint`
+  sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
+  fields       a map; nested parts are maps, tuples arrays, numpy arrays extension types:
+  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
+  type 2  dtype and shape only; the elements are the next frame
 
-dtype and shape are: one byte with the index in `DTYPES`, one byte for the number of axes, two zero
-bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight for the alignment of the
-elements.  Elements are little-endian and in C order.
+The encoding of dtype and shape is: one byte with the index in `DTYPES`, one byte for the number of
+axes, two zero bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight bytes,
+which aligns the elements.  Elements are little-endian and in C order.
 
 `encode` and `decode` do not copy large arrays.  A sender must not change an array that is in a
-message, and a receiver gets read-only views of the memory from the socket.  Copying small arrays is
-faster than sending them separately (`benchmarks/messaging.py`).  Equal messages with equal headers
-have equal bytes.  The protocol "flexsheet/1" of old bags is the same without `plan`.
+message, and a receiver gets read-only views of the memory from the socket.  Small arrays are
+copied, because that is faster than sending them separately (`benchmarks/messaging.py`).  Equal
+messages with equal headers have equal bytes.  The protocol "flexsheet/1" of old bags is the same
+without `plan`.
 """
 
 from __future__ import annotations
@@ -50,25 +51,27 @@ DTYPES = tuple(
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
 MAX_HEADER_BYTES = 1 << 20
-"""Maximum size of the header frame, since decoded values need up to 64 times as much memory."""
+"""Maximum size of the header frame; its decoded values can need up to 64 times as much memory."""
 
 MAX_ELEMENTS = 4096
-"""Maximum number of elements of an array or a map in the header.  A decoder allocates the stated
-length before it reads the elements, and arrays can be nested."""
+"""Maximum number of elements of an array or a map in the header frame.
+
+A decoder allocates the stated length before it reads the elements, and arrays can be nested.
+"""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
 _BUFFERS = (bytes, memoryview)
 _MAX_INTEGER = 2**63 - 1
-# The constructor of ExtType takes half the time of `encode` for checks that always succeed here.
+# The constructor of ExtType spends half the time of `encode` on checks that always succeed here.
 _extension = tuple.__new__
 
 
 class WireError(FlexsheetError, ValueError):
-    """An invalid or unexpected message, or one that cannot be encoded.
+    """Raised for an invalid or unexpected message, or one that cannot be encoded.
 
     cause: "malformed", "type", "fingerprint", "frames", "size" or "field"; from a subscriber also
-        "writer", "plan", "replayed" or "forbidden".
+      "writer", "plan", "replayed" or "forbidden".
     """
 
     code = "wire"
@@ -103,7 +106,7 @@ def encode(
 ) -> list[Buffer]:
     """Encode a message as frames; raises WireError if it is larger than `max_bytes`.
 
-    inline_bytes: maximum size of arrays in the header frame; decoders accept any value.
+    inline_bytes: maximum size of arrays in the header frame; decoders accept any size.
     """
     frames: list[Buffer] = [b""]
 
@@ -146,7 +149,7 @@ def encode(
 
 
 class Envelope:
-    """Message with a checked header, whose fields are not yet validated."""
+    """Message whose header is checked, but whose fields are not yet validated."""
 
     __slots__ = ("codec", "fields", "header")
 
@@ -154,7 +157,7 @@ class Envelope:
         self.codec, self.header, self.fields = codec, header, fields
 
     def open(self) -> Message:
-        """Validate the message; raises WireError that names the first invalid field."""
+        """Validate the message's fields; raises WireError that names the first invalid one."""
         try:
             return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
         except ValidationError as error:
@@ -168,11 +171,11 @@ def read_envelope(
     fingerprint: bytes | None = None,
     type_name: str | None = None,
 ) -> Envelope:
-    """Check and decode a message except the values of its fields; raises WireError.
+    """Check and decode a message, without validating its fields; raises WireError.
 
     frames: buffers (bytes, memoryview, zmq.Frame), header first.
-    expected: the topic with its size limit, or only the type.
-    fingerprint, type_name: of a recorded type; None: of the current type.
+    expected: the topic, whose size limit applies, or only the message type.
+    fingerprint, type_name: values of a recorded type; None: those of the current type.
     """
     if isinstance(expected, Topic):
         codec = get_codec(expected.message)
@@ -184,34 +187,36 @@ def read_envelope(
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
         raise WireError(
-            "malformed", "not a flexsheet message: the header does not have eleven elements"
+            "malformed", "not a flexsheet message: its header does not have eleven elements"
         )
     protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
-            "malformed", f"expected protocol {PROTOCOL}, found {_format_value(protocol)}"
+            "malformed",
+            f"the message's protocol differs: expected {PROTOCOL}, found {_format_value(protocol)}",
         )
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]
-    # Any element may be an array, whose comparison would not be a bool.
+    # The name may be an array, and comparing an array does not give a bool.
     if type(name) is not str or name != (type_name or codec.name):
         raise WireError("type", f"expected type {codec.name}, found {_format_value(name)}")
     if type(found) is not bytes or found != expected_fingerprint:
         raise WireError(
             "fingerprint",
             f"{codec.name}: expected fingerprint {expected_fingerprint.hex()}, "
-            f"found {_format_value(found)}; run the same version on both hosts",
+            f"found {_format_value(found)}; run the same version of flexsheet on both hosts",
         )
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:
             raise WireError(
-                "malformed", f"invalid stamp or number in the header: {_format_value(number)}"
+                "malformed",
+                f"the header has an invalid timestamp or sequence number: {_format_value(number)}",
             )
     for text in (clock_id, writer, plan):
         if type(text) is not str or len(text) > NAME_LENGTH:
-            raise WireError("malformed", f"invalid name in the header: {_format_value(text)}")
+            raise WireError("malformed", f"the header has an invalid text: {_format_value(text)}")
     if not (clock_id and writer):
-        raise WireError("malformed", "the name of the clock or of the writer is empty")
+        raise WireError("malformed", "the header does not name the clock or the writer")
     if type(fields) is not dict:
         raise WireError(
             "malformed", f"the fields of {codec.name} are not a map: {_format_value(fields)}"
@@ -236,15 +241,15 @@ def count_bytes(frames: Sequence[Any]) -> int:
 
 
 def _unpack(frames: Sequence[Any]) -> Any:
-    """Decode the header frame with its arrays; each further frame must be used exactly once."""
+    """Decode the header frame with its arrays; each further frame must belong to one array."""
     used = 0
 
     def unpack(code: int, data: bytes) -> NDArray[Any]:
         nonlocal used
         if code not in (_INLINE, _FRAME):
-            raise WireError("malformed", f"unknown extension type {code} in the header")
+            raise WireError("malformed", f"the header has an unknown extension type {code}")
         if len(data) < 8:
-            raise WireError("malformed", "an array does not contain dtype and shape")
+            raise WireError("malformed", "an array in the header has no dtype and shape")
         dtype, shape, offset, size = _read_dtype_and_shape(data[: (4 * data[1] + 11) & ~7])
         if code == _INLINE:
             if len(data) - offset != size:
@@ -253,18 +258,20 @@ def _unpack(frames: Sequence[Any]) -> Any:
         used += 1
         if len(data) != offset or used >= len(frames):
             raise WireError(
-                "frames", f"the frame of an array is missing; found {len(frames)} frames"
+                "frames",
+                f"a frame with the elements of an array is missing; found {len(frames)} frames",
             )
         view = _read_only(frames[used])
         if len(view) != size:
             raise _array_size_error(len(view), size, dtype, shape)
-        # frombuffer, because an array from the constructor could be made writeable again.
+        # np.frombuffer keeps arrays read-only; an array from np.ndarray could be made writeable
+        # again.
         return np.frombuffer(view, dtype).reshape(shape)
 
     if not frames:
         raise WireError("frames", "the message has no frames")
     try:
-        # msgpack accepts the buffer of a zmq.Frame, not the frame.
+        # msgpack reads the buffer of a zmq.Frame, but not the frame itself.
         first = frames[0] if isinstance(frames[0], _BUFFERS) else frames[0].buffer
         if len(first) > MAX_HEADER_BYTES:
             raise _header_size_error(frames)
@@ -277,12 +284,13 @@ def _unpack(frames: Sequence[Any]) -> Any:
         )
     except WireError:
         raise
-    # For invalid bytes msgpack raises ValueError, TypeError, struct.error and others.
+    # msgpack raises various errors for invalid bytes: ValueError, TypeError, struct.error and
+    # others.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"[:200]
         raise WireError("malformed", f"not a flexsheet message: {reason}") from error
     if used != len(frames) - 1:
-        raise WireError("frames", f"expected {used + 1} frames by the header, found {len(frames)}")
+        raise WireError("frames", f"the header describes {used + 1} frames, found {len(frames)}")
     return unpacked
 
 
@@ -296,7 +304,7 @@ def _array_size_error(
     found: int, expected: int, dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> WireError:
     return WireError(
-        "frames", f"array of {dtype} and shape {shape}: expected {expected} bytes, found {found}"
+        "frames", f"an array of {dtype} and shape {shape} needs {expected} bytes, found {found}"
     )
 
 
@@ -317,10 +325,10 @@ def _dtype_and_shape(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, int]:
-    """Return dtype, shape, length of `head`, and size of the elements in bytes."""
+    """Return dtype, shape, length of `head`, and total size of the elements in bytes."""
     code, axes = head[0], head[1]
     if code >= len(DTYPES) or axes > 8 or len(head) != (4 * axes + 11) & ~7:
-        raise WireError("malformed", f"invalid dtype or shape: {head[:16].hex()}")
+        raise WireError("malformed", f"an array has an invalid dtype or shape: {head[:16].hex()}")
     shape = struct.unpack_from(f"<{axes}I", head, 4)
     return DTYPES[code], shape, len(head), DTYPES[code].itemsize * prod(shape)
 
@@ -333,7 +341,7 @@ def _message_size_error(frames: Sequence[Any], max_bytes: int, what: str) -> Wir
 
 
 def _describe(error: ValidationError, name: str) -> str:
-    """Describe the first invalid field without its value."""
+    """Describe the first invalid field, without its value."""
     details = error.errors(include_url=False, include_input=False, include_context=False)
     where = ".".join(str(step) for step in details[0]["loc"]) or "message"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
@@ -341,9 +349,9 @@ def _describe(error: ValidationError, name: str) -> str:
 
 
 def _format_value(value: object) -> str:
-    """Describe a received value, truncated; for a container only its type.
+    """Describe a received value for an error text, truncated; for a container give only its type.
 
-    Deeply nested values would break `repr`.
+    Deeply nested values would make `repr` fail.
     """
     if isinstance(value, bytes):
         return repr(value[:60].hex())[:60]

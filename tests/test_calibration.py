@@ -198,8 +198,8 @@ def test_unusable_images_are_named(
     for bad_left, bad_right, said in (
         (left[:3], right[:2], "3 left and 2 right images"),
         ([], [], "no images"),
-        ([text], right[:1], r"text\.png: missing or unreadable"),
-        ([tmp_path / "absent.png"], right[:1], r"absent\.png: missing or unreadable"),
+        ([text], right[:1], r"text\.png: cannot read the image"),
+        ([tmp_path / "absent.png"], right[:1], r"absent\.png: cannot read the image"),
         ([left[0], small], right[:2], r"small\.png: 120x90 px, expected 480x360"),
     ):
         with pytest.raises(CalibrationError, match=said):

@@ -199,7 +199,7 @@ async def test_invalid_messages_are_rejected_as_from_sockets(tmp_path: Path) -> 
         await turn()
         assert [message.reason for message, _ in reader.messages] == ["a"]
         assert reader.counts.rejected == 5 == len(reader.problems)
-        for words in ("unexpected writer", "runs plan", "older than its start", "not allowed"):
+        for words in ("unexpected writer", "runs plan", "before its last restart", "not allowed"):
             assert any(words in problem for problem in reader.problems), words
         assert "EStop.engaged" in reader.problems[-1]
     with open_publisher(FINGERTIP, tmp_path) as (publisher, local, endpoint):

@@ -114,7 +114,7 @@ def test_contradicting_touches_are_refused() -> None:
     random = np.random.default_rng(9)
     touches = [touch(tilt, random) for tilt in TILTS_DEG]
     touches[3].marker_m[0] += 0.02
-    with pytest.raises(MarkerFitError, match=r"contradict each other: residual .* in touch 4"):
+    with pytest.raises(MarkerFitError, match=r"contradict each other: rms residual .* in touch 4"):
         fit_marker(touches)
 
 

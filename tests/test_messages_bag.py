@@ -334,7 +334,7 @@ def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
         foreign: Any = Writer(file)
         foreign.start(profile="ros2")
         foreign.finish()
-    with pytest.raises(BagError, match='profile "ros2", not of flexsheet'):
+    with pytest.raises(BagError, match='profile "ros2", expected "flexsheet"'):
         info(other)
 
 

@@ -1,10 +1,10 @@
-"""Read, record and simulate poses of an arm with a board on its flange.
+"""Read, record and simulate poses of an arm with a calibration board on its flange.
 
-The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row is a pose at
-rest: six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) with two image files (`left`,
-`right`). Instead of images it may give the board's pose in the left camera's frame (`board_x_m`,
-`board_y_m`, `board_z_m`: first corner; `board_rx_rad`, `board_ry_rad`, `board_rz_rad`: rotation
-vector).
+The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table is
+a pose of the arm at rest: six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) with two image
+files (`left`, `right`). Instead of images it may give the board's pose in the left camera's frame
+(`board_x_m`, `board_y_m`, `board_z_m`: first corner; `board_rx_rad`, `board_ry_rad`,
+`board_rz_rad`: rotation vector).
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""Maximum motion of joints at rest, and minimum duration of the rest."""
+"""Maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""Minimum rotation or translation of the board between recorded poses."""
+"""Minimum rotation or translation of the board between two recorded poses."""
 
 SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
-"""Standard deviations of the simulated bases from the scene's, and of the joint errors."""
+"""Standard deviations of the simulated bases from those in the scene, and of the joint errors."""
 
 
 class ArmPosesError(FlexsheetError, ValueError):
@@ -81,7 +81,7 @@ class ArmPosesError(FlexsheetError, ValueError):
 
 
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
-    """Make the stereo rig at the scene's pose, with the calibration's or the scene's optics."""
+    """Make the stereo camera at the scene's pose, with the calibration's or the scene's optics."""
     measured = scene.camera if calibration is None else calibration
     pose = scene.camera.world_from_left
     return LensRig(
@@ -100,9 +100,9 @@ def _make_camera_lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """Row of a table of arm poses.
+    """Row of a table of arm poses, with either image files or a board pose.
 
-    joints_rad: (6,). images, left_from_board: either image files or the board pose (4, 4).
+    joints_rad: (6,). images: left and right image file. left_from_board: board pose (4, 4).
     """
 
     name: str
@@ -112,7 +112,7 @@ class PoseRow:
 
 
 def read_pose_table(folder: Path) -> list[PoseRow]:
-    """Read the rows of a folder's table. Raises ArmPosesError with row and column."""
+    """Read the rows of a folder's table; raises ArmPosesError with row and column."""
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -121,7 +121,7 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
             lines = list(reader)
     except OSError as error:
         raise ArmPosesError(
-            f"{path}: cannot be read: {error.strerror}; see docs/arms.md"
+            f"{path}: cannot be read: {error.strerror}; docs/arms.md describes the table"
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArmPosesError(
@@ -177,9 +177,10 @@ def _parse_numbers(
 def read_detections(
     folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
-    """Return a folder's detections, and the poses without one as (name, reason).
+    """Detect the board in the images of a folder.
 
-    size: required (width, height) of the images, px. Raises ArmPosesError and CalibrationError.
+    Return the detections, and the poses without a detected board as (name, reason). size: required
+    (width, height) of the images, px. Raises ArmPosesError and CalibrationError.
     """
     rows = read_pose_table(folder)
     if rows[0].images is None:
@@ -213,7 +214,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Project the board of a row with a board pose into both images, without noise."""
+    """Project the board of a row that gives the board's pose into both images, without noise."""
     assert row.left_from_board is not None
     points = board_points(board)
     views = []
@@ -226,9 +227,9 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
 
 
 class PoseRecorder:
-    """Recorder of poses to a folder, whenever the arm is at rest and the board's pose is new.
+    """Recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
 
-    Joints and images must be added in the order of their times (s, of one clock).
+    Joint angles and images must be added in the order of their times (s, on one clock).
     """
 
     def __init__(self, folder: Path, board: Board, rig: LensRig) -> None:
@@ -240,13 +241,13 @@ class PoseRecorder:
         self._poses: list[Floats] = []
 
     def update_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joints (6,), rad."""
+        """Add measured joint angles (6,), rad."""
         moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w), record it if it is new, and return a hint."""
+        """Add an image pair (h, w), record it if its pose is new, and return a hint."""
         joints = self._joints
         if joints is None:
             return "no message from the arm yet"
@@ -265,7 +266,7 @@ class PoseRecorder:
         return f"pose {self.count} recorded; rotate and move the flange"
 
     def _estimate_pose(self, pair: BoardPair) -> Floats:
-        """Estimate left_from_board (4, 4) from the left image, to compare poses."""
+        """Estimate left_from_board (4, 4) from the left image, to compare it with earlier poses."""
         points = board_points(self._board)[pair.left.ids]
         lens = self._rig.left
         _, rotation, shift = cv2.solvePnP(points, pair.left.pixels, lens.matrix, lens.distortion)
@@ -283,7 +284,7 @@ class PoseRecorder:
 
 
 def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
-    """Append a pose to a folder's table; create the table if needed."""
+    """Append a pose to a folder's table of joint angles; create the table if needed."""
     path = folder / TABLE
     exists = path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
@@ -302,7 +303,7 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 
 
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """Return world_from_base (4, 4) of the simulated arm, which deviates from the scene's."""
+    """Return a random world_from_base (4, 4) for the simulated arm, near the pose in the scene."""
     pose: Pose = getattr(scene.arms, side).world_from_base
     nominal = transform_from_rpy(pose.position_m, pose.rpy_rad)
     random = np.random.default_rng([seed, side == "left"])
@@ -317,8 +318,8 @@ def simulate_poses(
 ) -> Iterator[int]:
     """Write images of a board on the simulated arm to a folder; yield the count after each pose.
 
-    The joints have errors of SIMULATED_JOINT_RAD, the images blur and noise. Raises BoardError for
-    a board that cannot be rendered.
+    The joint angles have random errors of SIMULATED_JOINT_RAD; the images have blur and noise.
+    Raises BoardError for a board that cannot be rendered.
     """
     random = np.random.default_rng([seed, side == "left", 1])
     camera = make_true_camera(scene.camera)
@@ -328,7 +329,7 @@ def simulate_poses(
     world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     ready = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-    # Put the board 60 mm in front of the flange, facing the camera while the arm reaches forward.
+    # Put the board 60 mm in front of the flange; it faces the camera while the arm reaches forward.
     flange = base @ twin_forward(ready)
     position = flange[:3, 3] + 0.06 * flange[:3, 2]
     facing = transform(world_from_left[:3, :3], position - world_from_left[:3, :3] @ middle)
@@ -343,7 +344,7 @@ def simulate_poses(
                 inverse(base) @ board_pose @ inverse(flange_from_board), ready
             )
         except ValueError:
-            continue  # out of reach: draw another pose
+            continue  # The pose is out of reach: try another random one.
         true_joints = np.clip(
             joints + random.normal(0.0, SIMULATED_JOINT_RAD, 6), RANGE_RAD[:, 0], RANGE_RAD[:, 1]
         )
@@ -361,7 +362,7 @@ def simulate_poses(
 
 
 def _is_in_both_views(simulated: TwinBoard, left_from_board: Floats) -> bool:
-    """Return whether all corners are at least 40 px inside both images."""
+    """Return whether all corners of the board are at least 40 px inside both images."""
     size = np.array([simulated.camera.width_px, simulated.camera.height_px])
     views = simulated.corners(left_from_board)
     return all(((view > 40.0) & (view < size - 40.0)).all() for view in views)

@@ -1,9 +1,9 @@
 """Fit a stereo rig to all corners of all board poses by least squares, with its covariance.
 
-The unknowns are the rig (22 parameters, `PARAMETERS`) and the board's pose in each pair (6). A
-pair's corners depend only on the rig and on that pose, so the poses are eliminated. A system of 22
-equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern Synthesis, 1999,
-section 6). Lens model: pinhole with k1, k2, p1, p2.
+The unknowns are the rig (22 parameters, `PARAMETERS`) and the board's pose in each image pair (6).
+The corners of a pair depend only on the rig and on that pose, so the poses can be eliminated. A
+system of 22 equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern
+Synthesis, 1999, section 6). Lens model: pinhole with distortion k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ PARAMETERS = (
     *(f"right.{name}" for name in LENS),
     *(f"right_from_left.{name}" for name in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")),
 )
-"""Names of the rig's parameters in order; rx, ry, rz: rotation vector."""
+"""Names of the rig's parameters, in their order; rx, ry, rz are a rotation vector."""
 
 LEFT, RIGHT, STAND = slice(0, 8), slice(8, 16), slice(16, 22)
 
 MAX_STEPS = 50
 CONVERGED_COST_CHANGE = 1e-9
-"""Relative change of the cost that ends the iteration."""
+"""Relative change of the cost (sum of squared residuals) below which the iteration ends."""
 
 
 class NotDeterminedError(FlexsheetError, ValueError):
-    """Raised when the pairs do not determine all parameters of the rig."""
+    """Raised if the image pairs do not determine all parameters of the rig."""
 
     code = "not-determined"
     remedy = "Add image pairs that differ in tilt and distance."
@@ -45,11 +45,12 @@ class NotDeterminedError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RigFit:
-    """Fitted rig and its residuals.
+    """Fitted stereo rig and its residuals.
 
-    rig: (22,). poses: of the board, (pairs, 6), rotation vector and position in the left camera's
-    frame. residuals: per pair, left and right (n, 2), detected minus projected, px. sigma_px:
-    standard deviation of one corner coordinate. covariance: of the rig, (22, 22).
+    rig: parameters (22,). poses: poses of the board (pairs, 6), rotation vector and position in the
+    left camera's frame. residuals: for each pair, detected minus projected corners (n, 2) of the
+    left and of the right image, px. sigma_px: standard deviation of one corner coordinate.
+    covariance: covariance matrix (22, 22) of the rig's parameters.
     """
 
     rig: Floats
@@ -59,7 +60,7 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms corner residuals (pairs, 2) of left and right views, px."""
+        """Return the rms corner residuals (pairs, 2) of the left and right views, px."""
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
@@ -68,7 +69,7 @@ class RigFit:
 
 
 def to_floats(array: object) -> Floats:
-    """Convert an OpenCV result to an array in double precision."""
+    """Convert an OpenCV result to a double-precision array."""
     return np.asarray(array, dtype=np.float64)
 
 
@@ -78,14 +79,14 @@ def rms_distance(shifts: Floats) -> float:
 
 
 def lens_arrays(lens: Floats) -> tuple[Floats, Floats]:
-    """Return the camera matrix (3, 3) and OpenCV's distortion (5,) of a lens (8,)."""
+    """Return the camera matrix (3, 3) and OpenCV's distortion (5,) for lens parameters (8,)."""
     fx, fy, cx, cy, k1, k2, p1, p2 = lens
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return matrix, np.array([k1, k2, p1, p2, 0.0])
 
 
 def pose_transform(pose: Floats) -> Floats:
-    """Return the transform (4, 4) of a pose (6,): rotation vector and position."""
+    """Return the transform (4, 4) that belongs to a pose (6,): rotation vector and position."""
     return rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:])
 
 
@@ -95,7 +96,7 @@ def pose_vector(transform: Floats) -> Floats:
 
 
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
-    """Project points to pixels (n, 2), with Jacobians (2n, 6) by pose and (2n, 8) by lens."""
+    """Project points to pixels (n, 2), with derivatives by pose (2n, 6) and by lens (2n, 8)."""
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
     slopes = to_floats(slope)
@@ -103,7 +104,10 @@ def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats
 
 
 def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the pose (6,) in the right camera's frame, and its Jacobians (6, 6) by both poses."""
+    """Compose a board pose with the pose between the cameras.
+
+    Return the pose (6,) in the right camera's frame, and its derivatives (6, 6) by both poses.
+    """
     rotation, position, *slopes = cv2.composeRT(pose[:3], pose[3:], stand[:3], stand[3:])
     rr1, rt1, rr2, rt2, tr1, tt1, tr2, tt2 = slopes
     by_pose = np.block([[rr1, rt1], [tr1, tt1]])
@@ -113,7 +117,11 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """Linearized residuals of a pair: shifts (m,) px, Jacobians (m, 22) by rig, (m, 6) by pose."""
+    """Linearized residuals of one image pair.
+
+    shifts: residuals (m,), px. by_rig, by_pose: derivatives (m, 22) by the rig and (m, 6) by the
+    pose.
+    """
 
     shifts: Floats
     by_rig: Floats
@@ -121,9 +129,9 @@ class Linearized:
 
 
 def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Linearized:
-    """Linearize a pair's residuals at a rig (22,) and pose (6,).
+    """Linearize the residuals of an image pair at a rig (22,) and a board pose (6,).
 
-    board: its corners (n, 3), m.
+    board: corners of the board (n, 3), m.
     """
     left_points, right_points = board[pair.left.ids], board[pair.right.ids]
     left, left_by_pose, left_by_lens = _project(left_points, pose, rig[LEFT])
@@ -145,10 +153,10 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """Normal equations with the poses eliminated.
+    """Normal equations of the rig after elimination of the poses.
 
-    matrix: (22, 22). side: (22,). poses: for each, the inverse of its block (6, 6), its gradient
-    (6,) and its coupling (22, 6).
+    matrix, side: matrix (22, 22) and right-hand side (22,). poses: for each pose, the inverse of
+    its block (6, 6), its gradient (6,) and its coupling to the rig (22, 6).
     """
 
     matrix: Floats
@@ -157,7 +165,7 @@ class _Reduced:
 
 
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
-    """Make the Levenberg-Marquardt equations with the diagonal times 1 + `damping`."""
+    """Make the Levenberg-Marquardt equations, whose diagonal is multiplied by 1 + `damping`."""
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
     for pair in pairs:
@@ -179,7 +187,7 @@ def _scaled_inverse(matrix: Floats) -> Floats:
     """
     scale = np.sqrt(np.diag(matrix))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise NotDeterminedError("a parameter of the rig has no effect on the corners")
+        raise NotDeterminedError("one parameter of the rig has no effect on the corner positions")
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     if values[0] < 1e-12:
         weakest = PARAMETERS[int(np.argmax(np.abs(vectors[:, 0] / scale) * scale))]
@@ -189,9 +197,9 @@ def _scaled_inverse(matrix: Floats) -> Floats:
 
 
 def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Floats) -> RigFit:
-    """Fit the rig and the poses to all corners from initial values (Levenberg-Marquardt).
+    """Fit the rig and the poses to all corners, from initial values (Levenberg-Marquardt).
 
-    board: its corners (n, 3), m. Raises NotDeterminedError.
+    board: corners of the board (n, 3), m. Raises NotDeterminedError.
     """
     rig, poses = rig.copy(), poses.copy()
 
@@ -220,7 +228,9 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
     numbers = sum(len(pair.shifts) for pair in current)
     freedom = numbers - len(PARAMETERS) - poses.size
     if freedom < 1:
-        raise NotDeterminedError(f"{numbers} corner coordinates, {numbers - freedom} unknowns")
+        raise NotDeterminedError(
+            f"{numbers} corner coordinates do not determine {numbers - freedom} unknowns"
+        )
     variance = cost / freedom
     return RigFit(
         rig=rig,

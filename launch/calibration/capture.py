@@ -1,7 +1,7 @@
-"""Select board pairs during live capture, by coverage.
+"""Select image pairs of a board during live capture, so that they cover what a calibration needs.
 
-A pair is accepted if the board is at rest in a new pose and adds coverage: image cells, tilts,
-distances, or the number of pairs.
+A pair is accepted if the board is at rest in a new pose and adds coverage: cells of the image,
+tilts, distances, or the number of pairs.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLUMNS, ROWS = 4, 3
-"""Columns and rows of the coverage cells of an image."""
+"""Number of columns and rows of the cells into which an image is divided to count coverage."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""Maximum corner motion between images of a board at rest, px."""
+"""Maximum motion of the corners between images of a board that counts as resting, px."""
 
 NEW_POSE_PX = 12.0
-"""Minimum corner distance between a new board pose and every accepted one, px."""
+"""Minimum distance of the corners between a new board pose and every accepted one, px."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""Limits of the near and far distances: board diagonal over image diagonal."""
+"""Limits of near and far distances, as length of the board's diagonal over the image's diagonal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Quantity to be covered by pairs.
+    """Quantity of which the image pairs must cover a minimum count.
 
-    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: of a cell, column and
+    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: for a cell its column and
     row.
     """
 
@@ -50,10 +50,10 @@ class Bin:
 
 
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
-    """Return the required number of pairs per bin, for `pairs` pairs.
+    """Return the required number of image pairs in each bin, for a total of `pairs`.
 
-    Excludes the left image's left edge and the right image's right edge, which at most distances
-    only one camera sees.
+    Cells at the left edge of the left image and the right edge of the right image are excluded,
+    because at most distances only one camera sees them.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin("pairs", ""): pairs}
@@ -72,7 +72,7 @@ def compute_required_counts(pairs: int) -> dict[Bin, int]:
 class PairAssessment:
     """Assessment of one image pair.
 
-    hint: instruction to the user about the next board pose.
+    hint: instruction to the user for the next board pose.
     """
 
     accepted: bool
@@ -80,7 +80,7 @@ class PairAssessment:
 
 
 class Capture:
-    """Selector of image pairs for a calibration, which counts the coverage."""
+    """Selector of image pairs for a calibration, which keeps count of the coverage."""
 
     def __init__(
         self,
@@ -93,8 +93,8 @@ class Capture:
     ) -> None:
         """Create a selector without pairs.
 
-        lens: of the left camera, approximate. still_images: number of consecutive images of a board
-        at rest that a pair requires.
+        lens: approximate lens of the left camera. still_images: number of consecutive images at
+        rest that a pair requires.
         """
         self.board = board
         self.needed = compute_required_counts(pairs)
@@ -115,7 +115,7 @@ class Capture:
         return not self.missing()
 
     def missing(self) -> list[Bin]:
-        """Return the bins with missing coverage, in the order of the requests to the user."""
+        """Return the bins that lack coverage, in the order in which the user is asked for them."""
         return [one for one, count in self.needed.items() if self.counts[one] < count]
 
     def add_pair(self, left: Image, right: Image) -> PairAssessment:
@@ -141,7 +141,7 @@ class Capture:
         return PairAssessment(True, self._make_hint("accepted; "))
 
     def _find_bins(self, pair: BoardPair) -> list[Bin]:
-        """Return the bins that a pair covers."""
+        """Return the bins to which a pair contributes."""
         pose = board_pose(pair.left, self._points, self._lens)
         bins = [Bin("pairs", ""), Bin("tilt", classify_tilt(pose, self._middle))]
         bins.append(Bin("distance", self._classify_distance(pose)))
@@ -163,7 +163,7 @@ class Capture:
         return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
     def _make_hint(self, prefix: str) -> str:
-        """Return the next instruction to the user, after the text `prefix`."""
+        """Return the next instruction to the user, preceded by `prefix`."""
         missing = self.missing()
         if not missing:
             return prefix + "coverage complete"
@@ -196,8 +196,8 @@ def _describe_cell(cell: Bin) -> str:
 def classify_tilt(pose: Floats, middle: Floats) -> str:
     """Classify the tilt of a board pose (6,) in the left camera's frame as one of TILTS.
 
-    Uses the board's normal towards the camera, so rotation within the board's plane has no effect.
-    middle: centre of the board (3,) in its own frame, m.
+    Only the direction of the board's normal counts, so rotation within the board's plane has no
+    effect. middle: centre of the board (3,) in its own frame, m.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]
@@ -214,7 +214,7 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
 
 
 def _measure_shift(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median displacement of common corners, px; infinite without common corners."""
+    """Return the median displacement of common corners, px; infinite if there are none."""
     _, here, there = np.intersect1d(
         pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
     )

@@ -1,7 +1,7 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
-Errors on pairs used to calibrate are too small. So `check_stereo` is for other pairs, and
-`cross_check` measures each pair with a calibration from the remaining pairs.
+On image pairs that were used to calibrate, errors are underestimated. `check_stereo` is therefore
+for other pairs, and `cross_check` measures each pair with a calibration from the remaining pairs.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """Rig in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
+    """Stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
@@ -50,7 +50,7 @@ class StereoRig:
 
     @staticmethod
     def from_fit(numbers: Floats) -> StereoRig:
-        """Make the rig from the 22 parameters of a fit."""
+        """Make the rig from the 22 parameters of a `RigFit`."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
         return StereoRig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
@@ -67,7 +67,12 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """Errors of a board measured by a rig, m and px; the arrays have different lengths."""
+    """Errors of a board that was measured with a stereo camera, m and px.
+
+    squares_m: errors of the distances between neighbouring corners. diagonals_m: errors of the
+    lengths of the diagonals. rigid_fit_m: distances of the corners from the fitted board. The
+    arrays have different lengths.
+    """
 
     squares_m: Floats
     diagonals_m: Floats
@@ -89,7 +94,7 @@ def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
 
 
 def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
-    """Return distances (n,) after the best rigid fit of `model` (n, 3) to `points` (n, 3).
+    """Return the distances (n,) of `points` (n, 3) from `model` (n, 3) after the best rigid fit.
 
     Source: Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
     """
@@ -100,7 +105,7 @@ def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
 
 
 def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasurement:
-    """Measure the corners that are visible in both views of a pair."""
+    """Triangulate the corners that both views of a pair show, and compare them with the board."""
     ids, left, right = pair.common()
     points = triangulate_corners(rig, left, right)
     row = {int(corner): number for number, corner in enumerate(ids)}
@@ -127,7 +132,7 @@ def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasure
 
 
 def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Return distances (2n,) between detected corners and projected points, left and right, px."""
+    """Return distances (2n,) between detected corners and projected points, left then right, px."""
     distances = []
     stands = (np.eye(4), rig.right_from_left)
     for pixels, matrix, distortion, stand in zip(
@@ -140,7 +145,7 @@ def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: F
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square, or None without values."""
+    """Return the root mean square, or None for an empty array."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -150,11 +155,12 @@ def _in_mm(values: Floats) -> float | None:
 
 
 def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
-    """Return root mean squares over all boards.
+    """Return the root mean squares of the errors of all measured boards.
 
-    square_rms_mm: of the distance errors between neighbouring corners. diagonal_rms_mm: of the
-    length errors of the board's diagonals. rigid_fit_rms_mm: of the corner errors after a rigid fit
-    of the board. reprojection_rms_px: of the triangulated corners.
+    square_rms_mm: error of the distances between neighbouring corners. diagonal_rms_mm: error of
+    the lengths of the board's diagonals. rigid_fit_rms_mm: distance of the corners from the board
+    after a rigid fit. reprojection_rms_px: distance of the detected corners from the projections of
+    the triangulated ones.
     """
     return {
         "pairs": len(boards),
@@ -174,11 +180,11 @@ def check_stereo(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> dict[str, float | int | list[str] | None]:
-    """Measure a board of known size with a calibration, in images not used to calibrate.
+    """Measure a board of known size with a calibration, in images that were not used to calibrate.
 
-    Returns the values of `summarize`, and used_to_calibrate: the left images that the calibration
-    was made from, whose errors are too small. Raises CalibrationError for images of another size,
-    and if no pair shows the board.
+    Returns the values of `summarize`, and used_to_calibrate: the left images that were used to
+    calibrate after all, so that their errors are underestimated. Raises CalibrationError for images
+    of another size, and if no pair shows the board.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):
@@ -205,9 +211,9 @@ def check_stereo(
 def calibrate_plain_opencv(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """Calibrate as in OpenCV's tutorials, for comparison: intrinsics first, then with them fixed.
+    """Calibrate as in OpenCV's tutorials, for comparison: first intrinsics, then the pose alone.
 
-    points: the board's corners (n, 3), m.
+    points: corners of the board (n, 3), m.
     """
     model = [points[pair.left.ids].astype(np.float32) for pair in pairs]
     left = [pair.left.pixels.astype(np.float32) for pair in pairs]
@@ -236,7 +242,7 @@ PLAIN_HALF_WINDOW_PX = 5
 
 
 def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """Find chessboard corners as in OpenCV's tutorials: refined in a fixed window of 11 px."""
+    """Find chessboard corners as in OpenCV's tutorials, refined in a fixed window of 11 px."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
     window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
     views = []
@@ -263,9 +269,9 @@ def cross_check(
 ) -> dict[str, object]:
     """Cross-validate: calibrate without `leave_out` pairs at a time, and measure those pairs.
 
-    Excludes the pairs i, i+G, i+2G, ... together, so that similar consecutive images are not
-    excluded together. For chessboards, repeats this with plain OpenCV. Raises CalibrationError for
-    unusable images, and if too few pairs remain.
+    The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
+    are similar. For chessboards, the same is done with plain OpenCV for comparison. Raises
+    CalibrationError for unusable images, and if too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}

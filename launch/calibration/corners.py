@@ -22,27 +22,28 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
-"""Progress callback of (steps done, number of steps, description of the last step)."""
+"""Progress callback with (steps done, total number of steps, description of the last step)."""
 
 SCALE = 2
-"""Enlargement of the image for corner refinement.
+"""Enlargement of the image for the refinement of corners.
 
-OpenCV's refinement interpolates linearly between pixels, which shifts corners by 0.015 px and
-changes the board's size by 3e-5. Enlarged images also have more detectable markers.
+OpenCV's refinement interpolates linearly between pixels. Without enlargement this would shift
+corners by 0.015 px and change the measured size of the board by 3e-5. More markers are detected in
+enlarged images, too.
 """
 
 MIN_CORNERS = 8
-"""Minimum number of ChArUco corners in a view; fewer do not determine its pose well."""
+"""Minimum number of ChArUco corners in a view; fewer do not determine the board's pose well."""
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
-"""Bounds of the refinement window's half side, in pixels of the enlarged image."""
+"""Bounds of half the side of the refinement window, in pixels of the enlarged image."""
 
 MAX_REFINEMENT_PX = 1.0
-"""Maximum shift of a ChArUco corner by refinement, px; larger shifts follow another edge."""
+"""Maximum shift of a ChArUco corner by the refinement, px; a larger shift ends at another edge."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""Standard deviations of the smoothing, px; ChArUco markers are closer than the next corners."""
+"""Standard deviation of the smoothing of ChArUco images, px; markers are close to the corners."""
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
@@ -59,7 +60,7 @@ class CalibrationError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """Corners of the board in one image: ids (n,), ascending, and pixels (n, 2)."""
+    """Detected board corners in one image: ids (n,), ascending, and pixel positions (n, 2)."""
 
     ids: Ids
     pixels: Floats
@@ -67,7 +68,7 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class BoardPair:
-    """One pose of the board in both images, whose corner ids may differ for a ChArUco board."""
+    """Corners of one board pose in both images; the ids may differ for a ChArUco board."""
 
     left: BoardView
     right: BoardView
@@ -81,11 +82,11 @@ class BoardPair:
 
 
 def ignore_progress(done: int, total: int, what: str) -> None:
-    """Ignore progress, for callers without a display."""
+    """Ignore progress reports, for callers without a display."""
 
 
 def board_points(board: Board) -> Floats:
-    """Return corners (rows*columns, 3) in the board's frame, m, along the columns first."""
+    """Return the corners (rows*columns, 3) in the board's frame, m, counted along columns first."""
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
     points[:, :2] = grid * board.square_m
@@ -99,7 +100,7 @@ def describe(board: Board) -> str:
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's board; CalibrationError for an unknown or too small dictionary."""
+    """Make OpenCV's ChArUco board; raises CalibrationError for an unsuitable dictionary."""
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
@@ -124,9 +125,10 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Make a detector that needs one marker per corner; wrong corners are refined or dropped later.
+    """Make a detector that accepts corners next to a single marker.
 
-    OpenCV's default of two markers finds a quarter fewer corners, mostly at the image's edge.
+    OpenCV's default of two markers finds a quarter fewer corners, mostly at the image's edge. Wrong
+    corners are refined or dropped later.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
@@ -134,9 +136,9 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 
 
 class CornerFinder:
-    """Detector of the corners of one kind of board.
+    """Detector of the corners of one calibration board.
 
-    quick: use OpenCV's fast check, which rejects images without a board early.
+    quick: whether to use OpenCV's fast check, which rejects images without a board early.
     """
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
@@ -191,14 +193,14 @@ class CornerFinder:
 
 
 def _measure_spacing(pixels: Floats) -> Floats:
-    """Return the distance (n,) of each corner to its nearest neighbour, px."""
+    """Corners in one line do not determine a pose."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))
 
 
 def _enlarge(image: Image) -> Image:
-    """Enlarge the image by SCALE; pixel x moves to SCALE * (x + 1/2) - 1/2."""
+    """Enlarge the image by SCALE; pixel coordinate x becomes SCALE * (x + 1/2) - 1/2."""
     larger = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_CUBIC)
     return np.asarray(larger, dtype=np.uint8)
 
@@ -206,13 +208,13 @@ def _enlarge(image: Image) -> Image:
 def _refine_corners(
     larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float
 ) -> Floats:
-    """Refine corners (n, 2) px to the saddle points of their neighbourhoods.
+    """Refine corners (n, 2) px to the saddle points of the grey levels around them.
 
-    larger: result of `_enlarge`. half_px: half sides of the windows (n,), in pixels of the original
-    image, as all other lengths.
+    larger: result of `_enlarge`. half_px: half sides of the windows (n,). All lengths are in pixels
+    of the original image.
 
-    A window must not contain the edges of a neighbouring corner or marker, which shift corners by
-    several pixels. Smoothing reduces noise and JPEG artefacts in the gradients.
+    A window must not contain edges of a neighbouring corner or marker, because they shift the
+    corner by several pixels. Smoothing reduces noise and JPEG artefacts in the gradients.
     """
     smooth = cv2.GaussianBlur(larger, (0, 0), SCALE * smoothing_px)
     halves = np.clip(SCALE * half_px, MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX).astype(int)
@@ -227,11 +229,11 @@ def _refine_corners(
 
 
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
-    """Renumber the right image's corners to match the left image's numbering.
+    """Renumber the right image's corners to match the numbering of the left image.
 
     A detector may start at either end of the board, or at any corner of a square board. The cameras
-    of a rig are nearly parallel, so the matching numbering has the same axis directions in both
-    images.
+    of a stereo rig are nearly parallel. The matching numbering therefore has the same axis
+    directions in both images.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -251,7 +253,7 @@ def match_views(
 ) -> BoardPair | str:
     """Match the board in a pair of views, or return the reason why that is impossible.
 
-    names: of the images.
+    names: names of the two images, for the reason.
     """
     if left is None or right is None:
         missing = [name for name, seen in zip(names, (left, right), strict=True) if seen is None]
@@ -266,10 +268,10 @@ def match_views(
 
 
 def read_gray(path: Path) -> Image:
-    """Read an image in grey; CalibrationError for an unreadable file."""
+    """Read an image as grey levels; raises CalibrationError if it cannot be read."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
-        raise CalibrationError(f"{path}: missing or unreadable image")
+        raise CalibrationError(f"{path}: cannot read the image; check the path and the format")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -284,10 +286,11 @@ def find_pairs(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> tuple[list[BoardPair | str], tuple[int, int]]:
-    """Return the board in each pair, or the reason for its absence, and the images' (width,
-    height).
+    """Find the board in all image pairs.
 
-    Raises CalibrationError for unequal counts, no images, unreadable images or different sizes.
+    Return for each pair the board's corners, or the reason why there are none, and the (width,
+    height) of the images. Raises CalibrationError for unequal counts, no images, unreadable images
+    or different sizes.
     """
     if len(left_paths) != len(right_paths):
         raise CalibrationError(
@@ -295,7 +298,7 @@ def find_pairs(
             "the same order"
         )
     if not left_paths:
-        raise CalibrationError("no images: the patterns match no file")
+        raise CalibrationError("no images: the file patterns match no file; check the patterns")
     finder = CornerFinder(board)
     results: list[BoardPair | str] = []
     size: tuple[int, int] | None = None

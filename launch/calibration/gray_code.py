@@ -1,9 +1,9 @@
 """Generate and decode structured light: Gray-code patterns, and camera images of them.
 
-A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each
-image is decoded to cells of a few projector pixels. A smooth map fitted to the cells around a
-projector pixel gives its image position with subpixel accuracy. Moreno and Taubin (2012) fit local
-homographies instead.
+A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each image
+is decoded to cells of a few projector pixels. A smooth map is fitted to the cells around a
+projector pixel, and gives its position in the image with subpixel accuracy. Moreno and Taubin
+(2012) fit local homographies instead.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 MIN_CONTRAST = 24
-"""Minimum difference between white and black image, in grey levels, of a lit camera pixel."""
+"""Minimum difference (grey levels) between the white and the black image at a lit camera pixel."""
 
 MIN_STRIPE_PX = 4
-"""Width of the finest decoded stripes, projector pixels."""
+"""Width of the finest stripes that are decoded, projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side length of the fit window around a projector pixel, projector pixels."""
+"""Half the side length of the window of the fit around a projector pixel, projector pixels."""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
@@ -43,7 +43,7 @@ class DecodeError(FlexsheetError, ValueError):
 
 
 def make_patterns(width_px: int, height_px: int) -> list[Image]:
-    """Return the projector's images: each pattern and its inverse, then white, black."""
+    """Return the images to project: each pattern and its inverse, then white, then black."""
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
@@ -54,9 +54,9 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Lit pixels (n, 2) of a camera and the projector pixels (n, 2) that light them.
+    """Lit camera pixels (n, 2) and the projector pixels (n, 2) that light them.
 
-    The projector pixels are the centres of their cells.
+    The projector pixels are the centres of the cells to which the images are decoded.
     """
 
     pixels: Floats
@@ -64,7 +64,7 @@ class Decoded:
 
 
 def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """Decode one camera's images (height, width) of `make_patterns`, in their order.
+    """Decode one camera's images (height, width) of the patterns, in the order of `make_patterns`.
 
     Raises DecodeError for a wrong number of images, different sizes, or too few lit pixels.
     """
@@ -118,12 +118,12 @@ def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
 
 
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
-    """Return the camera pixel (2,) at offset 0 of a quadratic map, or None if the fit is poor.
+    """Fit a quadratic map to cells; return its camera pixel (2,) at offset 0, None if poor.
 
-    offsets: (n, 2) of cells, in window half sides (-1..1).
+    offsets: (n, 2) of the cells, relative to half the window's side (-1..1).
     """
     for _ in range(2):
-        # Require cells on all sides; beyond the sheet's edge the fit would extrapolate.
+        # Require cells on all sides, because the fit would extrapolate beyond the sheet's edge.
         quadrants = (offsets > 0.0) @ np.array([1, 2])
         if len(pixels) < MIN_CELLS or len(np.unique(quadrants)) < 4:
             return None

@@ -1,19 +1,20 @@
 """Estimate the pose of an arm's base in the world from images of a board on its flange.
 
-Robot-world/hand-eye calibration: for each of several poses of the arm
+This is robot-world/hand-eye calibration. For each of several poses of the arm
 
 world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
 
-where the first and third transform are unknown. A closed form gives the initial values (Shah,
-Solving the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms
-Robotics 5(3), 2013). Then all corners of all images are fitted together.
+where the first and third transform are unknown. A closed form gives initial values (Shah, Solving
+the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms Robotics
+5(3), 2013). Then all unknowns are fitted to all corners of all images.
 
-The flange deviates from the forward kinematics by some tenths of a millimetre, an error common to
-all corners of a pair. So each pose has a small random flange motion. In this mixed model,
-restricted maximum likelihood estimates the standard deviations (Patterson and Thompson, Biometrika
-58(3), 1971). Treating all corners as independent would underestimate the uncertainty several times.
+The real flange deviates from the forward kinematics by some tenths of a millimetre. This error is
+common to all corners of an image pair. Each pose therefore has a small random flange motion. The
+standard deviations of this mixed model are estimated by restricted maximum likelihood (REML;
+Patterson and Thompson, Biometrika 58(3), 1971). If all corners were treated as independent, the
+uncertainty would be underestimated several times.
 
-Motions (6,) are a rotation vector (rad), then a translation (m).
+A motion (6,) is a rotation vector (rad), then a translation (m).
 """
 
 from __future__ import annotations
@@ -44,40 +45,40 @@ MIN_POSES = 6
 """Minimum number of poses; 15 to 20 are recommended."""
 
 MIN_ROTATION_RAD = float(np.radians(5.0))
-"""Minimum rms rotation of the flange about each of two axes; less does not determine all unknowns.
-"""
+"""Minimum rms rotation of the flange about each of two axes; less leaves unknowns undetermined."""
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""Size of the random subsets used as further initial values, in case of a wrong pose."""
+"""Size of the random subsets that give further initial values, in case some poses are wrong."""
 
 LENGTH_M = 0.3
-"""Translation that has the same weight as a rotation of one radian."""
+"""Translation that counts as much as a rotation of one radian in a pose's error."""
 
 MAX_MEDIAN_RATIO = 6.0
-"""Maximum error over the median error of a pose in the first fit."""
+"""Maximum ratio of a pose's error to the median error, for the pose to be used in the first fit."""
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""Squared deviation of an outlier pose, and the median for six degrees of freedom (chi-square).
+"""Limit of the squared deviation above which a pose is an outlier, and the chi-square median.
 
-Deviations are scaled by the median. The limit is above the maximum (43) of 75 simulated sets of 15
-poses without outliers; an arm's error varies over its workspace.
+The median is that for six degrees of freedom; deviations are scaled by it. The limit is above the
+maximum (43) of 75 simulated sets of 15 poses without outliers; an arm's error varies over its
+workspace.
 """
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""Lower bound of the scale, for poses that agree to rounding."""
+"""Lower bound of the scale of deviations, for poses that agree except for rounding."""
 
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""Maximum plausible standard deviations; larger ones mean wrongly assigned joints."""
+"""Maximum plausible standard deviations of an arm; larger ones mean wrongly assigned joints."""
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
-"""Maximum fraction of outliers; more indicate another mistake."""
+"""Maximum fraction of outlier poses; more indicate another mistake, such as a wrong board."""
 
 MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
-"""Lower bounds of the arm's standard deviations."""
+"""Lower bounds of the estimated standard deviations of the arm."""
 
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
@@ -87,18 +88,18 @@ ADVICE = (
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-"""Initial simplex of the search over the logarithms of the deviations."""
+"""Initial simplex of the search over the logarithms of the arm's two standard deviations."""
 
 MAX_ITERATIONS = 30
 CONVERGED_STEP = 1e-10
 """Maximum step of any unknown (rad, m) at convergence."""
 
 INITIAL_STEP = 1e-6
-"""Maximum step at convergence of an initial value."""
+"""Maximum step at convergence of the fits that compute initial values."""
 
 
 class HandEyeError(FlexsheetError, ValueError):
-    """Raised for poses that do not determine the base."""
+    """Raised for poses that do not determine the pose of the arm's base."""
 
     code = "hand-eye"
     remedy = "Measure more poses, with the board rotated about at least two axes."
@@ -106,7 +107,7 @@ class HandEyeError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraLens:
-    """Camera matrix (3, 3), px, and Brown's distortion (5,)."""
+    """Camera matrix (3, 3), px, and Brown's lens distortion (5,)."""
 
     matrix: Floats
     distortion: Floats
@@ -114,7 +115,7 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """Optics and pose of the stereo camera; transforms (4, 4)."""
+    """Lenses and pose of the stereo camera; transforms are (4, 4)."""
 
     left: CameraLens
     right: CameraLens
@@ -124,7 +125,7 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """Corners in one image: points on the board (k, 3), m, and pixels (k, 2)."""
+    """Board corners in one image: points in the board's frame (k, 3), m, and pixels (k, 2)."""
 
     points_board: Floats
     pixels: Floats
@@ -132,7 +133,7 @@ class CornerView:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """One pose of the arm: joints (6,), rad, and the board's corners in both images."""
+    """One pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
 
     name: str
     joints_rad: Floats
@@ -142,11 +143,11 @@ class BoardDetection:
 
 @dataclass(frozen=True, slots=True)
 class PoseResidual:
-    """Residual of one pose.
+    """Residual of one pose of the arm.
 
     shift_m, rotation_rad: difference between the flange poses from the images and from the joints.
-    rms_px: of the corners, projected with the pose from the joints. reason: for excluding the pose;
-    empty for an inlier.
+    rms_px: rms distance of the corners from their projections with the pose from the joints.
+    reason: why the pose was excluded; empty for an inlier.
     """
 
     name: str
@@ -158,15 +159,16 @@ class PoseResidual:
 
 @dataclass(frozen=True, slots=True)
 class BaseFit:
-    """Pose of the base with its uncertainty and residuals.
+    """Estimated pose of the arm's base, with its uncertainty and residuals.
 
-    covariance: (6, 6) of the motion from the estimated to the true world_from_base: rotation about
-    the base's origin in world axes, then translation. Scaled by the square of `jackknife_ratio` if
-    that is above 1.
+    covariance: covariance (6, 6) of the motion from the estimated to the true world_from_base:
+    rotation about the base's origin in world axes, then translation. It is scaled by the square of
+    `jackknife_ratio` if that is above 1.
 
-    corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m: of one
-    component of the flange's pose error. jackknife_ratio: jackknife over fit standard deviations
-    (rms over six). leave_one_out: (n, 6) motions of the base when one inlier is excluded.
+    corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m:
+    standard deviations of one component of the flange's pose error. jackknife_ratio: ratio of the
+    standard deviations from the jackknife to those from the fit (rms over six). leave_one_out:
+    motions (n, 6) of the base when one inlier is excluded.
     """
 
     world_from_base: Floats
@@ -180,9 +182,10 @@ class BaseFit:
     residuals: tuple[PoseResidual, ...]
 
     def compute_std(self, world_m: Floats) -> tuple[float, float]:
-        """Return the standard deviations of a commanded pose at a world point (3,), over all axes.
+        """Return the standard deviations of a commanded flange pose at a world point (3,).
 
-        The first is that of the position (m), the second that of the rotation (rad).
+        The first is that of the position (m), the second that of the rotation (rad), both over all
+        axes.
         """
         lever = np.hstack([-skew(world_m - self.world_from_base[:3, 3]), np.eye(3)])
         shift = float(np.sqrt(np.trace(lever @ self.covariance @ lever.T)))
@@ -197,7 +200,7 @@ class _Unknowns:
     flange_from_board: Floats
 
     def apply_step(self, step: Floats) -> _Unknowns:
-        """Apply motions (12,) to base and board, each about its own origin."""
+        """Apply motions (12,) to the base and the board, each about its own origin."""
         return _Unknowns(
             _apply_motion(self.world_from_base, step[:6]),
             _apply_motion(self.flange_from_board, step[6:]),
@@ -206,12 +209,13 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """One pose, linearized at the current estimates.
+    """Model of one pose, linearized at the current estimates.
 
-    measured: (6,) motion of the flange, in its own frame, that fits the corners best. spread: (6,
-    6) its covariance per px^2 of corner noise. by_unknowns: (6, 12) derivative of the flange's
-    motion by those of base and board. inner_px2: sum of squared pixel residuals after the motion
-    `measured`. count: number of coordinates. rms_px: of the corners, without that motion.
+    measured: flange motion (6,), in the flange's frame, that fits the corners best. spread: its
+    covariance (6, 6) per px^2 of corner noise. by_unknowns: derivative (6, 12) of the flange motion
+    by the motions of base and board. inner_px2: sum of squared pixel residuals after the motion
+    `measured`. count: number of corner coordinates. rms_px: rms error of the corners without that
+    motion.
     """
 
     measured: Floats
@@ -225,8 +229,8 @@ class _LinearizedPose:
 def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig) -> BaseFit:
     """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
 
-    The stereo rig is assumed exact: its errors affect the
-    result and the fingertip equally, since the same rig measures both.
+    The stereo camera is assumed exact: its errors shift the base and the fingertip equally, since
+    the same camera measures both.
     """
     _check_count(detections)
     flanges = [forward(one.joints_rad) for one in detections]
@@ -245,7 +249,7 @@ def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig) -> BaseFi
         inliers = _find_inliers(_linearize(unknowns, detections, flanges, rig), model)
         if (inliers == used).all():
             break
-        # Readmit a pose only a few times, so that the iteration ends.
+        # Readmit excluded poses only in the first iterations, so that the loop ends.
         used = inliers if attempt < MAX_READMISSIONS else inliers & used
     return _make_result(detections, flanges, rig, unknowns=unknowns, model=model, used=used)
 
@@ -253,7 +257,7 @@ def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig) -> BaseFi
 def _check_count(detections: Sequence[BoardDetection]) -> None:
     if len(detections) < MIN_POSES:
         raise HandEyeError(
-            f"{len(detections)} arm poses, at least {MIN_POSES} are required; record 15 to 20"
+            f"{len(detections)} arm poses, at least {MIN_POSES} are required; record 15 to 20 poses"
         )
     for one in detections:
         if not np.isfinite(one.joints_rad).all() or one.joints_rad.shape != (6,):
@@ -280,7 +284,10 @@ def _check_plausible(model: _NoiseModel) -> None:
 
 
 def _check_rotations(flanges: Sequence[Floats]) -> None:
-    """Check for rotations about two axes; one alone does not determine the translation along it."""
+    """Raise HandEyeError unless the flange rotates about two axes.
+
+    Rotations about one axis alone do not determine the translation along it.
+    """
     mean = _mean_rotation([flange[:3, :3] for flange in flanges])
     rotations = np.array([vector_from_rotation(mean.T @ flange[:3, :3]) for flange in flanges])
     values, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
@@ -295,19 +302,19 @@ def _check_rotations(flanges: Sequence[Floats]) -> None:
         x, y, z = axes[:, 2]
         raise HandEyeError(
             f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own frame "
-            f"(about others {np.degrees(spread[1]):.1f} degrees rms, at least "
-            f"{np.degrees(MIN_ROTATION_RAD):.0f} required); rotate it about another axis, too"
+            f"(about other axes {np.degrees(spread[1]):.1f} degrees rms, at least "
+            f"{np.degrees(MIN_ROTATION_RAD):.0f} required); rotate it about another axis as well"
         )
 
 
 def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
-    """Return the mean of rotations (least squares of the matrices)."""
+    """Return the mean of rotation matrices in the least-squares sense."""
     u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt)
 
 
 def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
-    """Fit left_from_board (4, 4) to the corners of both images.
+    """Fit the board's pose left_from_board (4, 4) to the corners of both images.
 
     One image of a flat board has two similar solutions; the other image decides between them.
     """
@@ -339,7 +346,7 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Return residuals (m,), px, and derivatives (m, 6) of the projections by a flange motion."""
+    """Return residuals (m,) of the corners, px, and derivatives (m, 6) by a flange motion."""
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
         (detection.left, rig.left, np.eye(4)),
@@ -352,7 +359,7 @@ def _linearize_pixels(
         rotation = eye_from_flange[:3, :3]
         by_point = np.empty((len(in_eye), 2, 3))
         for axis in range(3):
-            # Half a micrometre: the projection is smooth enough for ten digits.
+            # A step of half a micrometre: the projection is so smooth that ten digits remain.
             nudge = np.zeros(3)
             nudge[axis] = 5e-7
             ahead, behind = (
@@ -369,7 +376,7 @@ def _linearize_pixels(
 
 
 def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig) -> _Unknowns:
-    """Return the closed-form solution of all poses, or of the subset that fits most poses best."""
+    """Return initial values: the closed form for all poses, or for the subset that fits best."""
     random = np.random.default_rng(0)
     every = np.arange(len(flanges))
     subsets = [
@@ -400,11 +407,12 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
 def _solve_closed_form(
     flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> _Unknowns | None:
-    """Return Shah's solution of B F X = C, or None if these poses have none.
+    """Return Shah's solution of B F X = C, or None if the poses have none.
 
-    With Y the transpose of X's rotation, C Y = B F for all rotations. So the matrix sum(kron(F, C))
-    maps the stacked columns of Y to n times those of B, and both are its first singular vectors.
-    The translations follow by linear least squares.
+    Here B is world_from_base, F base_from_flange, X flange_from_board and C world_from_board. With
+    Y the transpose of X's rotation, C Y = B F for all rotations. So the matrix sum(kron(F, C)) maps
+    the stacked columns of Y to n times those of B, and both are its first singular vectors. The
+    translations follow by linear least squares.
     """
     worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
@@ -415,7 +423,7 @@ def _solve_closed_form(
         return None
     base = _unstack_rotation(u[:, 0])
     board = _unstack_rotation(vt[0]).T
-    # R_B (R_F t_X + t_F) + t_B = t_C
+    # The translations satisfy R_B (R_F t_X + t_F) + t_B = t_C.
     rows = np.vstack([np.hstack([base @ f[:3, :3], np.eye(3)]) for f in flanges])
     sides = np.concatenate(
         [c[:3, 3] - base @ f[:3, 3] for f, c in zip(flanges, worlds, strict=True)]
@@ -427,7 +435,7 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation nearest to these stacked columns (9,), up to a factor."""
+    """Return the rotation nearest to stacked columns (9,) that are known up to a factor."""
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
@@ -435,7 +443,7 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return flange motions (n, 6), in its frame, from the pose by joints to that by images."""
+    """Return flange motions (n, 6), in its own frame, from the pose by joints to that by images."""
     found = []
     for flange, board in zip(flanges, boards, strict=True):
         measured = rig.world_from_left @ board @ inverse(unknowns.flange_from_board)
@@ -455,23 +463,23 @@ def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """Standard deviations of a corner coordinate (px) and of the flange (rad, m)."""
+    """Standard deviations of a corner coordinate (px) and of the flange's pose error (rad, m)."""
 
     corner_px: float
     arm_rad: float
     arm_m: float
 
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
-        """Return the information (n, 6, 6) of each measured flange motion, with the arm error."""
+        """Return the information matrix of each flange motion (n, 6, 6), with the arm's error."""
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
         return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + arm))
 
 
 def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
-    """Return a mask (n,) of inliers by the chi-square test, scaled by the median.
+    """Return a mask (n,) of inliers by a chi-square test of deviations scaled by their median.
 
-    Deviations within rounding are inliers even if the others are exact.
+    Deviations within rounding are inliers even if the other poses are exact.
     """
     measured = np.array([one.measured for one in poses])
     bounded = _NoiseModel(
@@ -545,7 +553,7 @@ def _linearize(
 def _normal_equations(
     poses: Sequence[_LinearizedPose], model: _NoiseModel
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations (12, 12) and (12,) for a step of the unknowns."""
+    """Return the normal equations, matrix (12, 12) and vector (12,), for a step of the unknowns."""
     weights = model.compute_weights(poses)
     slopes = np.array([one.by_unknowns for one in poses])
     measured = np.array([one.measured for one in poses])
@@ -557,7 +565,7 @@ def _normal_equations(
 def _estimate_deviations(
     poses: Sequence[_LinearizedPose], before: _NoiseModel | None
 ) -> _NoiseModel:
-    """Estimate corner noise from residuals within poses, and the arm's error by REML."""
+    """Estimate the corner noise from residuals within poses, and the arm's error by REML."""
     freedom = sum(one.count - 6 for one in poses)
     corner = float(np.sqrt(max(sum(one.inner_px2 for one in poses), 0.0) / max(freedom, 1)))
     corner = max(corner, 1e-6)
@@ -565,7 +573,7 @@ def _estimate_deviations(
     slopes = np.array([one.by_unknowns for one in poses])
 
     def neg_log_likelihood(logs: Floats) -> float:
-        """Return -2 log of the restricted likelihood without its constant."""
+        """Return -2 times the logarithm of the restricted likelihood, without its constant."""
         logs = np.clip(
             logs,
             [np.log(MIN_ARM_RAD), np.log(MIN_ARM_M)],
@@ -591,7 +599,7 @@ def _estimate_deviations(
 
 
 def _apply_motion(pose: Floats, motion: Floats) -> Floats:
-    """Rotate a pose about its own origin and translate it; the motion is in the parent's axes."""
+    """Rotate a pose about its own origin and translate it, both in the parent frame's axes."""
     rotation = rotation_from_vector(motion[:3])
     return transform(rotation @ pose[:3, :3], pose[:3, 3] + motion[3:])
 
@@ -611,7 +619,8 @@ def _make_result(
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     left_out = []
     for index in range(len(poses)):
-        # At the optimum, excluding one pose is one step of the remaining normal equations.
+        # At the optimum, the effect of excluding one pose is one step of the remaining normal
+        # equations.
         without, side = _normal_equations(poses[:index] + poses[index + 1 :], model)
         left_out.append(np.linalg.solve(without, side)[:6])
     motions = np.array(left_out)

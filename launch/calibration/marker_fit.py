@@ -1,8 +1,9 @@
 """Fit the marker's position on the finger to touches of known points in several orientations.
 
-The marker's centre is at p + e + R o: p the touched point, e an error that all touched points have
-in common, R the finger's orientation, o the wanted offset in the finger's frame. A touched plane,
-such as the sheet, determines the component along its normal only. Orientations separate o from e.
+The marker's centre is at p + e + R o. Here p is the touched point, e an error that all touched
+points have in common, R the finger's orientation and o the wanted offset in the finger's frame. A
+touched plane, such as the sheet, only determines the component along its normal. Several
+orientations are needed to separate o from e.
 """
 
 from __future__ import annotations
@@ -18,27 +19,27 @@ from flexsheet.messages.errors import FlexsheetError
 Floats = NDArray[np.float64]
 
 TOUCH_NOISE_M = 2e-4
-"""Expected standard deviation of a touch along one axis: camera, hand and orientation."""
+"""Expected standard deviation of a touch along one axis, from camera, hand and orientation."""
 
 POINT_ERROR_M = 3e-4
-"""Expected standard deviation of the common error of touched points; it limits the result."""
+"""Expected standard deviation of the error that all touched points share; it limits accuracy."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
 """Minimum angle between orientations that count as different."""
 
 MAX_DEVIATION_M = 5e-4
-"""Maximum standard deviation of a component of a determined offset."""
+"""Maximum standard deviation of a component of the offset that counts as determined."""
 
 MAX_RESIDUAL_M = 1e-3
-"""Maximum root mean square residual of touches that agree."""
+"""Maximum root mean square residual of touches that count as consistent."""
 
 MAX_OFFSET_M = 0.05
-"""Maximum plausible distance of a marker from the pad."""
+"""Maximum plausible distance between the marker and the finger's pad."""
 
 
 class MarkerFitError(FlexsheetError, ValueError):
-    """Raised for touches that do not determine the marker's position."""
+    """Raised for touches that do not determine the marker's position on the finger."""
 
     code = "marker-fit"
     remedy = "Touch a known point in at least three orientations that differ by 15 degrees or more."
@@ -46,10 +47,10 @@ class MarkerFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One touch of a known point or plane; the finger was at rest.
+    """One touch of a known point or plane, during which the finger was at rest.
 
-    marker_m, point_m: (3,) world. normal: (3,) of a touched plane; None: the pad was at the point.
-    world_from_finger: (3, 3).
+    marker_m, point_m: measured marker and touched point (3,), world. normal: (3,) of a touched
+    plane; None: the pad was at the point. world_from_finger: rotation (3, 3).
     """
 
     marker_m: Floats
@@ -60,9 +61,10 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """Fitted offset (3,) in the finger's frame, m, and its uncertainty.
+    """Fitted offset of the marker (3,) in the finger's frame, m, and its uncertainty.
 
-    residuals_m: distances (touches,). orientations: number of different orientations.
+    point_offset_m: common error of the touched points. residuals_m: residual distances (touches,).
+    orientations: number of different orientations.
     """
 
     marker_from_pad_m: Floats
@@ -73,12 +75,12 @@ class MarkerFit:
 
     @property
     def residual_rms_m(self) -> float:
-        """Return the root mean square of the residuals."""
+        """Return the root mean square of the residuals, m."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
-    """Fit the offset by linear least squares.
+    """Fit the marker's offset by linear least squares.
 
     Raises MarkerFitError for too few touches or orientations, for touches that contradict each
     other, and for an implausible or undetermined offset.
@@ -117,8 +119,8 @@ def _check_fit(fit: MarkerFit) -> None:
     worst = int(np.argmax(fit.residuals_m))
     if fit.residual_rms_m > MAX_RESIDUAL_M:
         raise MarkerFitError(
-            f"the touches contradict each other: residual {1e3 * fit.residual_rms_m:.2f} mm, "
-            f"{1e3 * fit.residuals_m[worst]:.2f} mm in touch {worst + 1}, at most "
+            f"the touches contradict each other: rms residual {1e3 * fit.residual_rms_m:.2f} mm, "
+            f"maximum {1e3 * fit.residuals_m[worst]:.2f} mm in touch {worst + 1}; limit of the rms "
             f"{1e3 * MAX_RESIDUAL_M:g} mm; check units, signs and orientations"
         )
     for axis, deviation_m in zip("xyz", fit.standard_deviations_m, strict=True):
@@ -136,7 +138,7 @@ def _check_fit(fit: MarkerFit) -> None:
 
 
 def count_orientations(rotations: Sequence[Floats]) -> int:
-    """Return the number of rotations (3, 3) that differ from all counted ones before."""
+    """Count the rotations (3, 3) that differ from all counted before."""
     counted: list[Floats] = []
     for rotation in rotations:
         angles = [

@@ -1,4 +1,4 @@
-"""Write calibration boards to print at true size, as SVG or PNG.
+"""Write calibration boards as SVG or PNG, to be printed at true size.
 
 The first square is black. The white squares of a ChArUco board contain the markers, numbered by row
 as OpenCV's detector expects.
@@ -57,7 +57,7 @@ def find_black_rectangles(board: Board) -> Floats:
 
 
 def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
-    """Return (row, first column, length) of the black runs in a marker image."""
+    """Return (row, first column, length) of each run of black cells in a marker image."""
     runs = []
     for y, row in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))

@@ -1,7 +1,7 @@
 """Calibrate the projector's optics and pose from the points that its pixels light.
 
 A projector is an inverse camera: each of its pixels lights a point, whose position two cameras
-measure. So the poses of the sheet need not be known.
+measure. The poses of the sheet on which the points lie therefore need not be known.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""Typical errors of a scene's projector measured by tape, of which only the ratios matter.
+"""Typical errors of a projector in a scene that was measured by tape; only their ratios matter.
 
 Rotation (rad), position (m), focal length (relative), principal point (px).
 """
@@ -56,10 +56,10 @@ class ProjectorError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
-    """Points lit by projector pixels.
+    """Points that projector pixels light.
 
-    world: (n, 3) m. pixels: (n, 2) of the projector. pose: (n,) number of the sheet's pose. skew_m:
-    (n,) distance between the two cameras' rays.
+    world: positions (n, 3), m. pixels: projector pixels (n, 2). pose: index (n,) of the sheet's
+    pose. skew_m: distance (n,) between the rays of the two cameras.
     """
 
     world: Floats
@@ -70,10 +70,11 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """Calibrated projector and its residuals, in projector pixels and metres on the sheet.
+    """Calibrated projector and its residuals, in projector pixels and in metres on the sheet.
 
-    held_out_rms_px: of poses excluded from the fit. before_rms_px: of the initial projector.
-    coverage_ratio: fraction of the image's cells with points.
+    held_out_rms_px: rms residual of poses that were excluded from the fit. before_rms_px: rms
+    residual of the initial projector. coverage_ratio: fraction of the image's cells that contain
+    points.
     """
 
     projector: Projector
@@ -93,10 +94,10 @@ def measure_points(
     camera: StereoCamera,
     projector: Projector,
 ) -> ProjectorPoints:
-    """Triangulate the points lit by projector pixels, from left and right images of each pose.
+    """Triangulate the points lit by projector pixels, from images of each sheet pose.
 
-    camera: with calibrated optics, and `world_from_left` from the scene. Raises ProjectorError if
-    the patterns cannot be decoded.
+    camera: stereo camera with calibrated optics, and `world_from_left` from the scene. Raises
+    ProjectorError if the patterns cannot be decoded.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
@@ -117,7 +118,7 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """Return midpoints (n, 3) between the rays of pixels (n, 2), m, and their distances."""
+    """Triangulate pixels (n, 2); return midpoints (n, 3) between the rays, m, and ray distances."""
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(
@@ -149,9 +150,10 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 
 
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
-    """Fit a projector to points, from an initial projector.
+    """Fit a projector to the points that its pixels light.
 
-    Raises ProjectorError for too few points, a small depth range or coverage, and large residuals.
+    guess: initial projector. Raises ProjectorError for too few points, a small depth range or
+    coverage, and large residuals.
     """
     inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
@@ -219,7 +221,7 @@ def _rms(values: Floats) -> float:
 
 
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """Return the depth range of the central 90 % of the points along the projector's axis, m."""
+    """Return the depth range (m) of the central 90 % of the points, along the projector's axis."""
     pose = guess.world_from_projector
     along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
@@ -236,8 +238,8 @@ def _fit_projector(
 ) -> Projector:
     """Fit a projector by least squares: one focal length, principal point, k1, k2, p1, p2.
 
-    Aspect ratio and k3 are those of the guess. OpenCV's fit rejects a principal point outside the
-    image, which lens shift causes.
+    Aspect ratio and k3 are those of the guess. OpenCV's fit is not used, because it rejects a
+    principal point outside the image, which lens shift causes.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -293,11 +295,11 @@ def _make_projector(
 def fit_keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
 ) -> ProjectorFit:
-    """Fit a projector whose pixels (4, 2) light the corners of a rectangle on the virtual screen.
+    """Fit a projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
 
-    corners_px: bottom left, bottom right, top right, top left, from the user's view. The fit
-    matches this homography exactly. Of the projectors that do, it returns the one nearest to the
-    guess, with the guess's distortion. Raises ProjectorError if the corners are not a convex
+    corners_px: bottom left, bottom right, top right, top left, as the user sees them. Many
+    projectors match these four corners (a homography) exactly. The result is the one nearest to the
+    guess, with the distortion of the guess. Raises ProjectorError if the corners are not a convex
     quadrangle.
     """
     x, y = half_width_m, half_height_m
@@ -308,7 +310,7 @@ def fit_keystone(
     if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
             f"corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
-            "bottom right, top right, top left, from the user's view"
+            "bottom right, top right, top left, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)

@@ -1,4 +1,4 @@
-"""Write a calibration report: corner residuals, pair quality, coverage and uncertainty.
+"""Write a report of a stereo calibration: corner residuals, pair quality, coverage, uncertainty.
 
 The report is one self-contained HTML page; its images are also written as PNG.
 """
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""Arrow length of the 95th percentile of the residuals, image px."""
+"""Length of the arrow that shows the 95th percentile of the residuals, image px."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -41,10 +41,10 @@ img { max-width: 100%; } figcaption { color: #444; }
 
 
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
-    """Return right pixels (n, 2) of all common corners and their epipolar distances (n,), px.
+    """Compute how far corners in the right image are from the epipolar lines of the left corners.
 
-    The distances are signed, from the undistorted left corner's epipolar line, in the right
-    camera's pixels.
+    Return the right pixels (n, 2) of all common corners and their distances (n,), px, in
+    undistorted coordinates of the right camera. The distances are signed.
     """
     rig = StereoRig.from_fit(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]
@@ -158,7 +158,7 @@ def _format_image_axis(axis: Axes, size: tuple[int, int], title: str) -> None:
 
 
 def list_parameters(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
-    """Return (name, value, standard deviation) of the rig's 22 parameters."""
+    """Return (name, value, standard deviation) of the 22 parameters of the rig."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -169,7 +169,10 @@ def list_parameters(calibrated: CalibrationResult) -> list[tuple[str, float, flo
 
 
 def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
-    """Write `index.html` and its images to a folder, created if missing; return the page's path."""
+    """Write `index.html` and its images to a folder; return the path of the page.
+
+    The folder is created if it does not exist.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     calibration = calibrated.calibration
     board, uncertainty = calibration.board, calibration.uncertainty

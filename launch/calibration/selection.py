@@ -1,8 +1,8 @@
-"""Select reliable image pairs and corners, and fit the rig to them.
+"""Select reliable image pairs and corners, and fit the stereo rig to them.
 
 Zhang's method (A flexible new technique for camera calibration, 2000) fits each camera alone. Then
-both are fitted together with all parameters free (`bundle`), which predicts held-out images better
-than fixed intrinsics do.
+both cameras are fitted together with all parameters free (`bundle`). This predicts images that were
+not used better than a fit with fixed intrinsics does.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ MISFIT_RATIO = 5.0
 MIN_MISFIT_PX = 5.0
 MISFIT = "inconsistent with the other pairs:"
 CORNER_RATIO = 6.0
-"""Residual of an outlier corner, in standard deviations."""
+"""Residual above which a corner is an outlier, in standard deviations."""
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""Maximum fraction of outlier corners; a pair with more is excluded."""
+"""Maximum fraction of outlier corners in a pair; a pair with more is excluded."""
 
 REPEAT_PX = 1.0
-"""Maximum corner distance between two pairs that show the board in the same pose, px."""
+"""Maximum distance of corners (px) between two pairs that count as the same board pose."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
-    """Fit the lens (8,) of one camera to its views of the board.
+    """Fit the lens parameters (8,) of one camera to its views of the board.
 
-    points: the board's corners (n, 3), m.
+    points: corners of the board (n, 3), m.
     """
     _, matrix, distortion, *_ = cv2.calibrateCamera(
         [points[view.ids].astype(np.float32) for view in views],
@@ -65,13 +65,14 @@ def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) 
 def compute_misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """Return each pair's deviation (n,) from a robust rig estimate, rms px in the right image.
+    """Measure how much each pair contradicts the others, to find wrongly matched images.
 
     Each pair alone determines the relative pose of the cameras. The reference is the pair whose
     pose has the smallest median deviation over all pairs (least median of squares, Rousseeuw 1984).
-    Unlike a common fit, it is not distorted by wrongly matched images. left, right: lenses (8,).
+    Unlike a common fit, it is not distorted by wrong pairs. left, right: lenses (8,).
 
-    The second result is the right_from_left (6,) of the reference pair.
+    Return each pair's deviation (n,) from the reference, rms px in the right image, and the pose
+    right_from_left (6,) of the reference.
     """
     left_poses = [pose_transform(board_pose(pair.left, points, left)) for pair in pairs]
     right_poses = [pose_transform(board_pose(pair.right, points, right)) for pair in pairs]
@@ -90,9 +91,9 @@ def compute_misfits(
 
 
 def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit both cameras together from the pairs alone.
+    """Fit both cameras together, with initial values from the pairs alone.
 
-    points: the board's corners (n, 3), m.
+    points: corners of the board (n, 3), m.
     """
     left = fit_lens([pair.left for pair in pairs], points, size)
     right = fit_lens([pair.right for pair in pairs], points, size)
@@ -102,15 +103,15 @@ def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int])
 
 
 def count_corners(pair: BoardPair) -> int:
-    """Return the number of corners in both views of a pair."""
+    """Return the total number of corners in both views of a pair."""
     return len(pair.left.ids) + len(pair.right.ids)
 
 
 def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
     """Return the pairs without outlier corners.
 
-    The standard deviation is estimated from the median distance, which is robust to outliers
-    (1.1774 standard deviations for a two-dimensional normal distribution).
+    The standard deviation is estimated from the median distance, because outliers hardly affect it.
+    For a two-dimensional normal distribution the median is 1.1774 standard deviations.
     """
     distances = [[np.linalg.norm(view, axis=1) for view in views] for views in fit.residuals]
     every = np.concatenate([view for views in distances for view in views])
@@ -127,9 +128,9 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 
 
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """Map the number of each pair that repeats an earlier board pose to that earlier pair.
+    """Find pairs that repeat an earlier board pose; map their indices to the earlier ones.
 
-    Repeated pairs share their errors, so they must not count as independent measurements.
+    Repeated pairs have the same errors, so they must not count as independent measurements.
     """
     unique: dict[int, BoardPair] = {}
     repeated: dict[int, int] = {}
@@ -146,7 +147,7 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the larger of both views' median distances between common corners, px."""
+    """Return the median distance between common corners, px; the larger one of both views."""
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
@@ -157,10 +158,10 @@ def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
 
 
 class PairSelection:
-    """Remaining pairs of a calibration, and the reasons for excluding the others.
+    """Pairs that remain in a calibration, and the reasons for which others were excluded.
 
-    good: remaining pairs, by number. reasons: of excluded pairs, by number. residuals: rms (2,) px
-    of the left and right view, also of excluded pairs.
+    good: indices of the remaining pairs. reasons: reason for each excluded pair, by index.
+    residuals: rms (2,) px of the left and right view by index, including excluded pairs.
     """
 
     def __init__(self, found: Sequence[BoardPair | str], names: Sequence[str]) -> None:
@@ -174,7 +175,7 @@ class PairSelection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """Return the remaining pairs; CalibrationError for fewer than MIN_PAIRS."""
+        """Return the remaining pairs; raises CalibrationError if there are fewer than MIN_PAIRS."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
@@ -184,7 +185,7 @@ class PairSelection:
         return list(self.good.values())
 
     def exclude_pairs(self, errors_px: Floats, ratio: float, min_px: float, what: str) -> bool:
-        """Exclude pairs with errors above `ratio` medians and `min_px`; return whether any is."""
+        """Exclude pairs with errors above `min_px` and `ratio` medians; return whether any was."""
         limit_px = max(ratio * float(np.median(errors_px)), min_px)
         bad = [
             (i, error) for i, error in zip(self.good, errors_px, strict=True) if error > limit_px
@@ -195,7 +196,7 @@ class PairSelection:
         return bool(bad)
 
     def replace_pairs(self, cleaned: Sequence[BoardPair]) -> None:
-        """Replace the pairs by `cleaned`; exclude those that lost too many corners."""
+        """Replace the pairs by `cleaned`; exclude pairs that lost too many corners as outliers."""
         for i, pair in zip(list(self.good), cleaned, strict=True):
             whole = self.found[i]
             assert isinstance(whole, BoardPair)
@@ -207,7 +208,7 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return the number of corners in both views that were removed from a pair."""
+        """Return how many corners were removed from both views of the pair with index `number`."""
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
             return 0
@@ -218,8 +219,8 @@ def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int
     """Fit the rig to the reliable pairs and corners, and exclude the others from the selection.
 
     Excludes pairs that contradict the others (`compute_misfits`), corners with residuals above six
-    standard deviations, and pairs with residuals above three times the median and half a pixel.
-    Raises CalibrationError if too few pairs remain or they do not determine the rig.
+    standard deviations, and pairs whose residual exceeds half a pixel and three times the median.
+    Raises CalibrationError if too few pairs remain or if they do not determine the rig.
     """
     try:
         pairs = selection.pairs()

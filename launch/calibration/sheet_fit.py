@@ -1,4 +1,7 @@
-"""Fit the scaled force model to measured pushes: the rubber's stiffness and the slack width."""
+"""Fit the scaled sheet model to measured pushes: the rubber's stiffness and the unstretched width.
+
+A push is a measured force of a finger that is pressed into the sheet by a known depth.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +23,17 @@ Bools = NDArray[np.bool_]
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
-"""Error of the model as a fraction of the force; residuals are weighted by it and the noise."""
+"""Model error as a fraction of the force; residuals are divided by it and the noise combined."""
 
 OUTLIER_SIGMAS = 5.0
 """Residual of an outlier row, in standard deviations; the fit is repeated without outliers."""
 
 MAX_RELATIVE_DEVIATION = 0.5
-"""Maximum relative standard deviation of a determined parameter."""
+"""Maximum relative standard deviation of a parameter that counts as determined."""
 
 
 class SheetModelFitError(FlexsheetError, ValueError):
-    """Raised for rows that do not determine the model."""
+    """Raised for measured rows that do not determine the parameters of the model."""
 
     code = "sheet-model-fit"
     remedy = "Add pushes at other stretches and depths."
@@ -40,8 +43,8 @@ class SheetModelFitError(FlexsheetError, ValueError):
 class MeasuredPush:
     """One measured push.
 
-    position_m: on the stretched sheet, from its centre. edge_force_n: None if not measured.
-    unloading: whether the finger was deeper before; None if it is not known.
+    position_m: contact on the stretched sheet, from its centre. edge_force_n: force on a clamped
+    edge; None if not measured. unloading: whether the finger was deeper before; None if unknown.
     """
 
     edge_distance_m: float
@@ -57,10 +60,10 @@ class MeasuredPush:
 class SheetModelFit:
     """Fitted sheet model and its uncertainty.
 
-    law: model as a function of the stretch ratio over the nominal width. names, values,
-    standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows without
-    outliers. residual_ratio: (n,) measured over fitted force, minus one. rms_ratio, worst_ratio: of
-    the used rows with forces above the noise.
+    law: force model; it takes the stretch ratio relative to the nominal width. names, values,
+    standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows that are
+    not outliers. residual_ratio: measured force divided by fitted force, minus one (n,). rms_ratio,
+    worst_ratio: rms and maximum residual ratio of the used rows with forces above the noise.
     """
 
     law: ScaledSheetModel
@@ -75,26 +78,26 @@ class SheetModelFit:
 
 
 MIN_HYSTERESIS_ROWS = 3
-"""Minimum number of rows of loading, and of unloading, for the hysteresis."""
+"""Minimum number of rows with loading, and with unloading, to estimate the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """Share of the loading's energy that a cycle loses, with its standard deviation."""
+    """Fraction of the loading energy that is lost in a cycle, with its standard deviation."""
 
     ratio: float
     standard_deviation: float
 
     @property
     def amplitude(self) -> float:
-        """Return h: loading needs 1 + h of the elastic force, unloading gives 1 - h."""
+        """Return h: loading needs 1 + h times the elastic force, unloading gives 1 - h times."""
         return self.ratio / (2.0 - self.ratio)
 
 
 def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
-    """Estimate the hysteresis from the residuals of loading and unloading.
+    """Estimate the hysteresis from the residuals of the rows with loading and with unloading.
 
-    pushes: as measured. Returns None for fewer than three used rows of either. Raises
+    pushes: measured pushes. Returns None for fewer than three used rows of either kind. Raises
     SheetModelFitError if unloading needs more force than loading.
     """
     elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
@@ -113,14 +116,15 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
     deviation = share * float(np.hypot(errors[0] / loading, errors[1] / falls))
     if share > 1.0 + 3.0 * deviation:
         raise SheetModelFitError(
-            f"unloading: its force is {share:.2f} of that of loading; check the column's values"
+            f"column unloading: its force is {share:.2f} times that of loading; check the column"
         )
-    # (1 - h) / (1 + h) is the share, and 2 h / (1 + h) the energy.
+    # (1 - h) / (1 + h) is the ratio of the forces, and 2 h / (1 + h) the lost fraction of the
+    # energy.
     return Hysteresis(max(1.0 - share, 0.0), deviation)
 
 
 def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
-    """Return the pushes with the elastic forces, for those with a known direction."""
+    """Return the pushes with hysteresis removed from forces of loading and unloading."""
     signs = {None: 0.0, False: 1.0, True: -1.0}
     return [
         replace(push, force_n=push.force_n / (1.0 + signs[push.unloading] * hysteresis.amplitude))
@@ -134,10 +138,11 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 def fit_sheet_model(
     pushes: Sequence[MeasuredPush], nominal: Rubber, *, with_mooney: bool = False
 ) -> SheetModelFit:
-    """Fit modulus times thickness, slack width, cubic ratio and optionally the Mooney weight.
+    """Fit modulus times thickness, unstretched width, cubic ratio and optionally Mooney weight.
 
-    Robust least squares: soft L1, then without outliers. Raises SheetModelFitError for too few
-    rows, and for rows that do not determine a parameter.
+    The last two are the ratio of the cubic term and the weight of the Mooney term. The
+    least-squares fit is robust: first with soft-L1 loss, then without outliers. Raises
+    SheetModelFitError for too few rows, and for rows that do not determine a parameter.
     """
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
@@ -187,7 +192,7 @@ def fit_sheet_model(
     information = solved.jac.T @ solved.jac
     if np.linalg.cond(information) > 1e14:
         raise SheetModelFitError(
-            "the rows do not determine all parameters; add other stretches and depths"
+            "the rows do not determine all parameters; add rows with other stretches and depths"
         )
     deviations = np.sqrt(np.diag(np.linalg.inv(information)) * spread)
     law = build_model(solved.x)
@@ -225,7 +230,7 @@ def fit_sheet_model(
 def _predict(
     law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
 ) -> tuple[Floats, Floats]:
-    """Compute forces and edge forces (n,), N, with one call for pushes that differ in depth."""
+    """Compute contact forces and edge forces (n,), N; pushes that differ in depth share a call."""
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -248,9 +253,9 @@ def _residuals(
     *,
     fold: bool = False,
 ) -> Floats:
-    """Return weighted residuals of the used rows: forces, then edge forces.
+    """Return the weighted residuals of the used rows: contact forces, then edge forces.
 
-    fold: return the larger of both magnitudes for every row (n,) instead.
+    fold: return instead the larger magnitude of both residuals for every row (n,).
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
@@ -268,7 +273,7 @@ def _residuals(
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return measured over fitted force, minus one (n,)."""
+    """Return measured force divided by fitted force, minus one (n,)."""
     forces, _ = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0
@@ -278,11 +283,11 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
 def tabulate_pushes(
     law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
 ) -> TabulatedSheetModel:
-    """Tabulate the used rows relative to the model.
+    """Tabulate the measured corrections of the model, from the used rows.
 
-    Every combination of stretch, x and y must occur, with points given by their distance from the
-    centre. Depths may differ; they are interpolated to the range common to all combinations. Raises
-    SheetModelFitError for an incomplete grid.
+    Every combination of stretch, x and y must occur; points are identified by their distance from
+    the sheet's centre. Depths may differ; they are interpolated to the range that all combinations
+    have. Raises SheetModelFitError for an incomplete grid.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0

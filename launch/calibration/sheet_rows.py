@@ -1,4 +1,4 @@
-"""Read measured pushes of a sheet from a CSV file, or simulate them."""
+"""Read measured pushes of a finger into a sheet from a CSV file, or simulate them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""Maximum number of problems that are listed; the others are counted."""
+"""Maximum number of problems that are listed; further ones are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""Maximum plausible length over the sheet's width; a larger one is probably in another unit."""
+"""Maximum plausible length divided by the sheet's width; a larger one has probably another unit."""
 
 
 def read_rows(
     path: Path, sheet: SheetSpec, finger_radius_m: float
 ) -> tuple[list[MeasuredPush], list[int]]:
-    """Read pushes and their line numbers.
+    """Read measured pushes from a file, and return them with their line numbers.
 
-    The first line contains the columns: `depth_mm`, `force_n`, `edge_distance_mm` or
-    `stretch_ratio` (over the scene's width). Optional: `x_mm`, `y_mm` (from the sheet's centre),
-    `edge_force_n`, `finger_radius_mm`, `unloading` (1 if the finger was deeper before, else 0).
-    Empty lines and lines that start with # are skipped. Raises BadInputError with file, line and
-    column.
+    The first line contains the names of the columns: `depth_mm`, `force_n`, and `edge_distance_mm`
+    or `stretch_ratio` (edge distance divided by the scene's sheet width). Optional columns: `x_mm`,
+    `y_mm` (from the sheet's centre), `edge_force_n`, `finger_radius_mm`, `unloading` (1 if the
+    finger was deeper before, else 0). Empty lines and lines that start with # are skipped. Raises
+    BadInputError with file, line and column.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -115,7 +115,7 @@ def _check_header(where: str, names: list[str]) -> None:
 def _parse_row(
     where: str, names: list[str], cells: list[str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """Return the values of a row by column; append its faults to `problems`."""
+    """Return the values of a row by column; append errors in the row to `problems`."""
     if len(cells) != len(names):
         problems.append(
             Problem(
@@ -190,7 +190,7 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
 SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""Points as fractions of the width (x) and height (y), from the centre."""
+"""Pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
 
 
 def simulate_rows(
@@ -203,7 +203,7 @@ def simulate_rows(
 ) -> list[MeasuredPush]:
     """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
 
-    places: push at points over the whole sheet, not only at its centre.
+    places: whether to push at points all over the sheet, not only at its centre.
     """
     rng = np.random.default_rng(seed)
     pushes: list[MeasuredPush] = []

@@ -1,4 +1,7 @@
-"""Simulate pushes of the sheet with the simulator's membrane, for calibration and reference."""
+"""Simulate pushes of a finger into the sheet with the simulator's membrane model.
+
+Calibrations and reference computations use the results.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,10 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
-"""Residual tension of slack rubber, in shear moduli, for a sheet that is taut.
+"""Residual tension of slack rubber, in shear moduli, for a sheet that is almost taut.
 
-The graph uses a hundred times as much, since there the sheet may hang. For a sheet that is barely
-slack, that would triple the force of a small push.
+The simulator of a running graph uses a hundred times as much, because its sheet may hang. In a
+sheet that is barely slack, that tension would triple the force of a small push.
 """
 
 
@@ -34,7 +37,7 @@ def simulate_push(
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Return the normal force of a push and the mean force on a clamp, N.
+    """Return the normal force of a push and the mean force on a clamped edge, N.
 
     point_m: pushed point on the sheet (x, y from its centre).
     """
@@ -59,7 +62,7 @@ def simulate_force(
     point_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """Return the normal force of `simulate_push`, N."""
+    """Return only the normal force of `simulate_push`, N."""
     return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
 
@@ -77,7 +80,7 @@ def solve_sheet(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """Solve the simulated sheet between two edges (4, 4), under a fingertip (3,) or none."""
+    """Solve the simulated sheet between two edges (4, 4), under a fingertip (3,) or without one."""
     return solve(
         true_rubber(scene.sheet, None),
         world_from_left_edge,
@@ -95,7 +98,7 @@ def make_error_function(
 ) -> Callable[[Image, Image], Floats]:
     """Make a function that computes image errors from projector images of both coordinate ramps.
 
-    It returns the errors (n,), m, at all points of the simulated sheet that are visible to the eye.
+    It returns the errors (n,), m, at all points of the simulated sheet that the eye can see.
     """
     sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

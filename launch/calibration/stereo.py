@@ -1,7 +1,7 @@
-"""Calibrate a stereo rig from images of a board.
+"""Calibrate a stereo camera (rig) from images of a board.
 
-The lens model is a pinhole with k1, k2, p1, p2. k3 is fixed to 0, since boards that do not fill the
-image cannot separate it from k2.
+The lens model is a pinhole with distortion k1, k2, p1, p2. The coefficient k3 is fixed to 0,
+because boards that do not fill the image cannot separate it from k2.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ MAX_DEPTH_ERROR_FRACTION = 0.05
 class CalibrationResult:
     """Calibration with its fit and board pairs, for a report.
 
-    pairs: the used ones, by their number among all pairs.
+    pairs: pairs that were used, by their index among all pairs.
     """
 
     calibration: StereoCalibration
@@ -75,14 +75,15 @@ def calibrate_stereo(
     working_distance_m: float | None = None,
     progress: Progress = ignore_progress,
 ) -> CalibrationResult:
-    """Calibrate a rig from pairs of images of a board.
+    """Calibrate a stereo rig from pairs of images of a board.
 
     Excludes pairs without the board, repeated pairs, and pairs that contradict the others
     (`compute_misfits`). Then excludes corners with residuals above six standard deviations, and
-    pairs with residuals above three times the median and half a pixel.  The result contains the
+    pairs whose residual exceeds half a pixel and three times the median.  The result contains the
     reasons.
 
-    working_distance_m: distance for the uncertainty; None: median distance of the boards.
+    working_distance_m: distance to which the uncertainty applies; None: median distance of the
+    boards.
 
     Raises CalibrationError for unusable images, fewer than MIN_PAIRS remaining pairs, or an
     undetermined rig.
@@ -148,9 +149,10 @@ def compute_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """Return the rig's covariance and the resulting uncertainty of a fingertip at `distance_m`.
+    """Compute the rig's covariance and the resulting uncertainty of a fingertip at `distance_m`.
 
-    If jackknife refits scatter more than the covariance predicts, it is scaled up to their scatter.
+    If jackknife refits scatter more than the covariance predicts, the covariance is scaled up to
+    match.
     """
     if distance_m is None:
         middles = [pose_transform(pose) @ [*points.mean(axis=0), 1.0] for pose in fit.poses]

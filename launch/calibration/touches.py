@@ -1,4 +1,4 @@
-"""Read touches for `flexsheet calibrate marker` from a CSV file, or simulate them."""
+"""Read touches of known points from a CSV file (`flexsheet calibrate marker`), or simulate them."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ COLUMNS = (*REQUIRED, *NORMAL)
 MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
-"""Maximum plausible coordinate; a larger one is probably in another unit."""
+"""Maximum plausible coordinate; a larger number is probably in another unit."""
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
-    """Read touches; docs/set-up-marker.md lists the columns.
+    """Read touches from a file; docs/set-up-marker.md lists the columns.
 
     Raises BadInputError with file, line, column, value and remedy.
     """
@@ -94,7 +94,7 @@ def _check_header(where: str, names: list[str]) -> None:
 def _parse_row(
     where: str, names: list[str], cells: list[str], problems: list[Problem]
 ) -> dict[str, float]:
-    """Return the values of a row by column; append its errors to `problems`."""
+    """Return the values of a row by column; append errors in the row to `problems`."""
     if len(cells) != len(names):
         what = f"expected {len(names)} values, found {len(cells)}"
         problems.append(Problem(where, (), what, "give one value per column"))
@@ -113,7 +113,7 @@ def _parse_row(
             what = f'expected a finite number, found "{text}"'
             problems.append(Problem(where, (name,), what, "measure this touch again, or remove it"))
         elif abs(value) > limit:
-            what = f"expected at most {limit:g} in size, found {text}"
+            what = f"expected a magnitude of at most {limit:g}, found {text}"
             problems.append(Problem(where, (name,), what, "check the unit"))
         values[name] = value
     given = [name for name in NORMAL if name in values]
@@ -142,7 +142,7 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (12, -18), (12, 18))  # fmt: skip
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
 SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
-"""Standard deviations of the simulated pad from the point, and of the finger's angles."""
+"""Standard deviations of the simulated pad's position and of the finger's angles."""
 
 
 def simulate_touches(
@@ -152,11 +152,11 @@ def simulate_touches(
     calibration: StereoCalibration | None,
     seed: int,
 ) -> list[Touch]:
-    """Simulate touches of a known point, seen by the simulated stereo camera.
+    """Simulate touches of a known point, as the simulated stereo camera sees them.
 
-    Each orientation of `SIMULATED_TILTS_DEG` is touched once. The positions are those of the
-    triangulator's detector; a touch whose marker it does not accept is left out. calibration: the
-    detector's optics; None: the scene's.
+    Each orientation of `SIMULATED_TILTS_DEG` is used once. The marker positions are those that the
+    triangulator's detector finds; a touch whose marker it does not accept is left out. calibration:
+    optics that the detector uses; None: the scene's optics.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
@@ -183,7 +183,7 @@ def simulate_touches(
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
 ) -> Floats | None:
-    """Return the marker's position (3,) with the pad at a point; None if it is not accepted."""
+    """Return the detected marker position (3,) for a pad position; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
     given = TriangulatorParameters()
     reason, measured = detect(

@@ -1,7 +1,8 @@
-"""Compute the error of a measured fingertip caused by the uncertainty of the rig.
+"""Compute the error of a measured fingertip that results from the uncertainty of the stereo rig.
 
-The error follows to first order from the covariance of the rig's parameters. A delete-a-group
-jackknife also covers common corner errors, a warped board and deviations from the lens model.
+To first order, the error follows from the covariance of the rig's parameters. A delete-a-group
+jackknife (refits without some pairs) also covers errors that corners have in common, a warped board
+and deviations from the lens model.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from flexsheet.nodes.models import rigid
 Floats = NDArray[np.float64]
 
 GROUPS = 20
-"""Maximum number of jackknife refits; with more pairs, several are left out at a time."""
+"""Maximum number of jackknife refits; if there are more pairs, each refit leaves out several."""
 
 
 def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) -> Floats:
     """Sample points (n, 3), m, at depth `distance_m` in the left camera's frame.
 
-    They are a grid of 5 x 5 over the middle half of the left image's width and height, without
-    points outside the right image.
+    The points are a grid of 5 x 5 over the central half of the left image's width and height.
+    Points outside the right image are omitted.
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
@@ -52,10 +53,11 @@ def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) 
 
 
 def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
-    """Return the Jacobian (n, 3, 22) of triangulated positions (n, 3) by the rig's parameters.
+    """Return the derivatives (n, 3, 22) of triangulated positions (n, 3) by the rig's parameters.
 
-    For fixed pixels p = f(x, rig), the point of least squared image error obeys A dx + B drig = 0
-    in the least-squares sense, with A = df/dx and B = df/drig. So dx/drig = -(A'A)^-1 A'B.
+    For fixed pixels p = f(x, rig), the position x with the least squared image error changes so
+    that A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig. Therefore
+    dx/drig = -(A'A)^-1 A'B.
     """
     count = len(points)
     by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
@@ -75,9 +77,10 @@ def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
 
 
 def compute_position_std(slopes: Floats, covariance: Floats) -> tuple[float, float]:
-    """Return standard deviations (depth, lateral), m, root mean square over the points.
+    """Return the standard deviations (depth, lateral), m, as root mean square over the points.
 
-    slopes: (n, 3, 22). covariance: of the rig (22, 22). Lateral combines x and y.
+    slopes: derivatives (n, 3, 22) of the positions. covariance: covariance matrix (22, 22) of the
+    rig. Lateral combines x and y.
     """
     variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)
     return float(np.sqrt(variances[2])), float(np.sqrt(variances[0] + variances[1]))
@@ -91,8 +94,8 @@ def compute_jackknife_covariance(
 ) -> Floats:
     """Return the covariance (22, 22) of the rig from refits that each leave out some pairs.
 
-    Delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5): (G -
-    1)/G times the scatter of the G refits about their mean.
+    This is the delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section
+    5.5): (G - 1)/G times the scatter of the G refits about their mean.
     """
     groups = min(GROUPS, len(pairs))
     rigs = []
@@ -106,5 +109,5 @@ def compute_jackknife_covariance(
 
 
 def compute_right_from_left(rig: Floats) -> Floats:
-    """Return the transform (4, 4) between the cameras of a rig (22,)."""
+    """Return the transform (4, 4) from the left to the right camera of a rig (22,)."""
     return rigid.transform(pose_transform(rig[STAND])[:3, :3], rig[STAND][3:])

@@ -1,1 +1,1 @@
-"""Check the installation, a scene's layout and the hosts of a graph."""
+"""Check the installation, the layout of a scene and the hosts of a graph."""

@@ -1,4 +1,7 @@
-"""Compute how well a scene's sheet can render its object's force over depth."""
+"""Compute how well the sheet of a scene can render its object's force at each push depth.
+
+The planner does so by moving the sheet along its normal, so that the finger feels the force.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +33,14 @@ Floats = NDArray[np.float64]
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Reported depths, as fractions of the maximum push depth."""
+"""Push depths in the report, as fractions of the maximum push depth."""
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """Return the object's force curve (n, 2), m and N, on the side that faces the user.
+    """Return the object's force over depth (n, 2), m and N, on the side that faces the user.
 
-    The cached nonlinear table of the object is used if it exists, else the linear method, which is
-    computed if necessary. cache_dir: None for the user's.
+    The cached nonlinear table of the object is used if it exists. Otherwise the linear method is
+    used, and computed if necessary. cache_dir: None for the user's cache folder.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -59,9 +62,10 @@ def compute_compliance(
     max_depth_m: float | None = None,
     bounds: OffsetBounds | None = None,
 ) -> Compliance:
-    """Compute the compliance that the planner renders.
+    """Compute the sheet offsets by which the planner renders the object's force.
 
-    max_depth_m: maximum push depth; None for that of the scene. bounds: of the loop with the hand.
+    max_depth_m: maximum push depth; None for the scene's. bounds: limits that keep the loop of
+    sheet and hand stable.
     """
     return fit_compliance(
         curve,
@@ -84,7 +88,7 @@ def compliance_result(
 ) -> dict[str, Any]:
     """Return the result of `flexsheet doctor compliance --json`.
 
-    delay_s: from a measured depth until the sheet has moved by it.
+    delay_s: time from a measured depth until the sheet has moved accordingly.
     """
     table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))

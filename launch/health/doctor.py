@@ -1,4 +1,4 @@
-"""Check the computer that runs flexsheet; each finding has a remedy."""
+"""Check the computer that runs flexsheet; each problem that is found has a remedy."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_coun
 MIN_FREE_DISK_BYTES = 2 << 30
 MIN_CORES = 2
 PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
-"""Duration of the check of the load; period and processor time of an arm's bridge."""
+"""Duration of the check of the load; cycle period and processor time per cycle of an arm bridge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check; `remedy` is empty if the check passed."""
+    """Result of one check; `what` is the finding, `remedy` is empty if the check passed."""
 
     check: str
     state: Literal["ok", "warning", "failed"]
@@ -60,7 +60,7 @@ def check_all() -> Iterator[Finding]:
 
 
 def check_load() -> Finding:
-    """Check that a process with the load of an arm bridge gets a processor in time.
+    """Check whether a process with the load of an arm bridge gets a processor in time.
 
     This process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures its waiting time.
     """
@@ -86,12 +86,12 @@ def check_load() -> Finding:
 
 
 def check_python() -> Finding:
-    """Report the Python version; one that is too old cannot import this module."""
+    """Report the Python version; with a version that is too old, this module cannot be imported."""
     return Finding("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
 
 
 def check_libraries() -> Finding:
-    """Check that every requirement of the distribution is installed."""
+    """Check that all libraries that flexsheet requires are installed."""
     try:
         requirements = requires("flexsheet") or []
     except PackageNotFoundError:
@@ -146,12 +146,14 @@ def check_disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
     if free < MIN_FREE_DISK_BYTES:
-        return Finding("disk", "warning", text, "free some space: bags with images need 37 MB/s")
+        return Finding(
+            "disk", "warning", text, "free some disk space: recording images needs 37 MB/s"
+        )
     return Finding("disk", "ok", text)
 
 
 def check_clock() -> Finding:
-    """Check the source and resolution of the clock that stamps all messages."""
+    """Check the source and resolution of the clock from which all messages get their timestamps."""
     try:
         source = (CLOCK_SOURCES / "current_clocksource").read_text().strip()
     except OSError:
@@ -169,7 +171,7 @@ def check_clock() -> Finding:
 
 
 def check_sockets() -> Finding:
-    """Check that the folder of runs can be used."""
+    """Check that the folder for the files of running graphs (runs) can be used."""
     directory = root()
     if not directory.exists():
         return Finding("sockets", "ok", f"{directory} will be created")
@@ -185,14 +187,14 @@ def check_sockets() -> Finding:
 
 
 def check_leftovers() -> Finding:
-    """Find processes that launchers left behind."""
+    """Find node processes that are left over from ended launchers."""
     found = find_orphans()
     if found:
         pids = ", ".join(str(process.pid) for process in found)
         return Finding(
             "leftovers",
             "warning",
-            f"{len(found)} processes of ended launchers: {pids}",
+            f"{len(found)} processes are left over from ended launchers: {pids}",
             "flexsheet doctor --sweep",
         )
     return Finding("leftovers", "ok", "none")

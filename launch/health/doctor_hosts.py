@@ -1,6 +1,7 @@
-"""Evaluate host probes: return one finding for each host and check, with a remedy.
+"""Evaluate the probes of hosts: return one finding for each host and check, with a remedy.
 
-The findings come from the probes (`launch.health.probe`) and from checks of this computer.
+A probe (`launch.health.probe`) asks a host for its state. Further findings come from checks of this
+computer.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from flexsheet.nodes.arm_bridge.link_drivers import Driver
 
 State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
-"""Relative tolerance of rates, which are measured over one second."""
+"""Relative tolerance of message rates, which are measured over one second."""
 
 MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
@@ -51,7 +52,7 @@ MAX_NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """Result of one check of one host; `remedy` is empty if the check passed."""
+    """Result of one check of one host; `what`: the finding; `remedy`: empty if the check passed."""
 
     host: str
     check: str
@@ -78,7 +79,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""Finding and remedy when the host cannot be reached."""
+"""Finding and remedy if the host cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -90,12 +91,12 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.HANDSHAKE_TIMEOUT: (
         "launcher",
         "accepts connections, but does not complete the handshake",
-        "its launcher hangs or another program uses its ports; on {host}: flexsheet doctor",
+        "the launcher hangs, or another program uses its ports; on {host}: flexsheet doctor",
     ),
     Reachability.NO_RESPONSE: (
         "launcher",
         "the keys match, but no valid message arrived",
-        "its launcher hangs or has another version; see the refused messages",
+        "the launcher hangs or runs another version; see the refused messages",
     ),
     Reachability.KEY_MISMATCH: (
         "keys",
@@ -104,30 +105,30 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.KEY_REJECTED: (
         "keys",
-        "it rejects the key of {here}: its launch file has no key or another key for {here}",
+        "the host rejects the key of {here}: its launch file has no key or another key for {here}",
         "copy {file} from here to {host}; its launcher reloads it automatically",
     ),
     Reachability.UNENCRYPTED: (
         "keys",
-        "it does not encrypt, or another program uses its ports",
+        "the host does not encrypt, or another program uses its ports",
         "copy {file} from here to {host} and restart the launcher there",
     ),
     Reachability.OWN_KEY_INVALID: (
         "keys",
-        "it accepts connections, but the key of {here} cannot be used",
+        "the host accepts connections, but the key of {here} cannot be used",
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""Check, finding and remedy when the host is on, but its launcher does not report."""
+"""Check, finding and remedy if the host is on, but its launcher does not report."""
 
 SELF_CHECK = "self-check"
-"""Name of the check of the nodes' residuals."""
+"""Name of the check of what the host's nodes report about their own assumptions."""
 
 
 def evaluate_probes(
     plan: ResolvedGraph, here: str, probes: Mapping[str, HostProbe]
 ) -> list[HostFinding]:
-    """Return the findings of all probes, host by host."""
+    """Return the findings of all probes, sorted by host."""
     found: list[HostFinding] = []
     own = probes[here].status
     reference = (
@@ -136,7 +137,7 @@ def evaluate_probes(
     running = any(probe.status is not None for probe in probes.values())
     for host, probe in probes.items():
         if probe.status is not None:
-            # Overload comes first, because it causes most other faults.
+            # Report overload first, because it causes most other faults.
             found.append(_check_load(probe.status))
         found += _check_reachability(plan, here, probe, running=running)
         if probe.status is None:
@@ -164,7 +165,7 @@ REQUIRED_FOR_CHECKS = {
 
 
 def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:
-    """Report the causes that the self-checks of a host's nodes suspect, and what is not checked."""
+    """Report the causes that the nodes' self-checks suspect, and the checks that are off."""
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
@@ -228,8 +229,8 @@ def _check_reachability(
         yield HostFinding(host, check, state, what.format(**fields), remedy.format(**fields))
         yield HostFinding(host, "all else", "not asked", "its launcher does not report")
     for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
-        # The first handshake of this probe succeeded, so the keys are right.
-        remedy = "the host is very busy or the network slow; run this again"
+        # The first handshake of this probe succeeded, so the keys are correct.
+        remedy = "the host is very busy or the network is slow; run this check again"
         yield HostFinding(host, "keys", "warning", text, remedy)
     for text in probe.refused[:MAX_NAMES_SHOWN]:
         yield HostFinding(
@@ -314,11 +315,15 @@ def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFi
 def _check_clocks(
     plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
 ) -> HostFinding:
-    """Compare the measured offsets of the other hosts' clocks with the limit of the graph."""
+    """Compare the measured clock offsets to the other hosts with the limit of the graph."""
     remedy = "check chrony and the load of the network: docs/clocks.md"
     if probe.clocks is None:
         return HostFinding(
-            probe.host, "clocks", "failed", "its clock node does not publish", "see its log"
+            probe.host,
+            "clocks",
+            "failed",
+            "its clock node does not publish",
+            "see the log of the clock node",
         )
     limit_s = probe.clocks.max_offset_uncertainty_s
     known = {one.clock_id: one for one in probe.clocks.offsets}
@@ -391,7 +396,7 @@ def _check_rates(probe: HostProbe) -> HostFinding:
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
-    """Return why a port's rate is outside the range of its topic; None if it is inside."""
+    """Return why a port's message rate is outside the range of its topic; None if it is inside."""
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
@@ -414,7 +419,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
     ),
 }
-"""Check and remedy by role, for nodes that must publish."""
+"""Name of the check and remedy for nodes that must publish, by role."""
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
@@ -428,7 +433,7 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
             "devices",
             "failed",
             f"missing: {', '.join(missing)}",
-            "check its cable and its number: v4l2-ctl --list-devices",
+            "check the cable and the device number: v4l2-ctl --list-devices",
         )
     elif devices:
         yield HostFinding(host, "devices", "ok", ", ".join(devices))
@@ -438,7 +443,9 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
         check, remedy = OUTPUT_CHECKS[node.role]
         status = probe.nodes.get(node.name)
         if status is None:
-            yield HostFinding(host, check, "failed", f"{node.name} does not report", "see its log")
+            yield HostFinding(
+                host, check, "failed", f"{node.name} does not report", "see the node's log"
+            )
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
         what = f"{sent:.0f} Hz; {status.note or 'no note'}"
@@ -474,16 +481,16 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
 
 
 def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
-    """Distinguish a bridge that waits for its arm from one that does not report."""
+    """Distinguish a bridge that waits for its arm from a bridge that does not report."""
     status = probe.nodes.get(node.name)
     if status is None:
         return HostFinding(
-            probe.host, check, "failed", f"{node.name} does not report", "see its log"
+            probe.host, check, "failed", f"{node.name} does not report", "see the node's log"
         )
     assert probe.status is not None
     starts = any(one.state == "starting" for one in probe.status.nodes)
     where = "" if node.device_address is None else f" at {node.device_address}"
-    remedy = f"check that the controller{where} is on and its program runs; see its log"
+    remedy = f"check that the controller{where} is on and its program runs; see the node's log"
     return HostFinding(probe.host, check, "warning" if starts else "failed", status.note, remedy)
 
 
@@ -524,7 +531,7 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used for a host; None if it can."""
+    """Return why the key of this computer cannot be used to probe hosts; None if it can."""
     if not plan.keys:
         return None
     file = secret_file(here)
@@ -543,7 +550,7 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
 def check_before_start(
     plan: ResolvedGraph, here: str, key_problem: str | None
 ) -> Iterator[HostFinding]:
-    """Check this computer as a host of the graph before the graph is started."""
+    """Check this computer, as a host of the graph, before the graph is started."""
     address, nodes = plan.hosts[here], plan.nodes_on(here)
     if is_loopback(address) or address in list_own_addresses():
         yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
@@ -552,7 +559,7 @@ def check_before_start(
             here,
             "address",
             "failed",
-            f"{address} is not one of this computer's: {', '.join(sorted(list_own_addresses()))}",
+            f"{address} is not this computer's; it has {', '.join(sorted(list_own_addresses()))}",
             "name the right host with --host, or correct the launch file on all hosts",
         )
     if key_problem is not None:
@@ -562,7 +569,9 @@ def check_before_start(
         what = f"{secret_file(here)} matches the launch file; only its owner can read it"
         yield HostFinding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
-        remedy = "flexsheet keys new on each host, flexsheet keys install for each: docs/deploy.md"
+        remedy = (
+            "flexsheet keys new on each host, then flexsheet keys install for each: docs/deploy.md"
+        )
         yield HostFinding(here, "keys", "failed", "the launch file has no keys", remedy)
     libraries = check_libraries()
     yield HostFinding(
@@ -576,7 +585,7 @@ def check_before_start(
     devices = list_device_files(nodes)
     missing = [one for one in devices if not os.path.exists(one)]
     if missing:
-        remedy = "check its cable and its number: v4l2-ctl --list-devices"
+        remedy = "check the cable and the device number: v4l2-ctl --list-devices"
         what = f"missing: {', '.join(missing)}"
         yield HostFinding(here, "devices", "failed", what, remedy)
     elif devices:

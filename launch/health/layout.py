@@ -1,8 +1,9 @@
 """Check whether two arms reach a scene's whole working range, and suggest remedies.
 
-The range is sampled over contact points, sheet poses, push depths, stretches and motions. The sheet
-poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach of an arm follows
-the bridge's rules (`flexsheet.nodes.arm_bridge.reach`).
+The range is sampled over contact points on the object, sheet poses, push depths, stretches and
+motions. "Rolling" tilts the sheet over the object without slip, so that the contact also moves on
+the sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`), the reach
+of an arm those of its bridge (`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
@@ -49,29 +50,30 @@ TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
-"""Contacts whose differences are below both limits count as one."""
+"""Two contacts are duplicates if the differences of positions and of normals are below these."""
 
 ROLL_STARTS = 24
 """Number of contacts from which the sheet is rolled to find other contacts on the sheet."""
 
 CLAMP_MARGIN_M = 0.03
-"""Minimum distance of a finger from a clamped edge."""
+"""Minimum distance between the finger and a clamped edge of the sheet."""
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""Offsets along each axis at which a base is tried."""
+"""Offsets along each world axis at which a base position is tried as a remedy."""
 
 REACHED_COLOR = "#dcefdc"
 
 THINNED_COUNT = 600
-"""Number of samples that decide whether a base position gets a complete check."""
+"""Number of samples that are checked first; only a base that reaches them gets a complete check."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSample:
-    """A contact of the finger and a pose of the sheet there, without push.
+    """Contact of the finger with the object, and a pose of the sheet there without push.
 
-    tilt_rad: angle of the normal away from the user, positive upwards. world_from_sheet: (4, 4).
-    twists_world: (k, 6), motions of the sheet when the finger strokes at the scene's working speed.
+    tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
+    world_from_sheet: (4, 4). twists_world: velocities (k, 6) of the sheet when the finger strokes
+    at the scene's working speed.
     """
 
     tilt_rad: float
@@ -82,7 +84,7 @@ class ContactSample:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
-    """Sheet poses that the arms must reach, with tilt (n,), depth (n,) and contact (n, 3)."""
+    """Sheet poses that the arms must reach, with tilt (n,), push depth (n,) and contact (n, 3)."""
 
     poses: SheetPoses
     tilt_rad: Floats
@@ -92,7 +94,7 @@ class LayoutSamples:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRemedy:
-    """A change that makes the whole range reachable, as text and values."""
+    """Change that makes the whole range reachable, as text and as values."""
 
     what: str
     values: dict[str, Any]
@@ -100,7 +102,7 @@ class LayoutRemedy:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Result of the check: the reach of each arm, blocked paths between samples, remedies."""
+    """Result of the check: the reach of each arm, blocked paths between samples, and remedies."""
 
     scene: Scene
     samples: LayoutSamples
@@ -124,7 +126,7 @@ class Layout:
     def speed_m_per_s(self, fraction: float) -> float:
         """Return the finger speed that the arms can follow at a fraction of the reached samples.
 
-        fraction: 0 to 1. Return 0 if no sample is reached.
+        fraction: 0 to 1. The result is 0 if no sample is reached.
         """
         if not self.reached.any():
             return 0.0
@@ -132,9 +134,9 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speeds (n,) that an arm can follow; NaN if out of reach.
+        """Return the maximum finger speeds (n,) that an arm can follow; NaN where unreached.
 
-        All speeds of arm and sheet are proportional to the finger's.
+        The speeds of arm and sheet are proportional to the speed of the finger.
         """
         used = np.max([1.0 - reach.margins[limit] for limit in SPEED_LIMITS], axis=0)
         return np.asarray(self.scene.working_range.speed_m_per_s / used)
@@ -144,11 +146,12 @@ class Layout:
 
 
 def sample_contacts(scene: Scene) -> list[ContactSample]:
-    """Sample the contact points of any shape, and the poses of the sheet there.
+    """Sample contact points on the object, and the poses of the sheet at each of them.
 
-    The object is viewed from all directions within the scene's tilt. At each point the sheet
-    touches with its centre, or as after rolling from another point. For each axis the two rolls
-    with the largest positions on the sheet are used, limited to the sheet's usable size.
+    The object is viewed from all directions within the scene's tilt. At each point, the contact is
+    the centre of the sheet, or the point that results from rolling the sheet there from another
+    contact. For each axis of the sheet, the two rolls that end farthest from its centre are used,
+    limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
     pose = scene.object.world_from_object
@@ -186,7 +189,7 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
 def _find_touchable_points(
     scene: Scene, world_from_object: Floats, closest: Callable[[Floats], Nearest]
 ) -> list[Nearest]:
-    """Return the distinct surface points whose normals are within the scene's tilt."""
+    """Return the distinct surface points whose normals are within the scene's maximum tilt."""
     most = scene.working_range.tilt_rad
     low, high = (np.array(v) for v in (scene.finger.volume_min_m, scene.finger.volume_max_m))
     fractions = np.linspace(0.0, 1.0, 3)
@@ -233,7 +236,7 @@ def _find_touchable_points(
 def _list_contacts(
     waiting: SheetContact, starts: Sequence[SheetContact], found: Nearest, most: Floats
 ) -> Iterator[SheetContact]:
-    """Yield the sheet's central contact at a point, and its contacts after the longest rolls."""
+    """Yield the sheet's contact at its centre for one point, and those after the longest rolls."""
     yield waiting
     rolls = [roll_contact(contact, found) for contact in starts]
     position_sheet_m = np.array([contact.position_sheet_m for contact in rolls])
@@ -245,10 +248,10 @@ def _list_contacts(
 
 
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
-    """Combine every contact with every depth and with the minimum and maximum stretch.
+    """Combine every contact with every push depth and with the minimum and maximum stretch.
 
-    The sheet complies along its normal, by at most the push depth. Pushing at the working speed is
-    one of the motions that the arms must follow.
+    The push moves the sheet along its normal, by at most the push depth. Pushing at the working
+    speed is one of the motions that the arms must follow.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(
@@ -258,7 +261,7 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    # The margin keeps rounding from exceeding the limit.
+    # The margin keeps a rounding error from exceeding the limit.
     largest = max(sheet.min_stretch_ratio, min(sheet.max_stretch_ratio, longest) - 1e-9)
     poses, stretches, twists, tilts, depths, positions = [], [], [], [], [], []
     for contact in contacts:
@@ -283,7 +286,7 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
 
 
 def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Layout:
-    """Check both arms over the scene's working range, and find remedies if one fails."""
+    """Check both arms over the scene's working range, and search for remedies if one arm fails."""
     progress("finding the contacts on the object")
     samples = make_samples(scene, sample_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
@@ -300,7 +303,7 @@ def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Lay
 
 
 def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
-    """Yield the paths from the front to the limits of the range that the arms cannot follow."""
+    """Yield the paths from the front of the object to the limits of the range that are blocked."""
     poses, reached = layout.samples.poses, layout.reached
     if not reached.any():
         return
@@ -333,7 +336,7 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
 
 
 def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
-    """Yield changes that make all samples reachable: bases, tilt or depth."""
+    """Yield changes after which all samples are reachable: base positions, tilt or push depth."""
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
         if not reach.reachable.all():
@@ -368,7 +371,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """Return the scene with one arm's base shifted in the world."""
+    """Return the scene with the base of one arm moved by an offset in the world frame."""
     arms = scene.arms
     arm: ArmSpec = getattr(arms, side)
     base = Pose(
@@ -385,7 +388,7 @@ def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
     reach = layout.left if side == "left" else layout.right
     bad = np.flatnonzero(~reach.reachable)
     good = np.flatnonzero(reach.reachable)
-    # Limits of the flange's pose do not depend on the base.
+    # The limits of the flange's pose do not depend on the position of the base.
     independent_limits = {"workspace", "flange distance", "edge force"}
     if any(LIMITS[number] in independent_limits for number in set(reach.binding[bad].tolist())):
         return None
@@ -439,7 +442,7 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return where a limit applies, and its sample nearest to the front by tilt, then depth."""
+    """Describe where a limit is violated; give its sample nearest to the front."""
     where = np.flatnonzero(binding == number)
     samples = layout.samples
     order = np.lexsort((samples.depth_m[where], np.round(np.abs(samples.tilt_rad[where]), 6)))
@@ -454,7 +457,7 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
 
 
 def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
-    """Return the minimum margin of each kind with its limit, tilt and depth."""
+    """Return the minimum margin of each kind of limit, with its limit, tilt and push depth."""
     kinds = {
         "joint range": (RANGES, "rad"),
         "shoulder singularity": (("shoulder singularity",), "m"),
@@ -483,7 +486,7 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
 
 
 def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw the binding limit and the speed of each arm over tilt and depth."""
+    """Draw the violated limit and the possible speed of each arm over tilt and push depth."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -515,13 +518,16 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index of each sample's limiting limit (n,); -1 within reach."""
+    """Return the index (n,) of the limit that each sample violates most; -1 if it is reached."""
     return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """Cells over tilt and depth. rows, columns: of each sample (n,). frame: plot options."""
+    """Grid of cells over tilt and depth.
+
+    rows, columns: cell indices (n,) of the samples. frame: plot options.
+    """
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
@@ -540,14 +546,14 @@ class _TiltDepthGrid:
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 
     def minimum(self, values: Floats) -> Floats:
-        """Return the minimum value of each cell; NaN for an empty cell."""
+        """Return the minimum of the samples' values in each cell; NaN for an empty cell."""
         cells = np.full((DEPTHS, TILTS), np.inf)
         finite = np.isfinite(values)
         np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return each cell's colour: that of its most frequent limit, paler if it is rare."""
+        """Return each cell's colour: that of its most frequent limit, paler for few samples."""
         from matplotlib.colors import to_rgb
 
         cells = np.ones((DEPTHS, TILTS, 3))

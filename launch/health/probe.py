@@ -1,7 +1,8 @@
-"""Probe every host of a graph over the network, from one of them.
+"""Probe every host of a graph over the network, from one of its hosts.
 
 A running launcher publishes the state of its host on the topics `host`, `status`, `clocks` and
-those of its arms. For other hosts, the probe finds the step at which a connection fails.
+those of its arms. If nothing arrives from another host, the probe finds the step at which the
+connection fails.
 """
 
 from __future__ import annotations
@@ -29,26 +30,26 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
-"""Exceeds the three seconds after which the kernel reports that no host has the address."""
+"""Time limit of a connection; the kernel needs 3 s to report that no host has the address."""
 
 HANDSHAKE_S = 3.0
 MIN_LISTEN_S = 1.2
-"""Nodes publish the rates of their last second once a second."""
+"""Minimum listening time; nodes publish the message rates of the last second once per second."""
 
 POLL_PERIOD_S = 0.02
 SSH_PORT = 22
-"""A reply from this port, open or closed, shows that the host is on."""
+"""Port whose reply, open or closed, shows that a host is on."""
 
 
 class Reachability(StrEnum):
-    """Result of a connection to a host's launcher."""
+    """Outcome of an attempt to connect to a host's launcher."""
 
     RESPONDING = "responding"
     LOCAL = "local"
-    """This computer, on which no graph runs."""
+    """The host is this computer, and no graph runs here."""
     NO_ROUTE = "no_route"
     UNREACHABLE = "unreachable"
-    """No host has the address."""
+    """No host has this address."""
     NO_REPLY = "no_reply"
     BLOCKED = "blocked"
     """The host is on, but a firewall drops packets to the port."""
@@ -75,10 +76,10 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """Messages that one host published, and problems while reading them.
+    """Messages that one host published, and problems while receiving them.
 
-    refused: messages that were not accepted. failed_handshakes: connections without a valid key
-    after an earlier valid one.
+    refused: messages that were not accepted. failed_handshakes: connections whose key became
+    invalid after an earlier connection with a valid key.
     """
 
     host: str
@@ -97,8 +98,8 @@ async def probe_all(
 ) -> dict[str, HostProbe]:
     """Probe all hosts concurrently and return the results by host.
 
-    here: name of this host. keys: its keys; None if there are none or they cannot be used. run: its
-    running graph; None if no graph runs.
+    here: name of this host. keys: its key ring; None if there is none or it cannot be used. run:
+    its running graph; None if no graph runs here.
     """
     probes = await asyncio.gather(
         *(
@@ -145,7 +146,7 @@ async def _probe_remote(
 
 
 async def probe_port(address: str, port: int) -> Reachability:
-    """Return how far a TCP connection to a port gets; RESPONDING if it is accepted."""
+    """Return at which step a TCP connection to a port fails; RESPONDING if it is accepted."""
     number = await _connect(address, port)
     if number == 0:
         return Reachability.RESPONDING
@@ -159,7 +160,7 @@ async def probe_port(address: str, port: int) -> Reachability:
 
 
 async def _connect(address: str, port: int) -> int:
-    """Return the error number of a TCP connection attempt; 0 if it succeeded."""
+    """Return the error number of an attempt to connect by TCP; 0 if it succeeded."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
@@ -167,13 +168,13 @@ async def _connect(address: str, port: int) -> int:
             async with asyncio.timeout(CONNECT_S):
                 await asyncio.get_running_loop().sock_connect(probe, (address, port))
         except OSError as error:
-            # TimeoutError is an OSError without a number.
+            # A TimeoutError is an OSError without an error number.
             return error.errno or errno.ETIMEDOUT
     return 0
 
 
 async def _try_handshake(endpoint: str, host: str, keys: KeyRing | None) -> Reachability:
-    """Return whether both ends prove their keys."""
+    """Try a CURVE handshake, and return whether both ends prove their keys."""
     opened: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     opened.setsockopt(zmq.LINGER, 0)
     monitor = opened.get_monitor_socket(sum(HANDSHAKES))
@@ -202,9 +203,9 @@ async def _listen(
     find_source: Callable[[Writer], Source],
     timeout_s: float,
 ) -> None:
-    """Read what a host publishes until all expected messages arrived, at most `timeout_s`.
+    """Read what a host publishes until all expected messages have arrived, at most for `timeout_s`.
 
-    Without a host status the probe becomes NO_RESPONSE.
+    If no host status arrives, the probe's result becomes NO_RESPONSE.
     """
 
     def on_host(status: HostStatus, header: Header) -> None:
@@ -257,7 +258,7 @@ async def _listen(
 
 
 def _is_complete(plan: ResolvedGraph, probe: HostProbe) -> bool:
-    """Return whether all that the host's nodes publish for the doctor has arrived."""
+    """Return whether all messages that the doctor needs from the host's nodes have arrived."""
     nodes = plan.nodes_on(probe.host)
     return (
         probe.status is not None

@@ -1,7 +1,8 @@
-"""Check the system packages, and install missing ones if possible.
+"""Check for the required system packages, and install missing ones if possible.
 
 `python -m flexsheet.launch.health.system` checks what the nodes need; `--tests` adds what the tests
-need.  Missing packages are installed as root on Debian and its derivatives, otherwise printed.
+need.  Missing packages are installed if the process runs as root on Debian or a derivative.
+Otherwise the command that installs them is printed.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 SYSTEM_PATHS = ("/usr/sbin", "/sbin")
-"""Folders of `ip`, which are not in every user's PATH."""
+"""Folders that contain `ip` and may be missing in a user's PATH."""
 
 APT_OPTIONS = ("-qq", "-o", "DPkg::Lock::Timeout=120", "-o", "Acquire::Retries=2")
 
 
 @dataclass(frozen=True, slots=True)
 class SystemPackages:
-    """Debian packages for one purpose.
+    """Debian packages that are needed for one purpose.
 
-    problem: returns why the packages do not work; None if they do.
+    problem: function that returns why the packages do not work; None if they do.
     """
 
     purpose: str
@@ -42,7 +43,8 @@ class SystemPackages:
 def find_opengl_problem() -> str | None:
     """Return why no headless OpenGL context can be created; None if one can.
 
-    Another process tries it, because a driver that failed once fails again in its process.
+    This is tried in another process, because a driver that has failed once fails again in the same
+    process.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
     result = subprocess.run(
@@ -93,7 +95,7 @@ TABLE = (
         lambda: find_missing_files(programs=["systemd-analyze"]),
     ),
 )
-"""System packages by purpose."""
+"""System packages by their purpose."""
 
 
 def can_install() -> bool:
@@ -130,9 +132,9 @@ def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the system packages, and return 1 if a package for nodes is missing.
+    """Check the system packages; return exit code 1 if a package that nodes need is missing.
 
-    Return 0 with --tests, because the tests report missing packages.
+    With --tests return 0, because the tests themselves report missing packages.
     """
     parser = argparse.ArgumentParser(description="Check the system packages.")
     parser.add_argument("--tests", action="store_true", help="check packages for tests, too")

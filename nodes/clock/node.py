@@ -1,4 +1,4 @@
-"""Measure the offsets of other hosts' clocks by pings between the clock nodes, one per host."""
+"""Measure the offsets of other hosts' clocks by pings between the clock nodes (one per host)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,18 @@ PEER_TIMEOUT_NS = 60_000_000_000
 
 
 class ClockParameters(NodeParameters):
-    """Parameters of the clock node, from the launch file's key "clocks"."""
+    """Parameters of the clock node, from the key "clocks" of the launch file."""
 
-    rate_hz: Positive = Field(default=8.0, description="rate of the pings")
+    rate_hz: Positive = Field(default=8.0, description="rate at which pings are sent, Hz")
     max_offset_uncertainty_s: Positive = Field(
-        default=0.005, description="maximum uncertainty of a clock offset that nodes use"
+        default=0.005,
+        description="maximum uncertainty (s) of a clock offset with which nodes still work",
     )
     max_drift_ratio: float = Field(
-        default=5e-4, gt=0, lt=0.1, description="maximum relative drift between two clocks"
+        default=5e-4,
+        gt=0,
+        lt=0.1,
+        description="maximum relative difference between the rates of two clocks",
     )
 
 

@@ -1,9 +1,9 @@
 """Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping has four stamps: sent (t1, own), received (t2, other), answered (t3, other), received back
-(t4, own).  A message arrives after it was sent.  The other clock minus ours is therefore at most t2
-- t1 at t1, and at least t3 - t4 at t4; the maximum drift bounds its change in between.  No further
-assumption is made about the network's delays.
+A ping has four timestamps: sent (t1, own clock), received (t2, other clock), answered (t3, other
+clock), received back (t4, own clock).  A message arrives after it was sent.  The other clock minus
+ours is therefore at most t2 - t1 at time t1, and at least t3 - t4 at time t4.  The maximum drift
+limits how much it changes in between.  Nothing else is assumed about the delays of the network.
 
 Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting
 intervals.
@@ -22,7 +22,7 @@ FIT_SPAN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Offset from one ping: the other clock minus ours at our `at_ns`, offset_ns +- half_ns."""
+    """Offset from one ping: other clock minus ours at our time `at_ns`; offset_ns +- half_ns."""
 
     at_ns: int
     offset_ns: int
@@ -31,9 +31,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """Estimate of the other clock minus ours at our `at_ns`, with the bounds offset_ns +- half_ns.
+    """Estimated time of the other clock minus ours, with guaranteed bounds.
 
-    drift_ratio: estimated rate of change of the offset.
+    It applies at our time `at_ns`; the bounds are offset_ns +- half_ns. drift_ratio: estimated rate
+    of change of the offset.
     """
 
     at_ns: int
@@ -43,9 +44,9 @@ class OffsetEstimate:
 
 
 def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
-    """Make the sample of a ping from its stamps (see the module's docstring), ns.
+    """Make the sample of a ping from its four timestamps (see the module's docstring), ns.
 
-    Return None for inconsistent stamps.  max_drift_ratio: maximum relative drift of the clocks.
+    Return None for inconsistent timestamps.  max_drift_ratio: maximum relative drift of the clocks.
     """
     round_trip_ns, remote_ns = t4 - t1, t3 - t2
     drift_ns = max_drift_ratio * round_trip_ns
@@ -61,7 +62,7 @@ def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -
 def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
     """Return the bounds of the offset (ns) at `at_ns`, from all samples and the maximum drift.
 
-    The lower bound exceeds the upper one if the samples are inconsistent.
+    If the samples are inconsistent, the lower bound is above the upper one.
     """
     low = max(
         one.offset_ns - one.half_ns - int(max_drift_ratio * abs(at_ns - one.at_ns)) - 1
@@ -75,10 +76,11 @@ def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float)
 
 
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
-    """Fit a line to samples: offset at the newest one, relative to its own (ns), and slope.
+    """Fit a line to the samples to estimate the drift.
 
-    The least squares are weighted by the inverse square of the bounds, which favours pings without
-    queueing.  Offset and slope are 0 if the samples span less than FIT_SPAN_NS.
+    Return the line's value at the newest sample, relative to that sample's offset (ns), and its
+    slope. The least squares are weighted by the inverse square of the bounds, which favours pings
+    that did not wait in a queue.  Both results are 0 if the samples span less than FIT_SPAN_NS.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -97,11 +99,11 @@ def fit_drift(samples: list[Sample]) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class OtherClock:
-    """Samples of one other clock over the last minute: the best of each half second.
+    """Samples of one other clock over the last minute: the most accurate of each half second.
 
     max_drift_ratio: maximum relative drift of the clocks.
-    resets: number of deletions of all samples, after an inconsistent one (for example by a clock
-        step).
+    resets: how often all samples were deleted because a new one was inconsistent with them, for
+      example after a clock was set.
     """
 
     max_drift_ratio: float
@@ -109,7 +111,7 @@ class OtherClock:
     resets: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Add a sample if it is the best of its half second."""
+        """Add a sample if it is the most accurate one of its half second."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return
@@ -127,7 +129,7 @@ class OtherClock:
         samples.append(sample)
 
     def estimate(self, at_ns: int) -> OffsetEstimate | None:
-        """Estimate the offset at our `at_ns`; None before the first sample."""
+        """Estimate the offset at our time `at_ns`; None before the first sample."""
         if not self.samples:
             return None
         low, high = compute_bounds(self.samples, at_ns, max_drift_ratio=self.max_drift_ratio)

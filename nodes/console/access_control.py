@@ -1,8 +1,9 @@
-"""Control access to the page: loopback by default, a token elsewhere, and no foreign web pages.
+"""Control access to the console page: only this computer by default, from elsewhere with a token.
 
-A page of another site in a browser on this computer can connect to its sockets. A loopback address
-alone is therefore no protection: the Host and Origin of every request are checked. No page may show
-the console in a frame, because a frame can hide what the user clicks.
+A web page of another site, opened in a browser on this computer, could connect to the console's
+sockets. Listening on loopback is therefore no protection: the Host and Origin headers of every
+request are checked. No page may show the console in a frame, because a frame can hide what the user
+clicks.
 """
 
 from __future__ import annotations
@@ -35,30 +36,30 @@ MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
 FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
-"""Headers of every response."""
+"""Headers of every response, which forbid other pages to show the console in a frame."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
-"""Values of Sec-Fetch-Dest in requests for a page inside another one."""
+"""Values of the header Sec-Fetch-Dest in requests for a page inside another page."""
 
 SINGLE_HEADERS = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Cookie", "Sec-Fetch-Dest")
-"""Headers that are read; a request with a repeated one is malformed."""
+"""Headers that are read; a request that repeats one of them is malformed."""
 
 MALFORMED = "the console cannot read this HTTP request; open its address in a browser"
 CLOSE_TIMEOUT_S = 1.0
-"""Time for a client to read why its request was refused."""
+"""Time for which a refused connection stays open, so that the client can read the reason."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """A page that cannot be served; the text gives the reason and the remedy."""
+    """Raised if the page cannot be served; the text gives the reason and the remedy."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
 
 
 def read_token(path: Path) -> str:
-    """Read a token file: one line that only its owner can read.
+    """Read the access token from a file: one line that only its owner can read.
 
     Raises ConsoleError.
     """
@@ -77,7 +78,7 @@ def read_token(path: Path) -> str:
 
 
 class AccessControl:
-    """Access control of the requests for the page and its socket.
+    """Decides which HTTP and WebSocket requests to the console page are allowed.
 
     address: IP address of the page. token: required token; None permits every user of this
     computer.
@@ -92,14 +93,14 @@ class AccessControl:
         self._token = token
 
     def refusal(self, request: Request) -> Response | None:
-        """Return the response that refuses a request; None for a permitted request."""
+        """Return the response that refuses a request, or None if the request is allowed."""
         try:
             return self._refusal(request)
         except (ValueError, MultipleValuesError):
             return make_bad_request()
 
     def _refusal(self, request: Request) -> Response | None:
-        """Check a request as `refusal` does.
+        """Check a request for `refusal`.
 
         Raises ValueError or MultipleValuesError for a malformed request.
         """
@@ -121,7 +122,7 @@ class AccessControl:
             return None
         token = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
         if hmac.compare_digest(token.encode(), self._token.encode()):
-            # The cookie keeps the token out of the address line and of bookmarks.
+            # A cookie keeps the token out of the address bar and of bookmarks.
             to_page = {
                 "Location": "/",
                 "Set-Cookie": f"{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/",
@@ -183,9 +184,9 @@ def forbid_framing(response: Response) -> Response:
 
 
 def make_page_logger() -> logging.Logger:
-    """Return the logger of the page server.
+    """Return the page server's logger.
 
-    It logs one line, not a traceback, for bytes that a client sent.
+    For invalid bytes from a client it logs one line instead of a traceback.
     """
     logger = logging.getLogger("flexsheet.console")
     if not logger.filters:
@@ -194,7 +195,7 @@ def make_page_logger() -> logging.Logger:
 
 
 def shorten_traceback(record: logging.LogRecord) -> bool:
-    """Replace a record's traceback by its last line; return True, so that it is logged."""
+    """Replace the traceback of a log record by its last line; return True, so that it is logged."""
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
         record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
@@ -208,7 +209,7 @@ class PageConnection(ServerConnection):
     refused = False
 
     def send_data(self) -> None:
-        """Send the data of the protocol; send a refusal first after a malformed request."""
+        """Send the protocol's data; after a malformed request, send a refusal first."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
@@ -216,11 +217,11 @@ class PageConnection(ServerConnection):
         super().send_data()
 
     async def handshake(self, *arguments: Any, **rest: Any) -> None:
-        """Perform the opening handshake; a malformed one ends the connection."""
+        """Perform the opening handshake; close the connection if the handshake is malformed."""
         try:
             await super().handshake(*arguments, **rest)
         except InvalidHandshake:
-            # A client whose connection is closed at once might not read the answer.
+            # If the connection were closed at once, the client might not read the answer.
             await asyncio.wait([self.connection_lost_waiter], timeout=CLOSE_TIMEOUT_S)
 
 
@@ -228,8 +229,8 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
     """Start a viser server at exactly this address, with access control.
 
     viser uses the next free port if the requested one is in use, and accepts every client. The port
-    is therefore tried first, and the access control runs before viser's own request handler. Raises
-    ConsoleError, also if this version of viser listens in another way.
+    is therefore tried first, and access is checked before viser's own request handler. Raises
+    ConsoleError, also if this version of viser starts its server in another way.
     """
     _check_port_is_free(address, port)
     with _checking(access) as checked_servers:
@@ -248,9 +249,9 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
 
 @contextmanager
 def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
-    """Make new servers of websockets check each request with `access` first.
+    """Make new servers of the websockets library check each request with `access` first.
 
-    Yield the list of the replaced request handlers.
+    Yield the list of the request handlers that were replaced.
     """
     serve = websockets.asyncio.server.serve
     checked_servers: list[PageRequest] = []

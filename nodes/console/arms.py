@@ -1,8 +1,8 @@
-"""Define the drawn arms: boxes per link, and the poses of the links.
+"""Define the arms that the page draws: boxes for each link, and the poses of the links.
 
 The lengths are those of the RV-1A: base to shoulder, upper arm, elbow, forearm, flange. The
-thicknesses are approximate. The origin of a link's frame is on its joint axis. With all joints at
-zero every frame is parallel to the base.
+thicknesses are approximate. The origin of a link's frame is on its joint axis. With all joint
+angles zero, every frame is parallel to the base.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ JOINTS = (
     ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((0.0, 0.0, 0.072), (0.0, 0.0, 1.0)),
 )
-"""Position of each joint in the frame of the link before it (m), and its axis."""
+"""Position of each joint in the frame of the previous link (m), and the joint's axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A box of a link: size and centre (m) in the frame of the link; link 0 is the base."""
+    """Box that is part of a link: size and centre (m) in the link's frame; link 0 is the base."""
 
     link: int
     size_m: tuple[float, float, float]
@@ -51,10 +51,10 @@ PIECES = (
 )
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""Corners of a box, (8, 3): x is bit 4 of the index, y bit 2, z bit 1."""
+"""Corners of a box, (8, 3); in the index, bit 4 is the sign of x, bit 2 of y, bit 1 of z."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""Size of the bar that clamps the sheet: across, along the edge (over its length), through."""
+"""Size of the bar that clamps the sheet: across, along (longer than the edge), thickness."""
 
 
 def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
@@ -69,13 +69,13 @@ def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
 def rounded_box(
     size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Make a box with bevelled edges: vertices (24, 3), counter-clockwise triangles (44, 3).
+    """Make a box with bevelled edges: vertices (24, 3) and counter-clockwise triangles (44, 3).
 
     bevel: fraction of the smallest half side that is cut off.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
-    # Each corner has three vertices, one per face: index 8 * axis + corner.
+    # Each corner has three vertices, one for each face; the index is 8 * axis + corner.
     vertices = np.concatenate(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
@@ -83,7 +83,7 @@ def rounded_box(
 
 
 def _box_triangles() -> NDArray[np.int32]:
-    """Return the vertices (44, 3) of the triangles of corners, edge strips and faces."""
+    """Return the vertex indices (44, 3) of the triangles of corners, edge strips and faces."""
     corner = np.arange(8)
     triangles = [np.stack([corner, 8 + corner, 16 + corner], axis=1)]
     for axis in range(3):
@@ -103,7 +103,7 @@ def _box_triangles() -> NDArray[np.int32]:
 
 
 def _orient_outwards(vertices: Floats, triangles: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the triangles of a convex body about the origin, counter-clockwise from outside."""
+    """Orient the triangles of a convex body about the origin counter-clockwise from outside."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0.0
     triangles[inward] = triangles[inward][:, ::-1]

@@ -1,4 +1,4 @@
-"""Render the banner: the state of the arms, the remedy, and the source of the view."""
+"""Render the banner of the page: the state of the arms, the remedy, and what the view shows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
 class BannerState(IntEnum):
-    """States of the banner, the most urgent last."""
+    """State that the banner shows; if several apply, the last one in this list has priority."""
 
     READY = 0
     WAITING = 1
@@ -29,7 +29,7 @@ GROUNDS = {
     BannerState.FAULT: "bad",
     BannerState.ESTOP: "bad",
 }
-"""Class of the banner's background in page.css."""
+"""CSS class of the banner's background for each state, in page.css."""
 
 FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
 STILL_STOPPED = "the arms are still stopped"
@@ -37,11 +37,11 @@ STILL_STOPPED = "the arms are still stopped"
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """Inputs of the banner.
+    """State of the graph from which the banner is made.
 
-    arms: by side. estop_reason: None without an e-stop. overload: sentence about an overloaded
-    computer, or empty. solver_note: note of the soft body's solver while it has no result for this
-    scene. replay: name of the displayed bag.
+    arms: states of the arms by side. estop_reason: None without an e-stop. overload: sentence about
+    an overloaded computer, or empty. solver_note: note of the soft-body solver while it has no
+    result for this scene. replay: name of the bag that is shown, if any.
     """
 
     scene: str
@@ -54,14 +54,14 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """Return the reason of an engaged e-stop; None without an e-stop."""
+        """Return the reason of the engaged e-stop; None without an e-stop."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason
 
     @property
     def banner(self) -> BannerState:
-        """Return the most urgent current state."""
+        """Return the state with the highest priority of those that apply."""
         if self.stopped is not None:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
@@ -79,7 +79,7 @@ class GraphState:
 
 
 def is_faulty(arm: ArmState) -> bool:
-    """Return whether an arm does not follow because of a fault or a blocked path."""
+    """Return whether an arm does not follow the finger because of a fault or a blocked path."""
     return bool(arm.faults) or arm.mode in FAULTY_MODES or arm.path_blocked
 
 
@@ -114,7 +114,7 @@ def _title(state: GraphState, shown: BannerState) -> str:
             return f"E-STOP is engaged: {state.stopped}"
         case BannerState.FAULT:
             faults = "; ".join(_describe(side, arm) for side, arm in state.arms.items())
-            # The probable cause of the faults comes first.
+            # Name the probable cause of the faults first.
             return f"The computer is busy. {faults}" if state.overload else faults
         case BannerState.BUSY:
             return "The computer is busy"
@@ -133,7 +133,7 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """Return what the user can do; empty if nothing is necessary."""
+    """Return what the user can do; empty if no action is necessary."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
         return f"Release the stop when the arms are at rest; {_after_reset(state)}."
@@ -162,7 +162,7 @@ def _after_reset(state: GraphState) -> str:
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:
-    """Return why arms without a fault do not follow, or the state of the sheet."""
+    """Return why arms without a fault do not follow the finger, or else the state of the sheet."""
     if shown is BannerState.ESTOP:
         return ""
     for side, arm in state.arms.items():

@@ -1,4 +1,8 @@
-"""Carry out the requests of viewers, on the node's own loop."""
+"""Carry out the requests of the console page's viewers, in the console node's asyncio loop.
+
+The "eye view" is an image of what the user sees: a camera in the digital twin traces the projected
+frame from the viewpoint of the user's eye.
+"""
 
 from __future__ import annotations
 
@@ -35,22 +39,22 @@ SETTLE_S = 0.4
 EYE_VIEW_PERIOD_S = 6.0
 PIXELS_EVERY = 3
 MAX_DRAWING_S = 5.0
-"""Time after which the console stops waiting for a frame."""
+"""Time after which the console stops waiting for the renderer to draw a frame."""
 
 CAPTURE_S = 1.0
-"""Time after a frame within which the simulated eye has all its inputs."""
+"""Time after a frame within which the simulated eye receives all its inputs."""
 
 MAX_TRACING_S = 120.0
-"""Time after which the console stops waiting for an image."""
+"""Time after which the console stops waiting for the traced image of the eye view."""
 
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
-"""Number of requested labels whose late images are still shown."""
+"""Number of requests whose images are still shown if they arrive late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sliders:
-    """Values of the page's sliders; a rigid object has no modulus."""
+    """Positions of the page's sliders; `young_modulus_pa` is None for a rigid object."""
 
     young_modulus_pa: float | None
     stretch_ratio: float
@@ -68,7 +72,7 @@ class Sliders:
 
 
 class SceneController:
-    """Controller of the graph's scene: selects it, and changes it by the sliders."""
+    """Controller of the graph's scene, which the viewer selects and changes by sliders."""
 
     def __init__(
         self,
@@ -79,7 +83,8 @@ class SceneController:
     ) -> None:
         """Start with the scene `first`.
 
-        sliders: values of the previous console; None if nobody has moved them.
+        sliders: slider positions saved by the previous console process; None if they were never
+        moved.
         """
         self._publish, self._folder = publish, folder
         self.names = scenes.list_scene_names(folder)
@@ -90,18 +95,18 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another of the run's scenes.  Raises SceneChoiceError."""
+        """Change to another scene of this run's launch file.  Raises SceneChoiceError."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store a slider's value; `apply_sliders` publishes the scene when the sliders rest."""
+        """Store a slider's position; `apply_sliders` publishes the scene when the sliders rest."""
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene if it is due; return whether it was published.
+        """Publish the changed scene once the sliders have rested; return whether it was published.
 
         Raises SceneChoiceError.
         """
@@ -124,7 +129,10 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Make the picker of the current object in a thread, and pass it to the finger."""
+        """Prepare, in a thread, the picking of object points by which the viewer moves the finger.
+
+        failed: called with the cause if the object does not allow it.
+        """
         if self._picker_task is not None:
             self._picker_task.cancel()
         finger.use(None)
@@ -145,7 +153,7 @@ class SceneController:
 
 
 class EyeViewState(Enum):
-    """State of a request for an image of the user's eye."""
+    """State of a request for an eye view."""
 
     RESTING = auto()
     DRAWING = auto()
@@ -153,11 +161,12 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """Requester of images of the user's eye: frames with pixels, which the simulated eye traces.
+    """Requester of eye views: asks for one frame with pixels, which the simulated eye then traces.
 
-    Tracing needs one second of processor time, and longer on a busy computer. Only one image is
-    requested at a time. When the eye has its inputs, the display settings of another writer are
-    restored. Without them, the correction of the scene or of the console is restored.
+    Tracing takes one second of processor time, and longer on a busy computer, so only one image is
+    requested at a time. Once the simulated eye has its inputs, the display settings that another
+    writer had published are restored. If there are none, the image correction of the scene or of
+    the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -174,34 +183,34 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Return the label of the newest request."""
+        """Return the label of the newest request, by which its frame and image are recognized."""
         return f"console {self._number}"
 
     @property
     def correction(self) -> Correction:
-        """Return the correction chosen at the console, or that of the scene."""
+        """Return the image correction that was chosen at the console, or else that of the scene."""
         return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
-        """Return the duration of the current state, s."""
+        """Return the time since the last change of state, s."""
         return now_s - self._since_s
 
     def on_scene(self, scene: Scene) -> None:
-        """Use the correction of a scene.
+        """Take over the image correction that a new scene specifies.
 
         A renderer that has received a display message ignores the correction of later scenes. If
-        that message was the console's, the console publishes the new correction.
+        the console sent that message, it must therefore publish the new correction.
         """
         self._by_scene = scene.methods.correction
         if self._owns_display and not self._borrowed:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display message of another writer, to restore it later."""
+        """Store display settings of another writer, to restore them after an eye view."""
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
-        """Request the next image if it is due, and end a request that takes too long."""
+        """Request the next eye view if it is due, and give up a request that takes too long."""
         waited_s = self.waited_s(now_s)
         match self.state:
             case EyeViewState.RESTING:
@@ -232,16 +241,16 @@ class EyeViewRequester:
         )
 
     def request_now(self) -> None:
-        """Request the next image without waiting for the period."""
+        """Request the next eye view without waiting for the end of the period."""
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Process the first frame with the requested pixels, which the eye traces."""
+        """Process the first frame with the requested pixels, which the simulated eye traces."""
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Process an image; return whether this console requested it, however late it is."""
+        """Process a traced image; return whether this console requested it, even if it is late."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -262,7 +271,7 @@ class EyeViewRequester:
 
 
 class Replay:
-    """Display of a bag instead of the running graph; none of its messages is published."""
+    """Replay of a bag on the page, instead of the running graph; nothing is published."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -275,27 +284,27 @@ class Replay:
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Show a bag of the folder from its start.  Raises BagError."""
+        """Open a bag of the folder and show its start.  Raises BagError."""
         self.timeline = Timeline(self._folder / name)
         self.playing = True
 
     def leave(self) -> None:
-        """Return to the running graph."""
+        """Close the bag and show the running graph again."""
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Go to a position of the bag (s), clipped to its duration."""
+        """Jump to a time in the bag (s from its start), clipped to its duration."""
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
     def play_or_pause(self) -> None:
-        """Pause, or play from the current position; at the end, play from the start."""
+        """Pause, or continue from the current position; from the end, start again."""
         if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
             self.seek(0.0)
         self.playing = not self.playing
 
     def advance(self, duration_s: float) -> None:
-        """Play for this time (s); stop at the end."""
+        """Advance the replay by this duration (s); stop at the end of the bag."""
         if self.timeline is None or not self.playing:
             return
         self.seek(self.timeline.seconds + self.rate * duration_s)
@@ -305,7 +314,7 @@ class Replay:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleFiles:
-    """Files of a console: the run's plan and scenes, the bags, and its state."""
+    """Paths that a console uses: the run's plan and scenes, the bags, and the saved state."""
 
     plan: Path
     scenes: Path
@@ -314,7 +323,7 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """This console's host may not reset an e-stop; the text names the hosts that may."""
+    """Raised if this console's host may not reset an e-stop; the text names the hosts that may."""
 
     code = "release"
     remedy = (
@@ -324,10 +333,10 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """Combination of the controllers, which also publishes e-stops, recordings and bookmarks.
+    """Main controller of the console; also publishes e-stops, recording commands and bookmarks.
 
     A restarted console continues with the scene, the sliders and the recording of its run. warn:
-    called with the reason if it cannot continue.
+    called with the cause if it cannot continue with them.
     """
 
     def __init__(
@@ -352,7 +361,7 @@ class ConsoleController:
         self.stopped: str | None = None
 
     def begin(self) -> None:
-        """Publish the latched messages again: they are lost when their publisher exits."""
+        """Publish the latched messages again, because they are lost when their publisher exits."""
         self.scenes.publish_current()
         if self.recording:
             self._publish(Recording(running=True))
@@ -363,7 +372,7 @@ class ConsoleController:
         self._publish(EStop(engaged=True, reason=reason))
 
     def release(self) -> None:
-        """Reset the e-stop; ReleaseError if the graph would ignore the reset."""
+        """Reset the e-stop; raises ReleaseError if the nodes ignore resets from this host."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
                 f"this console's host {NodeNote.MAY_NOT_RESET.phrase}; "
@@ -390,7 +399,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Store the state with which a restarted console continues."""
+        """Save the scene, sliders and recording, with which a restarted console continues."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
@@ -402,7 +411,7 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Return the state of the previous console; without one, a state with the first scene."""
+    """Load the state of the previous console; without one, make a state with the first scene."""
     try:
         state = load_state(files.state)
     except scenes.SceneChoiceError as error:

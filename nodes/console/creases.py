@@ -1,4 +1,4 @@
-"""Split meshes at sharp edges, for a viewer that shades every vertex by one normal."""
+"""Split meshes at sharp edges, for a viewer that shades every vertex with a single normal."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ Floats = NDArray[np.float64]
 Triangles = NDArray[np.int32]
 
 CREASE_RAD = 0.7
-"""Minimum angle between the normals of two triangles at a sharp edge."""
+"""Minimum angle between the normals of two adjacent triangles whose edge counts as sharp."""
 
 
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
-    """Duplicate the vertices of sharp edges, so that each side has separate vertices.
+    """Duplicate the vertices at sharp edges, so that each side of an edge has its own vertices.
 
-    vertices (n, 3), triangles (t, 3). Return the source vertex (k,) of each of the k >= n new
-    vertices, and the triangles (t, 3) of the new vertices.
+    vertices: (n, 3). triangles: (t, 3). Return the index (k,) of the original vertex for each of
+    the k >= n new vertices, and the triangles (t, 3) with indices of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -24,7 +24,7 @@ def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.in
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    # Corner i of triangle t has number 3 t + i; its edge leads to the triangle's next corner.
+    # Corner i of triangle t has index 3 t + i; its edge leads to the triangle's next corner.
     corners = np.arange(triangles.size)
     after = corners - corners % 3 + (corners + 1) % 3
     start, end = triangles.ravel()[corners], triangles.ravel()[after]
@@ -34,7 +34,7 @@ def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.in
     first, second = first[shared], second[shared]
     smooth = (normals[first // 3] * normals[second // 3]).sum(axis=1) > np.cos(CREASE_RAD)
     first, second = first[smooth], second[smooth]
-    # Across a smooth edge the corners at both of its ends are one vertex.
+    # Across a smooth edge, the two corners at each of its ends are the same vertex.
     one = np.concatenate([first, after[first]])
     other = np.concatenate([after[second], second])
     graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(corners), len(corners)))

@@ -1,4 +1,4 @@
-"""Show the tab with the images of the user's eye."""
+"""Show the page's tab with images of what the user's eye sees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGES = (
 
 
 class EyeTab:
-    """Tab with the images of the user's eye; an image is visible once it exists."""
+    """Tab with the images of what the user's eye sees; an image is visible once it exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(
@@ -40,7 +40,7 @@ class EyeTab:
         }
 
     def show_correction(self, correction: Correction) -> None:
-        """Show the correction of the scene or of the viewer."""
+        """Show which image correction is active: the scene's or the one that a viewer chose."""
         self._correction.value = correction
 
     def show_text(self, html: str) -> None:

@@ -1,4 +1,4 @@
-"""Control the simulated finger: the viewer's request, and steps towards it."""
+"""Control the simulated finger: move it step by step to the position that a viewer requests."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Floats = NDArray[np.float64]
 
 LABEL = "console"
 FRONT_M = 1.5
-"""Distance from the screen at which a ray from the front starts."""
+"""Distance from the imaginary screen at which rays from the front start, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ray:
     """Ray in the world frame, which selects the first point on the object that it meets.
 
-    origin_m (3,), direction (3,) of any length. Raises ValueError for values that are not finite,
-    and for a direction of length 0.
+    origin_m: (3,). direction: (3,), of any length. Raises ValueError for values that are not
+    finite, and for a direction of length 0.
     """
 
     origin_m: tuple[float, float, float]
@@ -39,7 +39,7 @@ class Ray:
 
     @property
     def is_from_front(self) -> bool:
-        """Return whether the ray is along the negative z axis."""
+        """Return whether the ray points along the negative z axis (away from the user)."""
         return self.direction[:2] == (0.0, 0.0) and self.direction[2] < 0.0
 
     @classmethod
@@ -50,10 +50,11 @@ class Ray:
 
 @dataclass(frozen=True, slots=True)
 class FingerIntent:
-    """Requested position of the finger.
+    """Finger position that a viewer requests.
 
-    position: ray to a point on any object. depth_m: depth below the surface, unless lifted. lifted:
-    the finger hovers above the position. Raises ValueError for an invalid depth.
+    position: ray that selects the point on any object. depth_m: depth below the surface, used
+    unless lifted. lifted: whether the finger hovers above the point. Raises ValueError for an
+    invalid depth.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))
@@ -67,7 +68,7 @@ class FingerIntent:
             )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
-        """Return the position (3,) of the fingertip on an object."""
+        """Return the requested position (3,) of the fingertip on an object."""
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
         return picker.pick(origin, direction, -HOVER_M if self.lifted else self.depth_m)
 
@@ -75,8 +76,8 @@ class FingerIntent:
 class FingerController:
     """Controller that moves the simulated finger to the requested position at a limited speed.
 
-    Each step is a path of one point. Nothing is published before the first command, so that other
-    writers can control the finger.
+    Each step is published as a path of one point. Nothing is published before the viewer's first
+    command, so that other programs can control the finger.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
@@ -90,12 +91,12 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Apply the request to another object; None while its shape is unknown."""
+        """Apply the request to another object; picker: None while the object's shape is unknown."""
         self._picker = picker
         self._update_target()
 
     def restore(self, intent: FingerIntent) -> None:
-        """Continue with the request of the previous console."""
+        """Continue with the request that the previous console process saved."""
         self.intent, self._commanded = intent, True
         self._update_target()
 
@@ -106,7 +107,7 @@ class FingerController:
 
     @property
     def position_m(self) -> tuple[float, float]:
-        """Return the requested position (x, y) as viewed from the front."""
+        """Return the requested position (x, y) as seen from the front, m."""
         return self._position_m
 
     def touch(self, origin: Floats, direction: Floats) -> None:
@@ -115,19 +116,19 @@ class FingerController:
         self._request(position=position, lifted=False)
 
     def move_to(self, x_m: float, y_m: float) -> None:
-        """Move to (x, y) as viewed from the front; stay lifted or pushing."""
+        """Move to (x, y) as seen from the front, m; the finger stays lifted or keeps pushing."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
-        """Push to this depth at the requested position."""
+        """Push to this depth (m) at the requested position."""
         self._request(depth_m=depth_m, lifted=False)
 
     def lift(self) -> None:
-        """Lift the finger above the position."""
+        """Lift the finger above the requested position."""
         self._request(lifted=True)
 
     def lift_or_lower(self) -> None:
-        """Lift the finger, or lower a lifted one."""
+        """Lift the finger, or lower it if it is lifted."""
         self._request(lifted=not self.intent.lifted)
 
     def _request(self, **changes: object) -> None:
@@ -136,7 +137,7 @@ class FingerController:
         self._update_target()
 
     def _update_target(self) -> None:
-        """Compute the target, if the request and the object exist."""
+        """Compute the target position, if there are a request and an object."""
         self._target, self._arrived = None, False
         position = self.intent.position
         if position.is_from_front:
@@ -147,7 +148,7 @@ class FingerController:
                 self._position_m = float(target[0]), float(target[1])
 
     def advance(self, duration_s: float, measured: Floats | None) -> bool:
-        """Publish the next step, if any; return whether it was the last.
+        """Publish the next step towards the target, if any; return whether it was the last step.
 
         measured: measured position of the finger (3,); None if unknown.
         """

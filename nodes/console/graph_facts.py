@@ -1,4 +1,4 @@
-"""Read facts about the graph from the run's plan."""
+"""Read facts about the graph that the console needs from the run's plan."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from flexsheet.nodes import NodeRole
 
 @dataclass(frozen=True, slots=True)
 class GraphFacts:
-    """Facts about the graph, which are constant while the console runs.
+    """Facts about the graph that are constant while the console runs.
 
-    others_may_reset: hosts that may reset an e-stop; empty if the console's own host may.
-    recorders: names of the recorders. records_on_request: whether a recorder waits for the topic
-    `recording`. solvers: names of the nodes that publish the skin. consoles: names of the consoles.
+    others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may.
+    recorders: names of the recorder nodes. records_on_request: whether a recorder waits for the
+    topic `recording`. solvers: names of the nodes that publish the skin of the soft object.
+    consoles: names of the console nodes.
     """
 
     others_may_reset: tuple[str, ...] = ()
@@ -29,7 +30,7 @@ class GraphFacts:
 
     @property
     def sampling_readers(self) -> tuple[str, ...]:
-        """Return the names of the nodes that skip messages by design."""
+        """Return the names of nodes that skip messages by design, because they only sample them."""
         return self.consoles
 
     @classmethod

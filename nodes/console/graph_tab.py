@@ -1,4 +1,4 @@
-"""Show the tab with the state of the graph: a strip chart of latencies, and tables."""
+"""Show the page's tab with the state of the graph: a strip chart of latencies, and tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class GraphTab:
-    """Chart whose lines differ by colour and dashes, with tables below it."""
+    """Chart of latencies, whose lines differ by colour and dashes, with tables below it."""
 
     def __init__(self, gui: Any) -> None:
         gui.add_html(
@@ -39,7 +39,7 @@ class GraphTab:
 
     def show(self, tables: str, columns: tuple[Floats, ...]) -> None:
         self._tables.show(tables)
-        # uPlot finds no range if one of the series has no value.
+        # The chart library uPlot finds no range if one of the series has no value.
         scales = _scales(max_latency_ms(columns))
         if self._chart.scales != scales:
             self._chart.scales = scales
@@ -54,7 +54,7 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the upper end of the chart's scale: the next of 1, 2, 5, 10, ... ms."""
+    """Return the upper end of the chart's scale: the next larger one of 1, 2, 5, 10, ... ms."""
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))
     decade = 10.0 ** np.floor(np.log10(largest))

@@ -1,4 +1,4 @@
-"""Sample the latencies of the last half minute, for the strip chart."""
+"""Store samples of the latencies over the last half minute, for the page's strip chart."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """Samples of the latencies after the exposure, ms."""
+    """Samples of the time from the camera's exposure to each step of the processing, ms."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
     def add(self, now_s: float, source: MessageSource) -> None:
-        """Add a sample; samples older than the window are dropped."""
+        """Add a sample; samples older than half a minute are dropped."""
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return seconds before the latest sample (<= 0), and each series in ms.
+        """Return the samples' times relative to the latest one (s, <= 0), and each series in ms.
 
-        A missing value is NaN.
+        Missing values are NaN.
         """
         if not self._samples:
             return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
@@ -42,7 +42,7 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest sample (ms) and the maximum by series; NaN without a value."""
+        """Return the latest sample and the maximum of each series, ms; NaN if there is none."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             valid = values[np.isfinite(values)]
@@ -51,10 +51,10 @@ class History:
 
 
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    """Return the columns so that a line is drawn for every value.
+    """Return the columns with values repeated so that even an isolated one is drawn.
 
-    A value without a neighbour is repeated at the sample indices it. A single sample is repeated
-    half a second earlier.
+    A value without a neighbour is repeated at the previous sample. A single sample is repeated half
+    a second earlier.
     """
     times, *series = columns
     if len(times) == 1:
@@ -72,9 +72,9 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
 
 
 def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
-    """Return the time (ms) from the exposure to the publication of the latest message of each step.
+    """Return the time (ms) from the exposure to the newest message of each processing step.
 
-    NaN without a message. For the arms: the time at which the command of that exposure was written.
+    NaN if there is no message. For the arms, the time ends when the resulting command was sent.
     """
     found = []
     for name, kind in (

@@ -1,4 +1,4 @@
-"""Store the latest message of each topic, and decode it on demand."""
+"""Store the latest message of each topic, and decode it only when it is needed."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageSource(Protocol):
-    """Source of the messages that the page shows: the running graph, or a bag."""
+    """Interface of a source of the displayed messages: the running graph, or a bag."""
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message of the topic with its header; None before the first."""
+        """Return the latest message of the topic with its header; None before the first message."""
         ...
 
 
 class LatestMessages:
-    """Latest message of each topic, decoded at the first access.
+    """Store of the latest message of each topic, which is decoded when it is first read.
 
-    refused: called with the topic and the error of a message that cannot be decoded.
+    refused: called with the topic and the error if a message cannot be decoded.
     """
 
     def __init__(self, refused: Callable[[Topic, WireError], None]) -> None:
@@ -32,7 +32,7 @@ class LatestMessages:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Store the frames; return whether they replaced unread frames."""
+        """Store a message's frames; return whether they replaced frames that had not been read."""
         unread = name in self._frames
         self._frames[name] = frames
         return unread
@@ -50,7 +50,7 @@ class LatestMessages:
 
 
 def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return the entry with the type `kind`.  Raises TypeError for another type."""
+    """Return the entry if its message has the type `kind`; raises TypeError otherwise."""
     if entry is None:
         return None
     message, header = entry

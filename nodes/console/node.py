@@ -1,4 +1,4 @@
-"""Serve a page in the browser that shows and controls the whole apparatus."""
+"""Serve a web page that shows the running graph with all devices, and controls it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TOPICS_READ = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
     *("frame", "twin/eye", "status", "host", "estop", "display"),
 }
-"""Topics that the console reads if the graph has them."""
+"""Topics that the console reads if a node of the graph writes them."""
 
 
 class ConsoleParameters(NodeParameters):
@@ -40,7 +40,8 @@ class ConsoleParameters(NodeParameters):
         default=8080, description="TCP port of the page; 0: any free port"
     )
     token_file: Path | None = Field(
-        default=None, description="file with the token of the viewers; required unless on loopback"
+        default=None,
+        description="file with the token that viewers need; required unless on loopback",
     )
     rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")
@@ -50,14 +51,19 @@ class ConsoleParameters(NodeParameters):
     finger_speed_m_per_s: Positive = Field(
         default=0.15, description="maximum speed of the simulated finger"
     )
-    bags: Path = Field(default=Path("runs"), description="folder with the bags to replay")
-    plan: Path = Field(
-        default=Path("@run/plan.json"), description="plan of the run, with the first scene"
+    bags: Path = Field(
+        default=Path("runs"), description="folder with the bags that can be replayed"
     )
-    scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
+    plan: Path = Field(
+        default=Path("@run/plan.json"),
+        description="plan file of the run, which contains the first scene",
+    )
+    scenes: Path = Field(
+        default=Path("@run/scenes"), description="folder with the scenes to choose from"
+    )
     state_file: Path = Field(
         default=Path("@run/console-state.json"),
-        description="file with the state for a restart of the console",
+        description="file in which a restarted console finds its state",
     )
 
     @field_validator("address")
@@ -81,7 +87,7 @@ class ConsoleParameters(NodeParameters):
 
 
 class Console(Node):
-    """Node that serves the page; it reads messages at its own rates while there are viewers."""
+    """Node that serves the page; while there are viewers, it reads messages at its own rates."""
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
@@ -133,7 +139,7 @@ class Console(Node):
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Store messages until they are drawn; decode them immediately if all are needed."""
+        """Store messages until they are drawn; decode them at once where all are needed."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         superseded = self._latest.put(source.topic.name, message)
@@ -146,7 +152,7 @@ class Console(Node):
 
     @periodic("rate_hz")
     def draw(self) -> None:
-        """Update the 3D view and all moving parts."""
+        """Update the 3D view and everything on the page that moves."""
         now_s = self.clock.now_ns() * 1e-9
         viewers = len(self._server.get_clients())
         self.note = f"{self.url}, viewers: {viewers}"
@@ -154,7 +160,7 @@ class Console(Node):
 
     @periodic("tables_hz")
     def refresh_tables(self) -> None:
-        """Update tables and charts."""
+        """Update the tables and charts of the page."""
         if self._server.get_clients():
             self._call(self.operator.refresh_tables, self.clock.now_ns() * 1e-9)
 
@@ -163,7 +169,7 @@ class Console(Node):
         next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
     def _request(self, name: str, *values: Any) -> None:
-        """Pass a request of a viewer to the loop, from any thread."""
+        """Pass a viewer's request to the node's loop; called on any thread."""
         self._loop.call_soon_threadsafe(self._call, self.operator.handle_request, name, *values)
 
     def _call(self, function: Any, *values: Any) -> None:

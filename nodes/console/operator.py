@@ -1,4 +1,4 @@
-"""Connect page and graph: pass requests to the controller, and messages to the page."""
+"""Connect the page with the running graph: pass on viewers' requests, and show messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MAX_WIDTH_PX = 340
 
 BAG_LIST_PERIOD_S = 5.0
 MAX_STEP_S = 0.2
-"""Maximum time step of finger and replay, so that they do not jump after a pause."""
+"""Maximum time step of the finger and the replay, so that they do not jump after a pause."""
 
 SIDES = ("left", "right")
 BOOKMARKS_SHOWN = 5
@@ -53,7 +53,7 @@ REPLAYED = (
     "the page shows a replay, but the finger is part of the running graph: first press "
     '"Back to the running graph" in Record'
 )
-MEASURED = "the finger is measured; the console can move a simulated finger only"
+MEASURED = "this graph measures a real finger; the console can only move a simulated finger"
 NO_RECORDER = (
     "this graph has no recorder that the console can start: start the graph with --console, or "
     "set the parameter start_paused: true of its recorder"
@@ -61,7 +61,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """Connection of page and graph; runs on the node's own loop."""
+    """Mediator between the page and the running graph, in the console node's asyncio loop."""
 
     def __init__(
         self,
@@ -76,8 +76,8 @@ class Operator:
     ) -> None:
         """Build the page.
 
-        name: name of the console's node. with_finger: the graph simulates the finger, and the mouse
-        moves it. with_eye: the graph simulates the eye.
+        name: name of the console's node. with_finger: whether the graph simulates the finger, so
+        that the mouse can move it. with_eye: whether the graph simulates the eye.
         """
         self._name, self._live, self.controller = name, live, controller
         self._with_finger, self._with_eye = with_finger, with_eye
@@ -121,7 +121,7 @@ class Operator:
 
     @property
     def source(self) -> MessageSource:
-        """Return the source of the displayed messages: a bag or the running graph."""
+        """Return the source of the displayed messages: a replayed bag or the running graph."""
         return self.controller.replay.timeline or self._live
 
     def handle_request(self, name: str, *values: Any) -> None:
@@ -139,7 +139,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Handle a message of a topic whose messages are all needed."""
+        """Process a message of a topic on which every message is needed, not only the newest."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -155,7 +155,7 @@ class Operator:
                 self._page.eye.show_image(name, downsample_image(image))
 
     def advance(self, now_s: float, has_viewers: bool) -> None:
-        """Advance finger, sliders and replay; draw them if there are viewers."""
+        """Advance finger, sliders and replay by one step; update the page if it has viewers."""
         step_s = min(now_s - self._now_s, MAX_STEP_S)
         self._now_s, controller = now_s, self.controller
         finger = self._live.latest("fingertip", Fingertip) if has_viewers else None
@@ -212,7 +212,7 @@ class Operator:
         self._page.eye.show_image("frame", downsample_image(entry[0].pixels[0]))
 
     def refresh_tables(self, now_s: float) -> None:
-        """Update tables, charts and banner."""
+        """Update the tables, the charts and the banner of the page."""
         ages = {name: (status, now_s - at_s) for name, (status, at_s) in self._statuses.items()}
         self._history.add(now_s, self._live)
         latencies = panels.make_latency_table(self._history.latest_and_max())
@@ -226,7 +226,7 @@ class Operator:
         self._show_eye_status(now_s)
         finger = self.source.latest("fingertip", Fingertip)
         if now_s >= self._finger_shown_s:
-            # A moving slider must not jump back to the last request.
+            # A slider that is being moved must not jump back to the last request.
             self._page.touch.show_intent(self.controller.finger)
         self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
         if self._awaits_bag or now_s >= self._bags_s + BAG_LIST_PERIOD_S:
@@ -264,7 +264,7 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the solver's note while it has no skin of this scene, or an empty text."""
+        """Return the solver's note until the skin of this scene arrives; then an empty text."""
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""
@@ -289,9 +289,9 @@ class Operator:
         self._page.touch.show_position(self.controller.finger)
 
     def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
-        """Pass a command to the finger.
+        """Pass a command to the finger's controller.
 
-        Raises ValueError if it is refused; the page then shows the state.
+        Raises ValueError if the command is refused; the page then shows the unchanged state.
         """
         finger = self.controller.finger
         self._finger_shown_s = self._now_s + SETTLE_S
@@ -307,7 +307,7 @@ class Operator:
         self._page.touch.show_lifted(finger)
 
     def _on_new_scene(self) -> None:
-        """Store the time of the new scene, and make its picker."""
+        """Store the time at which the scene changed, and prepare picking points on its object."""
         self._sent_ns = round(1e9 * self._now_s)
         self.controller.scenes.make_picker(self.controller.finger, self._page.show_problem)
 
@@ -379,6 +379,6 @@ class Operator:
 
 
 def downsample_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return every nth pixel of an image, so that it is at most `MAX_WIDTH_PX` wide."""
+    """Downsample an image by taking every nth pixel, so that it is at most `MAX_WIDTH_PX` wide."""
     step = -(-image.shape[1] // MAX_WIDTH_PX)
     return np.ascontiguousarray(image[::step, ::step])

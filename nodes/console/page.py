@@ -1,4 +1,4 @@
-"""Build the panels of the page: controls and texts beside the 3D view."""
+"""Build the panels of the page: controls and texts next to the 3D view."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
 class Page:
-    """All panels of the page; the operator updates their contents."""
+    """All panels of the page; the `Operator` updates their contents."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Page:
     ) -> None:
         """Build the panels.
 
-        others_may: hosts that may reset an e-stop; empty if the console's host may.
+        others_may: other hosts that may reset an e-stop; empty if the console's host may.
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may
@@ -60,7 +60,7 @@ class Page:
             self.record = RecordTab(self._gui, request)
 
     def _add_stop(self) -> None:
-        """Add the e-stop in a separate window, which tabs and scrolling cannot hide."""
+        """Add the e-stop button in a separate window, which tabs and scrolling cannot hide."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
             stop = self._gui.add_button(
@@ -70,9 +70,9 @@ class Page:
             self._release = self._gui.add_button(
                 RELEASE, disabled=True, hint="The arms must be at rest"
             )
-        # viser shows its own notices at the top.
+        # Place the window at the bottom, because viser shows its own notices at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
-        # viser folds panels on small screens.
+        # Expand the window, because viser folds panels on small screens.
         panel.expand()
         stop.on_click(make_callback(self._request, "stop", "pressed at the console"))
         self._release.on_click(make_callback(self._request, "release"))
@@ -80,7 +80,7 @@ class Page:
         command.on_trigger(make_callback(self._request, "stop", "Escape at the console"))
 
     def show_scene(self, scene: Scene, controller: ConsoleController) -> None:
-        """Show a scene of the graph or of a bag."""
+        """Show the values of a scene of the graph or of a bag."""
         self.view.set_scene(scene)
         self.touch.show_scene(
             scene, controller.scenes.base, controller.scenes.names, controller.scenes.sliders
@@ -94,7 +94,7 @@ class Page:
     def show_state(self, state: GraphState) -> None:
         """Show the banner, and enable the button that releases the e-stop or resets a fault."""
         self._state.show(banner.render(state))
-        # The button is always visible, so that no other control moves under the pointer.
+        # The button is always visible, so that no other control moves under the mouse pointer.
         self._release.disabled = not state.resettable
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:

@@ -1,6 +1,6 @@
-"""Make the texts and tables of the page, as HTML for screen readers too.
+"""Make the texts and tables of the page as HTML, also for screen readers.
 
-Every colour comes with a symbol. The classes are those of page.css.
+Every colour is accompanied by a symbol. The CSS classes are defined in page.css.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""Fraction of a topic's minimum rate below which the topic is slow."""
+"""Fraction of a topic's minimum rate below which the topic is reported as slow."""
 
 MAX_STATUS_AGE_S = 3.0
-"""Age of the last status message above which a node is silent."""
+"""Age of the last status message above which a node is reported as silent."""
 
 MODES = {
     "starting": "starting",
@@ -33,12 +33,12 @@ MODES = {
     "relax": "relaxing the sheet",
     "estop": "stopped",
 }
-"""Texts of the modes of an arm."""
+"""Texts for the modes of an arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Style of a series: colour for light and dark pages, and dashes (px)."""
+    """Line style of a series in a chart: colour on light and dark pages, and dashes (px)."""
 
     color: str
     dash: tuple[int, ...] = ()
@@ -60,7 +60,7 @@ def _mark(kind: tuple[str, str], text: str) -> str:
 def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
-    """Make a table. numbers: indices of right-aligned columns."""
+    """Make an HTML table. numbers: indices of right-aligned columns."""
     alignments = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
         f'<th scope="col"{alignments.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
@@ -78,14 +78,14 @@ def _table(
 
 
 def make_paragraph(html: str) -> str:
-    """Make a paragraph of the page."""
+    """Wrap HTML in a paragraph with the style of the page."""
     return f'<p class="fs-words">{html}</p>'
 
 
 def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
-    """Make the legend of the chart with numbers.
+    """Make the legend of the latency chart, with the values of each series.
 
-    latencies: by series, the latest and the maximum value (ms); NaN without a value.
+    latencies: by name of the series, the latest and the maximum value (ms); NaN if there is none.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
@@ -101,9 +101,9 @@ def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
 
 
 def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
-    """Make a table of the nodes: state, processor load, last error or note.
+    """Make the table of the nodes: state, processor load, last error or note.
 
-    statuses: by node, its latest status and its age (s).
+    statuses: by name of the node, its latest status and the status's age (s).
     """
     rows = []
     for name, (status, age_s) in sorted(statuses.items()):
@@ -130,10 +130,10 @@ def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
 def make_topics_table(
     statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
 ) -> str:
-    """Make a table of the topics: rate, maximum age at the readers, losses.
+    """Make the table of the topics: rate, maximum age at the readers, and lost messages.
 
     statuses: as in `make_nodes_table`. sampling_readers: nodes that skip messages by design and are
-    not counted as readers.
+    therefore not counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
@@ -195,9 +195,9 @@ def _finger(fingertip: Fingertip | None) -> str:
 def eye(
     *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe the state of the images of the eye.
+    """Describe the state of the images that show what the user's eye sees.
 
-    waited_s: duration of `state`. ago_s: age of the latest image; None without an image.
+    waited_s: duration of `state`. ago_s: age of the latest image; None if there is no image.
     """
     if not possible:
         return make_paragraph("This graph has no simulated eye (a node of type twin_eye).")
@@ -223,9 +223,9 @@ def eye(
 
 
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
-    """Describe the recorder's note and the newest bookmarks.
+    """Describe the state of the recorder and the newest bookmarks.
 
-    note: None without a recorder.
+    note: status note of the recorder node; None if there is no recorder.
     """
     if note is None:
         return make_paragraph(_mark(WARN, "this graph has no recorder"))
@@ -234,7 +234,7 @@ def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
 
 
 def problem(text: str) -> str:
-    """Make the box of an error; an empty text removes it."""
+    """Make the box that shows an error; an empty text removes the box."""
     if not text:
         return ""
     sentence = escape(text[:1].upper() + text[1:])

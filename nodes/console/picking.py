@@ -1,4 +1,4 @@
-"""Compute the fingertip position that a mouse ray selects, and the path to it."""
+"""Compute the fingertip position that the mouse selects on the object, and the path to it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ MAX_RAY_M = 3.0
 SURFACE_TOLERANCE_M = 1e-4
 MAX_STEPS = 64
 MIN_STEP_RATIO = 0.01
-"""Minimum length of a step around an object, over a full step."""
+"""Minimum length of a step around an object, as a fraction of a full step."""
 
 HOVER_M = 0.03
-"""Height of a lifted finger above the object."""
+"""Height of a lifted finger above the object's surface."""
 
 
 class SurfacePicker:
-    """Picker of points of a scene's object; to build one for a mesh needs a second."""
+    """Picker of points on a scene's object; building one for a mesh takes a second."""
 
     def __init__(self, scene: Scene) -> None:
         pose = scene.object.world_from_object
@@ -32,11 +32,11 @@ class SurfacePicker:
         self._low, self._high = scene.finger.volume_min_m, scene.finger.volume_max_m
 
     def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
-        """Return the fingertip (3,) that a ray from the viewer's eye selects.
+        """Return the fingertip position (3,) that a ray from the viewer's eye selects.
 
-        If the ray meets the object: the point `depth_m` below its surface along the normal
-        (negative: above). If it misses the object: the point of the ray nearest to it, at least at
-        that height. direction (3,) is not zero.
+        If the ray meets the object, this is the point `depth_m` below the surface along the normal
+        (negative: above). If it misses the object, it is the ray's point nearest to the object, but
+        at least at that height. direction: (3,), not zero.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin
@@ -61,10 +61,10 @@ class SurfacePicker:
         return self._within(apply(self._world_from_object, inside))
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
-        """Return the next point (3,) from the finger to the target, at most `max_step_m` away.
+        """Return the next point (3,) on the way to the target, within `max_step_m` of the finger.
 
-        The step goes no deeper into the object than `depth_m` or the current depth of the finger.
-        If a path around the object makes no progress, the step is straight.
+        The step goes no deeper into the object than `depth_m` or than the finger already is. If a
+        step around the object makes no progress, the step is straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -1,4 +1,4 @@
-"""Show the tab that records bags, adds bookmarks and replays bags."""
+"""Show the page's tab that records bags, adds bookmarks and replays bags."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"
 NO_BOOKMARK = "-"
 RECORDING_COLOR = (146, 64, 14)
-"""This colour differs from that of the e-stop."""
+"""Colour of the recording button; it differs from that of the e-stop."""
 
 
 class RecordTab:
-    """Controls of recording and replay; the timeline is visible while a bag is shown."""
+    """Controls for recording and replay; the timeline is visible while a bag is shown."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._request = request
@@ -53,7 +53,7 @@ class RecordTab:
         seconds = self._seconds_by_option.get(option)
         if seconds is not None:
             self._request("seek", seconds)
-            # The same bookmark can then be chosen again.
+            # Reset the choice, so that the same bookmark can be chosen again.
             self._bookmarks.value = NO_BOOKMARK
 
     def show_state(self, html: str, *, recording: bool) -> None:
@@ -65,7 +65,7 @@ class RecordTab:
     def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
         """List the bags.
 
-        recorded: a bag to select, because it was just recorded.
+        recorded: bag to select, because it was just recorded.
         """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
@@ -74,9 +74,9 @@ class RecordTab:
             show_value(self._bag, recorded)
 
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
-        """Show the position of the timeline.
+        """Show the current time in the replayed bag.
 
-        opened: another bag, or none, is shown now.
+        opened: whether another bag, or none, is shown from now on.
         """
         timeline = replay.timeline
         if opened:

@@ -1,4 +1,4 @@
-"""Read a bag as the page shows it: the newest message of each topic up to a position."""
+"""Read a bag for the page: the newest message of each topic up to a time in the bag."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """Reader of a bag at a position; `seconds` counts from its start.
+    """Reader of a bag at a time; `seconds` is the time from the bag's start.
 
-    Raises BagError for a file that is not a bag, or contains nothing that the page shows.
+    Raises BagError for a file that is not a bag, or that contains nothing that the page shows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +53,7 @@ class Timeline:
         return check_type(cached[1], kind)
 
     def _times(self, name: str) -> tuple[list[int], list[Chunk]]:
-        """Return the log times of the messages of a topic in order, and the chunk of each."""
+        """Return the log times of a topic's messages in order, and the chunk that contains each."""
         entries = [
             (time_ns, chunk.offset, chunk)
             for chunk in self._reader.chunks
@@ -70,7 +70,7 @@ class Timeline:
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Return the messages of a chunk by channel and log time; the last chunks are cached."""
+        """Return a chunk's messages by channel and log time; the most recent chunks are cached."""
         cached = self._chunks.get(chunk.offset)
         if cached is None:
             with self.path.open("rb") as file:
@@ -87,7 +87,7 @@ class Timeline:
         return cached
 
     def _find_bookmarks(self) -> list[tuple[float, str]]:
-        """Return the bookmarks as (seconds, label)."""
+        """Return the bookmarks in the bag as (seconds from the start, label)."""
         found = []
         for i, time_ns in enumerate(self._positions.get("bookmark", ([], []))[0]):
             message, _ = self._open("bookmark", i)

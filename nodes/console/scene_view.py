@@ -1,4 +1,4 @@
-"""Draw the 3D view, and update its changed parts."""
+"""Draw the 3D view of the page, and update the parts that change."""
 
 from __future__ import annotations
 
@@ -42,14 +42,15 @@ GRID_SECTION: Color = (128, 135, 146)
 SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
 """Distance by which the sheet and its lines are drawn nearer to the viewer.
 
-A flat object is in the plane of the sheet, and equal depths would flicker."""
+Without it, a flat object in the plane of the sheet would flicker, because both have equal depth.
+"""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
 NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
-"""Distance of the floor below the bases of the arms."""
+"""Distance of the drawn floor below the bases of the arms."""
 
 LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices", "Names")
 EYE_VIEW = "the eye"
@@ -58,14 +59,14 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""Eye and target of each view (world, m); None: from between the user's eyes."""
+"""Camera position and target of each view (world, m); None: between the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
-"""Called with a ray (origin and direction, world) from the viewer's eye through the mouse."""
+"""Callback with a ray (origin, direction; world) from the viewer's eye through the pointer."""
 
 
 class SceneView:
-    """The 3D scene of all viewers; `draw` sends changes."""
+    """The 3D view of the scene that all viewers see; `draw` sends changes to them."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
@@ -77,7 +78,7 @@ class SceneView:
         self._skin_shape: tuple[int, ...] | None = None
         self._finger_color = FINGER
         self._scene.set_up_direction("+y")
-        # Without a graphics card, shadows would take most of the time of a frame.
+        # Without a graphics card, shadows would take most of the drawing time.
         self._scene.configure_default_lights(cast_shadow=False)
         first = next(iter(VIEWPOINTS.values()))
         assert first is not None  # the first viewpoint needs no scene
@@ -85,7 +86,7 @@ class SceneView:
         server.initial_camera.fov = 0.75
 
     def look_from(self, client: viser.ClientHandle, name: str) -> None:
-        """Change one viewer's view."""
+        """Change one viewer's camera to the view of this name."""
         viewpoint, scene = VIEWPOINTS[name], self._of_scene
         if viewpoint is None:
             if scene is None:
@@ -102,12 +103,12 @@ class SceneView:
         for handle in self._layers.get(layer, []):
             handle.visible = shown
         for side, frames in self._links.items():
-            # An arm is visible after its first pose.
+            # An arm becomes visible with its first pose.
             for handle in frames:
                 handle.visible = self._shown["Arms"] and side in self._posed
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw everything again for a scene."""
+        """Draw everything again for another scene."""
         self._scene.reset()
         self._layers = {layer: [] for layer in LAYERS}
         self._of_scene, self._skin_shape, self._posed = scene, None, set()
@@ -127,7 +128,7 @@ class SceneView:
         ]
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
-        """Draw the object with this skin."""
+        """Draw the object with this surface mesh; `rest`: vertices at rest."""
         self._skin_source, split = split_creases(rest, triangles)
         corners = _f32(rest[self._skin_source])
         self._object = self._add(
@@ -137,11 +138,11 @@ class SceneView:
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for a press or drag on sheet or object, and for its end."""
+        """Set the callbacks for a press or drag on the sheet or object, and for its end."""
         self._touched, self._released = touched, released
 
     def draw(self, snapshot: SceneSnapshot) -> None:
-        """Update all poses and meshes."""
+        """Update all poses and meshes in the view to a snapshot of the messages."""
         scene = self._of_scene
         if scene is None:
             return
@@ -198,7 +199,7 @@ class SceneView:
         )
 
     def _add_arm(self, side: str, height_m: float) -> list[Any]:
-        """Add frames of the seven links and of the clamp, with their boxes."""
+        """Add the frames and boxes of an arm's seven links and of its clamp."""
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -291,7 +292,7 @@ class SceneView:
             )
 
     def _add_names(self, scene: Scene) -> None:
-        """Add labels above the bodies."""
+        """Add name labels above the devices."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
         centre = apply(
@@ -342,7 +343,7 @@ class SceneView:
         )
 
     def _make_touchable(self, handle: Any) -> None:
-        # Coroutines run on the server's own loop, in the order of the mouse events.
+        # Coroutines run on the server's own loop, which keeps the order of the mouse events.
         async def dragged(event: Any) -> None:
             if event.phase == "end":
                 self._released()
@@ -359,7 +360,7 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the sheet's points (n, 3) towards the user along its mean normal."""
+    """Move the sheet's points (n, 3) towards the user along the sheet's mean normal."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)
@@ -367,7 +368,7 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
 
 
 def make_line_segments(points: Floats) -> Floats:
-    """Return segments (n, 2, 3) of every fifth row and column of the sheet's grid."""
+    """Return segments (n, 2, 3) along every fifth row and column of the sheet's grid of points."""
     grid = points.reshape(ROWS, COLUMNS, 3)
     rows, columns = grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)
     lines = np.concatenate([rows, columns]) if ROWS == COLUMNS else rows
@@ -375,7 +376,7 @@ def make_line_segments(points: Floats) -> Floats:
 
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Make a fingertip (n, 3) and its triangles: tip at the origin, axis away from the user."""
+    """Make a fingertip mesh: vertices (n, 3), with the tip at the origin, and triangles."""
     rings, around = 8, 20
     tilt = np.linspace(0.0, 0.5 * np.pi, rings)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])
@@ -389,7 +390,7 @@ def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
         ]
         + [np.array([[0.0, 0.0, FINGER_LENGTH_M + 0.4 * radius_m]])]
     )
-    # Tilted about the centre of the tip, since a finger comes from below.
+    # Tilt the finger about the centre of its tip, because a real finger comes from below.
     lean = np.array(
         [
             [1.0, 0.0, 0.0],

@@ -1,4 +1,4 @@
-"""Load the scenes of a run, and change one by the sliders of the page."""
+"""Load the scenes of a run, and change a scene as the page's sliders request."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ Floats = NDArray[np.float64]
 
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
-"""Minimum and step of the slider."""
+"""Minimum and step of the slider for the sheet's tension (stretch ratio)."""
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """A scene that cannot be used; the text gives the reason."""
+    """Raised for a scene that cannot be used; the text gives the reason."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
 
 
 def first_scene(plan_file: Path) -> Scene:
-    """Return the scene of the run's plan.  Raises SceneChoiceError without one."""
+    """Return the scene of the run's plan; raises SceneChoiceError if the plan has none."""
     values = json.loads(plan_file.read_text())["scene"]
     if values is None:
         raise SceneChoiceError('the launch file has no scene; set its key "scene" for the console')
@@ -43,7 +43,7 @@ def list_scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene of the run's folder by its name.  Raises SceneChoiceError."""
+    """Load a scene from the run's folder by its name; raises SceneChoiceError."""
     names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
@@ -53,10 +53,10 @@ def load(folder: Path, name: str) -> Scene:
 def edit_scene(
     scene: Scene, *, young_modulus_pa: float | None, stretch_ratio: float, size_ratio: float
 ) -> Scene:
-    """Change the stiffness, the minimum stretch of the sheet and the size of the object.
+    """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
-    The front of the object is fixed; it grows away from the user. A rigid object stays rigid.
-    Raises SceneChoiceError for invalid values.
+    The front of the object stays where it is; the object grows away from the user. A rigid object
+    stays rigid. Raises SceneChoiceError for invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -88,7 +88,7 @@ def edit_scene(
 
 
 def max_stretch_ratio(scene: Scene) -> float:
-    """Return the upper end of the slider, from the scene's limits of stretch and force."""
+    """Return the upper end of the tension slider, from the scene's limits of stretch and force."""
     sheet = scene.sheet
     strongest = stretch_for_edge_force(
         sheet.max_edge_force_n,
@@ -98,7 +98,7 @@ def max_stretch_ratio(scene: Scene) -> float:
         thickness_m=sheet.thickness_m,
     )
     limit = min(sheet.max_stretch_ratio, strongest)
-    # Rounded down to the slider's step, but never below the stretch of the scene itself.
+    # Round down to the slider's step, but never below the stretch of the scene itself.
     steps = np.floor((limit - 1.0) / STRETCH_STEP + 1e-6)
     return max(1.0 + float(steps) * STRETCH_STEP, sheet.min_stretch_ratio, MIN_STRETCH_RATIO)
 
@@ -110,7 +110,7 @@ def _with(part: Any, **changes: Any) -> Any:
 
 
 def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
-    """Scale a shape about its origin; a plane is unchanged."""
+    """Scale a shape about its origin; a plane is returned unchanged."""
     if not (np.isfinite(ratio) and ratio > 0.0):
         raise SceneChoiceError(f"size: factor {ratio} is not a positive number")
     changes = GEOMETRIES[geometry.shape].scale(geometry, ratio)
@@ -118,9 +118,9 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent of the touchable surface towards the user (world z) from its origin, m.
+    """Return how far the touchable surface extends from its origin towards the user (world z), m.
 
-    world_from_object: rotation (3, 3). A cylinder is measured at its side, as its ends are not
-    touched.
+    world_from_object: rotation (3, 3). For a cylinder only the curved surface counts, because its
+    ends are not touched.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

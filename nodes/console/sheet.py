@@ -1,6 +1,6 @@
-"""Compute the drawn sheet: a ruled surface between its edges, deflected by the finger.
+"""Compute the sheet that the page draws: a ruled surface between its edges, with a finger's dent.
 
-The deflection is that of a soap film, for display only. See `flexsheet.nodes.models.sheet` for the
+The deflection is that of a soap film, for display only. `flexsheet.nodes.models.sheet` contains the
 mechanics of the sheet.
 """
 
@@ -20,10 +20,10 @@ Indices = NDArray[np.int32]
 COLUMNS, ROWS = 41, 41
 MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""Number of cells along each side around a vertex that are tested for a hit of a ray."""
+"""Number of cells on each side of a vertex that are tested for the hit of a ray."""
 
 MIRRORED = 2
-"""Number of images of the finger in each free edge."""
+"""Number of mirror images of the finger in each free edge."""
 
 
 def compute_sheet_points(
@@ -34,7 +34,7 @@ def compute_sheet_points(
     fingertip: Floats | None,
     finger_radius_m: float,
 ) -> Floats | None:
-    """Compute vertices (ROWS * COLUMNS, 3) in the world: rows upwards, columns to the right.
+    """Compute vertices (ROWS * COLUMNS, 3) in the world frame: rows upwards, columns to the right.
 
     fingertip: (3,), or None. Returns None if the edges are too close to each other.
     """
@@ -60,11 +60,11 @@ def compute_sheet_points(
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Compute the deflection (n,) of a film clamped at x = +-width / 2, over the finger's depth.
+    """Compute the deflection (n,) of a film clamped at x = +-width / 2, per depth of the finger.
 
-    x, y: (n,). The film solves Laplace's equation with a point force in an infinite strip. The
-    conformal map of the strip yields its Green's function in closed form. Free edges at y =
-    +-height / 2 are modelled by mirroring the finger. Within `radius_m` of the finger the
+    x, y: points (n,). The film solves Laplace's equation for a point force in an infinite strip,
+    whose Green's function is known in closed form from a conformal map. The free edges at y =
+    +-height / 2 are modelled by mirror images of the finger. Within `radius_m` of the finger the
     deflection is 1.
     """
     width_m, height_m = size_m
@@ -81,7 +81,10 @@ def film(
 
 
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
-    """Compute Green's function of Laplace in |x| < pi / 2, up to a factor, for (source_x, 0)."""
+    """Compute Green's function of Laplace's equation in |x| < pi / 2 for a source at (source_x, 0).
+
+    The result is not normalized.
+    """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)
     return np.asarray(np.log(np.maximum(high + np.cos(x + source_x), near) / near))
@@ -89,7 +92,7 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return the fractions (n, 1) of width and height of each vertex, 0 to 1."""
+    """Return each vertex's position as fractions (n, 1) of the width and of the height, 0 to 1."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)
 
@@ -104,10 +107,11 @@ def make_sheet_triangles() -> Indices:
 
 
 def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
-    """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet.
+    """Compute where rays from `origin` (3,) in directions `towards` (n, 3) meet the sheet.
 
-    points: from `compute_sheet_points`. A miss gives NaN. Method of Moeller and Trumbore
-    (1997), on the triangles around the vertex whose direction is nearest to the ray.
+    points: vertices from `compute_sheet_points`. A ray that misses gives NaN. The method of Moeller
+    and Trumbore (1997) is applied to the triangles around the vertex whose direction is nearest to
+    the ray.
     """
     direction = towards - origin
     directions = points - origin
@@ -129,7 +133,7 @@ def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
 
 
 def _around(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return indices (n, 2 * NEAR**2) of the triangles in the cells around vertices (n,)."""
+    """Return the indices (n, 2 * NEAR**2) of the triangles in the cells around vertices (n,)."""
     rows, columns = np.divmod(vertices, COLUMNS)
     cells = np.arange(-NEAR // 2, NEAR - NEAR // 2)
     row = np.clip(rows[:, None, None] + cells[None, :, None], 0, ROWS - 2)

@@ -1,4 +1,7 @@
-"""Compute the contents of the 3D view at one time, as arrays in the world frame."""
+"""Compute the contents of the 3D view at one time, as arrays in the world frame.
+
+"Skin" is the surface mesh of the soft object.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from flexsheet.nodes.models.rigid import transform_from_rpy
 Floats = NDArray[np.float64]
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
-"""Positions of the drawn rays, over the half width and half height of the object."""
+"""Positions of the drawn light rays, as fractions of half the object's width and height."""
 
 
 def transform_from_pose(pose: Pose) -> Floats:
@@ -27,11 +30,11 @@ def transform_from_pose(pose: Pose) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SceneSnapshot:
-    """Contents of the 3D view at one time; unknown values are None.
+    """Contents of the 3D view at one time; values that are not known yet are None.
 
-    links: by side, world_from_link (7, 4, 4). edges: by side, world_from_edge. sheet: (n, 3), see
-    `compute_sheet_points`. skin: (n, 3), deformed. finger: (3,). finger_valid: whether it is
-    tracked.
+    links: poses world_from_link (7, 4, 4) of each arm's links, by side. edges: pose world_from_edge
+    of each clamped edge, by side. sheet: points (n, 3) from `compute_sheet_points`. skin: deformed
+    vertices (n, 3). finger: fingertip (3,). finger_valid: whether the fingertip is tracked.
     """
 
     links: dict[str, Floats]
@@ -43,7 +46,7 @@ class SceneSnapshot:
 
 
 def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
-    """Compute the snapshot of the latest messages."""
+    """Compute the contents of the 3D view from the latest messages."""
     links, edges = {}, {}
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         state = source.latest(f"arm_{side}", ArmState)
@@ -78,7 +81,7 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the deformed skin; at rest before the solver's first result for it."""
+    """Return the deformed skin vertices; the skin at rest before the solver's first result."""
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
         return None
@@ -89,7 +92,10 @@ def _skin(source: MessageSource) -> Floats | None:
 
 
 def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
-    """Return indices (9,) of skin vertices for rays: a grid on the side that faces the user."""
+    """Select nine vertices at which light rays are drawn, in a grid on the user's side.
+
+    rest: vertices at rest. Return the indices (9,) of the vertices.
+    """
     low, high = rest.min(axis=0), rest.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     chosen = []
@@ -102,10 +108,11 @@ def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
 
 
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Compute the light rays of points (n, 3) of the deformed skin.
+    """Compute the light rays that show points (n, 3) of the deformed skin.
 
-    Return segments (m, 2, 3) from the eye to the sheet, and (m, 2, 3) from the sheet to the
-    projector. Points whose ray misses the sheet have none; a scene without projector has none.
+    Return segments (m, 2, 3) from the eye to the sheet, and segments (m, 2, 3) from the sheet to
+    the projector. A point whose ray misses the sheet has no segments, nor has a scene without
+    projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

@@ -1,4 +1,4 @@
-"""Store the state with which a restarted console continues."""
+"""Save and load the state with which a restarted console continues."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from flexsheet.nodes.console.scenes import SceneChoiceError
 class ConsoleState(BaseModel):
     """State of the console.
 
-    base: the selected scene. sliders: their values; None if not moved. recording: whether recording
-    was requested. finger: the requested position of the finger; None if nobody has moved it.
+    base: the selected scene. sliders: slider positions; None if not moved. recording: whether
+    recording was requested. finger: the requested finger position; None if nobody has moved it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,7 +28,7 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the state; return None without a file.
+    """Read the saved state; return None if there is no file.
 
     Raises SceneChoiceError for an invalid file.
     """

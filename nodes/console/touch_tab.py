@@ -1,4 +1,4 @@
-"""Show the tab that controls the finger, the scene and the view."""
+"""Show the page's tab that controls the finger, the scene and the view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LIFT, LOWER = "Lift the finger (L)", "Lower the finger (L)"
 
 
 class TouchTab:
-    """Controls of finger, scene and view."""
+    """Controls of the finger, the scene and the view."""
 
     def __init__(self, gui: Any, request: Request, view: SceneView, *, with_finger: bool) -> None:
         self._gui, self._request, self._view = gui, request, view
@@ -42,7 +42,12 @@ class TouchTab:
     def _add_finger(self) -> None:
         gui, request = self._gui, self._request
         self._depth = gui.add_slider(
-            "Push, mm", 0.0, MAX_DEPTH_MM, 0.5, 4.0, hint="Depth of the finger in the object"
+            "Push, mm",
+            0.0,
+            MAX_DEPTH_MM,
+            0.5,
+            4.0,
+            hint="Depth of the finger below the object's surface",
         )
         self._across = gui.add_slider(
             "Across, mm",
@@ -98,9 +103,9 @@ class TouchTab:
                 on_value(box, partial(self._request, "show_layer", layer))
 
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
-        """Show a scene of the graph.
+        """Show the values of a scene in the controls.
 
-        base: the scene that the sliders change.
+        base: the scene before the sliders changed it.
         """
         if names:
             self._scene.options = tuple(names)
@@ -114,19 +119,19 @@ class TouchTab:
         self._size.value = round(100.0 * sliders.size_ratio)
 
     def show_intent(self, finger: FingerController) -> None:
-        """Show the requested position of the finger."""
+        """Show the finger position that the viewer requested."""
         if self._with_finger:
             show_value(self._depth, _within(1e3 * finger.intent.depth_m, 0.0, MAX_DEPTH_MM, 1))
             self.show_position(finger)
             self.show_lifted(finger)
 
     def show_position(self, finger: FingerController) -> None:
-        """Show the requested position, clipped to the sliders."""
+        """Show the requested position, clipped to the range of the sliders."""
         for slider, value_m in zip((self._across, self._up), finger.position_m, strict=True):
             show_value(slider, _within(1e3 * value_m, -MAX_OFFSET_MM, MAX_OFFSET_MM, 0))
 
     def show_lifted(self, finger: FingerController) -> None:
-        """Show the label of the button: lift the finger, or lower it."""
+        """Label the button according to what it does next: lift or lower the finger."""
         label = LOWER if finger.intent.lifted else LIFT
         if self._lift.label != label:
             self._lift.label = label

@@ -1,6 +1,6 @@
 """Write messages to bags.
 
-If the disk fills up, close the current bag and continue in a new one.
+If the disk fills up, the current bag is closed, and a new one is started when space is free again.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 RETRY_NS = 5_000_000_000
-"""Time after a disk error before the next attempt."""
+"""Time after a disk error before the next attempt to start a bag."""
 
 
 class BagRecording:
-    """Recording of messages to bags while it is requested.
+    """Recording of messages to bags, while it is requested.
 
-    A bag ends at `keep_free_bytes`, which leave space for its index.  When twice as much is free
-    again, another bag starts with the last messages of all latched topics.  Disk errors during
-    writing are passed to `on_error`, not raised.
+    A bag is ended when the free disk space falls to `keep_free_bytes`, which leaves space for its
+    index.  When twice as much is free again, another bag starts with the last messages of all
+    latched topics.  Disk errors during writing are passed to `on_error`, not raised.
 
     note: state of the recording, one line.  lost: number of lost messages since the last bag.
     """
@@ -57,13 +57,13 @@ class BagRecording:
 
     @property
     def path(self) -> Path | None:
-        """Return the current bag; None if there is none."""
+        """Return the path of the current bag; None if there is none."""
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
         """Start a bag named after the current time.  Raises BagError or OSError."""
         self.requested, self.lost = True, 0
-        # The time of day is only used for the bag's name.
+        # The time of day is only used to name the bag.
         now = datetime.now(UTC)
         self._path = Path(now.astimezone().strftime(str(self._parameters.bag)))
         try:
@@ -74,7 +74,7 @@ class BagRecording:
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Start a bag, or end the current one; a disk error is passed to `on_error`."""
+        """Start a bag, or end the current one; disk errors are passed to `on_error`."""
         try:
             if requested and not self.requested:
                 self.start()
@@ -87,9 +87,9 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag at a low free space, or start another one at a sufficient free space.
+        """End the bag if free disk space is low, and start another bag when there is enough again.
 
-        Also start another bag at the maximum size or duration.
+        Also start another bag when the current one reaches the maximum size or duration.
         """
         if not self.requested:
             return
@@ -116,7 +116,7 @@ class BagRecording:
         )
 
     def _split(self, bag: BagWriter) -> None:
-        """Close the bag and start another one, which begins with the latched messages."""
+        """Close the bag and start the next one, which begins with the latched messages."""
         self._bag = None
         try:
             bag.close()
@@ -125,10 +125,10 @@ class BagRecording:
             self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
-        """Write a message, and return whether it is lost because no bag is open.
+        """Write a message; return whether it is lost because no bag is open.
 
-        The last message of each writer of a latched topic is stored for the next bag, except
-        requests to record.
+        The last message of each writer of a latched topic is stored for the next bag. Recording
+        commands are not stored.
         """
         is_request = self._parameters.start_paused and topic.message is Recording
         if topic.delivery is Delivery.LATCHED and not is_request:
@@ -167,13 +167,13 @@ class BagRecording:
         self.note = f"recording to {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
-        """Close the bag after an error, and report the error."""
+        """Close the bag after a disk error, and report the error."""
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
         self.note = f"{NodeNote.NOT_RECORDING.phrase} {error}"
         self._on_error(error)
         if bag is not None:
-            # The disk error is already reported, and a truncated bag can be read.
+            # The disk error is already reported, and a truncated bag can still be read.
             with suppress(BagError):
                 bag.close()
             if bag.messages == 0:
@@ -194,7 +194,7 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a bag at a free path, with attached files.  Raises BagError or OSError."""
+    """Open a bag at a free path and attach files to it.  Raises BagError or OSError."""
     bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
     try:
         for file in attach:

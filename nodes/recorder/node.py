@@ -1,4 +1,4 @@
-"""Record topics to a bag: the encoded messages and the schemas to decode them."""
+"""Record topics to a bag: the serialized messages and the schemas to decode them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 
 class Recorder(Node):
-    """Node that writes received messages to a bag; an existing bag is never overwritten.
+    """Node that writes the messages it receives to a bag; it never overwrites an existing bag.
 
     If the disk is full, the graph continues without a recording.  Lost messages are counted as
-    dropped, and the note contains the reason; see `BagRecording`.
+    dropped, and the node's note contains the reason; see `BagRecording`.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RECORDER
@@ -43,7 +43,7 @@ class Recorder(Node):
     async def setup(self) -> None:
         compress = self.parameters.compress
         if compress is None:
-            # Topics that are not logged by default are images, which are slow to compress.
+            # Topics that are not recorded by default contain images, which take long to compress.
             compress = all(source.topic.logged for source in self.inputs.values())
         self._recording = BagRecording(
             self.parameters,
@@ -59,12 +59,12 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full, and start another one at sufficient free space."""
+        """End the bag before the disk is full; start another one when there is space again."""
         self._recording.check_disk()
         self.note = self._recording.note
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Write the undecoded frames of a message."""
+        """Write a message's frames to the bag without decoding them."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         if self.parameters.start_paused and source.topic.message is Recording:

@@ -14,10 +14,10 @@ RUN_FILES = tuple(
 
 
 class RecorderParameters(NodeParameters):
-    """Parameters of the recorder: topics to record and bag to write."""
+    """Parameters of the recorder: which topics to record, to which bag, and disk limits."""
 
     bag: Path = Field(
-        description="file to write; %Y%m%d-%H%M%S and similar codes become the start time"
+        description="bag file to write; %Y%m%d-%H%M%S and similar codes become the start time"
     )
     topics: tuple[str, ...] = Field(
         default=(), description="topics to record; empty: all that are logged by default"
@@ -27,22 +27,22 @@ class RecorderParameters(NodeParameters):
     )
     compress: bool | None = Field(
         default=None,
-        description="compress the bag; null: unless it contains images, which are slow to compress",
+        description="compress the bag; null: only if it has no images, which take long to compress",
     )
     start_paused: bool = Field(
         default=False,
-        description="record only on request by the topic `recording`, each time to a new bag",
+        description="record only while the topic `recording` requests it, each time to a new bag",
     )
     keep_free_bytes: int = Field(
         default=256 << 20,
         ge=0,
-        description="minimum free space of the disk, below which the bag is ended; another bag "
-        "starts at twice as much",
+        description="minimum free space on the disk, below which the bag is ended; another bag "
+        "starts when twice as much is free",
     )
     watch_hz: float = Field(
         default=2.0,
         gt=0.0,
-        description="rate of the checks of disk, size and duration",
+        description="rate at which disk space, bag size and duration are checked, Hz",
     )
     max_bag_bytes: int | None = Field(
         default=None, ge=1, description="size at which another bag is started; null: no limit"
