@@ -154,11 +154,11 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "    topics: {twin__finger: twin/arms}\n",
-            'topic "twin/arms" carries TwinArms, port "twin__finger" needs TwinFinger',
+            'topic "twin/arms" has message type TwinArms, but port "twin__finger" requires',
         ),
         (
             GRAPH + f"  second: {{type: '{BEACON}'}}\n",
-            'topic "twin/finger" is written by "beacon" already; connect one of the two ports',
+            'topic "twin/finger" is already written by "beacon"; connect one of the two ports',
         ),
         (
             f"nodes: {{listener: {{type: '{LISTENER}'}}}}\n",
@@ -166,7 +166,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" does not exist'),
         (GRAPH + "external_topics: [fingertp]\n", 'did you mean "fingertip"?'),
-        (GRAPH + "external_topics: [twin/finger]\n", 'is written by "beacon" already'),
+        (GRAPH + "external_topics: [twin/finger]\n", 'is already written by "beacon"'),
         (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is reserved'),
         (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is reserved'),
         (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
