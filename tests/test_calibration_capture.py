@@ -412,7 +412,7 @@ def test_images_are_taken_from_the_camera_source(
         (("--device-source", "twin", "--scene", "SCENE"), "use --twin SCENE"),
         (
             ("--device-source", "[1,", "--scene", "SCENE"),
-            "use the format of a camera node's source",
+            "use the format of a camera node's parameter",
         ),
         (("--twin", "SCENE", "--pictures", "."), "name a new folder"),
         (("--twin", "SCENE", "--marker-mm", "40"), "do not fit"),

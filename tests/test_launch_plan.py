@@ -138,7 +138,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
         (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),
         (GRAPH + "hosts: {main: {address: left.lab}}\n", '"left.lab" is not an IP address'),
-        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "is not the address of one host"),
+        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "is not the address of a single host"),
         (
             GRAPH + "hosts: {main: {address: 127.0.0.1}, left: {address: 127.0.0.1}}\n",
             'is also the address of host "main"',
