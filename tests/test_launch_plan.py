@@ -399,10 +399,10 @@ def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> N
     [
         (f'"{BEACON}"}}', f'"{BEACON}", process: arm}}', 'fault of "beacon" would stop the arm'),
         ("port: 5020", "port: 5022", 'fault of "twin_arms" would stop the arm of "bridge"'),
-        ("process: arm}", "process: arm, nice: 3}", "give both the same nice"),
-        ("process: arm}", "process: arm, host: left}", "give both the same host"),
+        ("process: arm}", "process: arm, nice: 3}", "set the same nice for both nodes"),
+        ("process: arm}", "process: arm, host: left}", "set the same host for both nodes"),
         ("process: arm", "process: beacon", "is the name of another node"),
-        ("process: arm", "process: plan", "or reserved"),
+        ("process: arm", "process: plan", "or is reserved"),
         ("process: arm", "process: 3", "process"),
     ],
 )
