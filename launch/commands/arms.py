@@ -183,10 +183,7 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """Connection to the arms of a running graph, for their states and for commands.
-
-    It is an asynchronous context manager.
-    """
+    """Asynchronous context that receives the states of a graph's arms and publishes commands."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run

@@ -75,10 +75,7 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
 
 
 def simulate_views(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """Yield one simulated image pair for each of several poses of a board.
-
-    Raises CommandError if the board cannot be simulated.
-    """
+    """Yield one simulated image pair per pose of a board.  Raises CommandError."""
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
 

@@ -21,10 +21,7 @@ def measure_system(
     configurations: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Measure the configurations, print the results and draw a chart into the folder `output`.
-
-    If the measurement was interrupted, the same folder continues it.
-    """
+    """Measure configurations and draw a chart; the same folder continues a measurement."""
     import json
 
     from flexsheet.launch.methods.results import describe_load, replace_non_finite
@@ -62,14 +59,7 @@ def _print_points(result: dict[str, Any]) -> None:
     from flexsheet.launch.methods.system_chart import ERRORS
 
     front = {(one["scene"], one["configuration"]) for one in result["front"]}
-    columns = (
-        "scene",
-        "configuration",
-        "cores",
-        "exposure to arm, ms",
-        "exposure to image, ms",
-        *ERRORS,
-    )
+    columns = ("scene", "configuration", "cores", "to arm, ms", "to image, ms", *ERRORS)
     rows = [
         (
             point["scene"],

@@ -121,10 +121,7 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 
 
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
-    """Return the host name of this computer in the graph.
-
-    Raises CommandError if it is unknown or cannot be determined.
-    """
+    """Return this computer's host name in the graph.  Raises CommandError if it is ambiguous."""
     from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN

@@ -70,10 +70,7 @@ MapOption = Annotated[
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create and return the folder for the bag and results of an experiment.
-
-    This is `output`, or a new folder in runs/ if it is None.
-    """
+    """Create the folder for an experiment's bag and results: `output`, or a new folder in runs/."""
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:

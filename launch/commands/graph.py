@@ -53,10 +53,7 @@ async def receive_until(
     done: Callable[[], bool],
     timeout_s: float,
 ) -> bool:
-    """Pass messages of the running graph to the handler of their topic until `done()`.
-
-    Returns False if that takes longer than `timeout_s`.
-    """
+    """Pass messages to the handler of their topic until `done()`; return False on a timeout."""
     from flexsheet.launch.running.tools import make_subscriber
 
     satisfied = asyncio.Event()

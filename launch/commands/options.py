@@ -224,10 +224,7 @@ _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "l
 
 
 def name_values(command: Any) -> None:
-    """Set the placeholder that the help shows for the value of each argument and option.
-
-    Flags have no value and get an empty placeholder.
-    """
+    """Set the placeholder that the help shows for the value of an option; flags have no value."""
     help_option = command.get_help_option(SimpleNamespace(help_option_names=["-h", "--help"]))
     for parameter in (*command.params, help_option):
         if getattr(parameter, "is_flag", False):

@@ -158,10 +158,7 @@ def hz(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the message rate of each writer of a topic.
-
-    The rate is computed from the publication timestamps and the sequence numbers.
-    """
+    """Measure the message rate of each writer of a topic, from timestamps and sequence numbers."""
     arrivals = _measure(topic, run, duration)
     print_rows(measure_rates([one.header for one in arrivals]), as_json=as_json)
 
@@ -348,10 +345,7 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
-    """Convert a message or a field to JSON types.
-
-    Unless `full`, a long array is replaced by its type, shape, minimum and maximum.
-    """
+    """Convert a message or field to JSON types; unless `full`, summarize long arrays."""
     import numpy as np
     from pydantic import BaseModel
 
@@ -501,10 +495,7 @@ async def _collect(
 def make_listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, raw: bool = False
 ) -> Subscriber:
-    """Return a subscriber to a topic of the running graph.
-
-    Raises CommandError if no node writes the topic.
-    """
+    """Return a subscriber to a topic of the running graph.  Raises CommandError."""
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)

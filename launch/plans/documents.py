@@ -391,10 +391,7 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
 
 
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
-    """Validate the document's values below the key `at` against `model`, and return the model.
-
-    Raises BadInputError with all problems.
-    """
+    """Validate the values below the key `at`.  Raises BadInputError with all problems."""
     values: Any = document.values
     for part in at:
         values = values[part]

@@ -128,10 +128,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign each node a column to the right of all nodes whose topics it reads.
-
-    Links that close a loop are ignored.
-    """
+    """Assign each node a column right of all nodes whose topics it reads; ignore loops."""
     order: list[str] = []
     seen: set[str] = set()
 

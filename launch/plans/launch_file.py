@@ -244,10 +244,7 @@ def apply_console(document: Document) -> None:
 
 
 def _find_role(type_name: object) -> NodeRole | None:
-    """Return the role that the class of a node type declares.
-
-    None if it declares none or cannot be imported.
-    """
+    """Return the role of a node type; None if its class has none or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):

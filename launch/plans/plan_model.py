@@ -73,10 +73,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """Writer of a topic with its endpoints.
-
-    Readers on the writer's host connect to `ipc`, readers on other hosts to `tcp`.
-    """
+    """Writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
 
     name: str
     host: str
@@ -103,10 +100,7 @@ class Writer(StrictModel):
 
 
 class ResolvedPort(StrictModel):
-    """Input or output port of a node, with its topic and endpoints.
-
-    An output binds the endpoints; an input connects to them.
-    """
+    """Port of a node with its topic; an output binds the endpoints, an input connects to them."""
 
     port: str
     topic: str
@@ -173,10 +167,7 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """Process of the graph with its nodes.
-
-    The nodes have the same host, niceness, restart policy and heartbeat timeout.
-    """
+    """Process with its nodes, which have equal niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
@@ -247,10 +238,7 @@ class ResolvedGraph(StrictModel):
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def processes_on(self, host: str | None) -> list[ResolvedProcess]:
-        """Return the processes on one host, in the order of their first nodes.
-
-        None selects all hosts.
-        """
+        """Return the processes on one host (None: all hosts), in the order of their first nodes."""
         members: dict[str, list[ResolvedNode]] = {}
         for node in self.nodes_on(host):
             members.setdefault(node.process or node.name, []).append(node)

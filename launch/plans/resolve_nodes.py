@@ -63,10 +63,7 @@ class NodeEntry:
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs whose topic no node writes.
-
-        Inputs to which the launch file assigns a topic stay connected.
-        """
+        """Disconnect optional inputs without a writer, unless the launch file names a topic."""
         if self.type is None:
             return
         self.disconnect(
@@ -136,10 +133,7 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 
 
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
-    """Find the node's class, connect its ports to topics, and check its parameters.
-
-    Problems are reported to `document`.
-    """
+    """Find the node's class, connect its ports, check its parameters, and report problems."""
     key = entry.key
     type_name = entry.spec.type
     try:

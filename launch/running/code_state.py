@@ -37,10 +37,7 @@ def read_git_state(directory: Path) -> str:
 
 
 def _has_changed_sources(listed: str) -> bool:
-    """Return whether the output of `git status --porcelain -z` lists changed or new code files.
-
-    Each of its entries consists of two letters and a path.
-    """
+    """Return whether the output of `git status --porcelain -z` lists changed or new code files."""
     entries = [entry for entry in listed.split("\0") if entry]
     return any(
         not entry.startswith(UNTRACKED) or Path(entry).suffix in SOURCE_SUFFIXES

@@ -96,10 +96,7 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs that used most processor time since the last call.
-
-        The result is empty at the first call, or if the last call is older than WINDOW_S.
-        """
+        """Return the programs that used most processor time since the last call, if recent."""
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)

@@ -37,10 +37,7 @@ class EStopFile:
         self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """Return the stored e-stop; None if there is no file.
-
-        If the file cannot be read, an e-stop with that reason is returned.
-        """
+        """Return the stored e-stop, or None.  An unreadable file also counts as an e-stop."""
         try:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:

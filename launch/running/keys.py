@@ -87,10 +87,7 @@ class KeyWatch:
 
 
 def install(launch_file: Path, host: str, key: str) -> None:
-    """Write the public key of a host into a launch file.  Raises BadInputError.
-
-    Comments and layout of the file are preserved.
-    """
+    """Write the public key of a host into a launch file.  Raises BadInputError."""
     document = read_document(launch_file)
     hosts = document.values.get("hosts")
     if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):

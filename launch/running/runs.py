@@ -107,10 +107,7 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs.
-
-    Its path must be short, because Linux limits socket paths to 107 bytes.
-    """
+    """Return the folder of this user's runs; it is short, as socket paths are limited."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
@@ -228,10 +225,7 @@ def _signal(processes: Iterable[psutil.Process], number: int) -> None:
 
 
 def _is_of_our_namespace(run: Run) -> bool:
-    """Return whether the run's launcher used the PID namespace of this process.
-
-    A container can share the folder of runs but has its own process ids.
-    """
+    """Return whether the run's launcher has our PID namespace; a container has another one."""
     try:
         marker = json.loads((run.directory / _LAUNCHER_FILE).read_text())
     except FileNotFoundError:

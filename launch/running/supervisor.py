@@ -220,10 +220,7 @@ class Child:
         return True
 
     def _handle_line(self, line: bytes) -> None:
-        """Report a line and write it to the log of the node that it names, if any.
-
-        A line without a known node goes to the log of the process.
-        """
+        """Report a line and write it to the log of the node that it names, else of the process."""
         node = self._find_node(line)
         self._logs[node].write(line + b"\n")
         if self._reports:
@@ -298,10 +295,7 @@ class RunningGraph:
 
     @property
     def run(self) -> Run:
-        """Return the run, with its directory, logs and id.
-
-        Raises RuntimeError if the graph has not been started.
-        """
+        """Return the run (directory, logs, id).  Raises RuntimeError before the start."""
         if self._run is None:
             raise RuntimeError("the graph has not been started")
         return self._run
@@ -392,10 +386,7 @@ class RunningGraph:
             child.signal(signal.SIGKILL)
 
     async def stop(self) -> None:
-        """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets.
-
-        A second call has no effect.
-        """
+        """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets; may be called twice."""
         self._stopping = True
         watches = [] if self._keys_watch is None else [self._keys_watch]
         for task in (*self._supervisors.values(), *watches):
@@ -661,10 +652,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the graph's scene file as JSON.
-
-        Nodes that publish scenes can then switch to them.
-        """
+        """Write all scenes in the folder of the scene file as JSON, for nodes that publish them."""
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
@@ -708,10 +696,7 @@ async def _terminate(children: list[Child]) -> None:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """Return the configuration with which a node is started in a run.
-
-    The placeholder of the run's directory is replaced by its path.
-    """
+    """Return the configuration of a node; replace the placeholder of the run's directory."""
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
