@@ -58,7 +58,9 @@ def tune(
     ] = False,
     margin: Annotated[
         float,
-        typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance that is kept as a margin."),
+        typer.Option(
+            min=0.0, max=0.9, help="Fraction of each tolerance that is reserved as a margin."
+        ),
     ] = 0.2,
     runs: Annotated[
         int,
