@@ -1,1 +1,1 @@
-"""Launch files, scenes, supervision, experiments, method benchmarks and the command line."""
+"""Command line, launch files and scenes, supervision of nodes, experiments, method benchmarks."""

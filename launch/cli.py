@@ -1,7 +1,7 @@
-"""The `flexsheet` command.
+"""Entry point of the `flexsheet` command.
 
-A command is a line of `COMMANDS`; its module in `launch.commands` is imported only when it is
-called, so that commands start fast.
+The table `COMMANDS` lists all subcommands. The module of a subcommand in `launch.commands` is
+imported only when it is called, so that commands start fast.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
 }
-"""Map each command to its modules in `flexsheet.launch.commands`, in the order of `--help`.
+"""Modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first module defines the typer app `app`, or the one that is named after a colon; the others add
-to it with `register(app)`.
+The first module defines the typer app, called `app` or as given after a colon. The other modules
+add commands to it with `register(app)`.
 """
 
 
 @cache
 def load_command(name: str) -> Any:
-    """Return the click command of a name in `COMMANDS`."""
+    """Import the modules of a command in `COMMANDS` and return its click command."""
     first, *further = COMMANDS[name]
     module, _, attribute = first.partition(":")
     app: typer.Typer = getattr(_import(module), attribute or "app")
@@ -80,9 +80,10 @@ def _import(module: str) -> Any:
 
 
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms"})
-"""Commands that SIGINT may end without cleanup until their event loop handles it.
+"""Commands for which Python's SIGINT handler is not installed.
 
-The other commands clean up after the KeyboardInterrupt that Python's handler raises.
+Until their event loop handles SIGINT, the signal ends them without cleanup. In other commands,
+Python's handler raises KeyboardInterrupt, and they clean up.
 """
 
 
@@ -100,7 +101,7 @@ class CommandTable(Mapping[str, Any]):
 
 
 class CommandGroup(TyperGroup):
-    """Typer group with the commands of `CommandTable`."""
+    """Typer group whose subcommands are imported on first use by `CommandTable`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -130,7 +131,7 @@ app = typer.Typer(
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit if it was requested."""
+    """Print the version and exit, if the option --version is given."""
     if requested:
         from importlib.metadata import version
 
@@ -151,7 +152,7 @@ def flexsheet(
 
 
 def main() -> None:
-    """Run the command line; print errors that users can correct without a traceback."""
+    """Run the command line.  Errors that users can correct are printed without a traceback."""
     try:
         app(prog_name="flexsheet")
     except Exception as error:
@@ -165,7 +166,7 @@ def main() -> None:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error; for a disk error, with the path and the remedy."""
+    """Return the text of an error; add path and remedy to the text of a disk error."""
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))

@@ -344,7 +344,7 @@ def test_a_node_that_asks_for_the_topic_is_refused(tmp_path: Path) -> None:
     tree["nodes"]["spy"] = spied
     with launch_file.open("w") as file:
         yaml.dump(tree, file)
-    with pytest.raises(BadInputError, match="would read the truth"):
+    with pytest.raises(BadInputError, match="would read the ground truth"):
         load_graph(launch_file, apparatus="seed:1")
 
 

@@ -365,7 +365,7 @@ def test_a_parameter_is_read_and_changed_in_the_running_graph(
     ("arguments", "code", "said"),
     [
         (("set", "beacon.rate_hz", "9"), 2, "start the graph again with --set beacon.rate_hz=9"),
-        (("set", "listener.patience_s", "soon"), 2, "listener.patience_s=soon: is invalid"),
+        (("set", "listener.patience_s", "soon"), 2, "listener.patience_s=soon: invalid value"),
         (("set", "listener.patience", "1"), 2, 'did you mean "patience_s"?'),
         (("get", "listner.patience_s"), 2, 'did you mean "listener"?'),
     ],

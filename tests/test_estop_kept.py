@@ -191,7 +191,7 @@ async def test_a_reset_from_the_future_is_rejected(folder: Path) -> None:
         launchers.say(STOP)
         await until(lambda: len(files(folder)) == 2, launchers.said)
         launchers.say(RESET, before_ns=-(10**10))
-        refused = "e-stop not reset by tools: stamped in the future"
+        refused = "e-stop not reset by tools: its timestamp is in the future"
         await until(lambda: launchers.said.count(refused) == 2, launchers.said)
         assert len(files(folder)) == 2
 

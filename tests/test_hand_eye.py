@@ -462,7 +462,7 @@ def test_bad_input_to_the_command_is_named(
     write_poses(poor, place.detections(8, rotation_rad=[0.0, 0.0, 0.4]), place, "rad")
     output = tmp_path / "arms.yaml"
     for arguments, words in (
-        ([*COMMON, "-o", output], "give --left-arm, --right-arm or both, or else --twin"),
+        ([*COMMON, "-o", output], "give either --twin, or --left-arm, --right-arm or both"),
         ([*COMMON, "--left-arm", tmp_path / "none", "-o", output], "joints.csv: cannot be read"),
         ([*COMMON, "--left-arm", poor, "-o", output], "rotates about one axis only"),
         ([*COMMON, "--left-arm", poor, "-o", tmp_path / "no" / "x"], "does not exist"),

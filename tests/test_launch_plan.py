@@ -138,7 +138,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
         (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),
         (GRAPH + "hosts: {main: {address: left.lab}}\n", '"left.lab" is not an IP address'),
-        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "is not the address of one host"),
+        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "is not the address of a single host"),
         (
             GRAPH + "hosts: {main: {address: 127.0.0.1}, left: {address: 127.0.0.1}}\n",
             'is also the address of host "main"',
@@ -154,11 +154,11 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "    topics: {twin__finger: twin/arms}\n",
-            'topic "twin/arms" carries TwinArms, port "twin__finger" needs TwinFinger',
+            'topic "twin/arms" has message type TwinArms, but port "twin__finger" requires',
         ),
         (
             GRAPH + f"  second: {{type: '{BEACON}'}}\n",
-            'topic "twin/finger" is written by "beacon" already; connect one of the two ports',
+            'topic "twin/finger" is already written by "beacon"; connect one of the two ports',
         ),
         (
             f"nodes: {{listener: {{type: '{LISTENER}'}}}}\n",
@@ -166,7 +166,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" does not exist'),
         (GRAPH + "external_topics: [fingertp]\n", 'did you mean "fingertip"?'),
-        (GRAPH + "external_topics: [twin/finger]\n", 'is written by "beacon" already'),
+        (GRAPH + "external_topics: [twin/finger]\n", 'is already written by "beacon"'),
         (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is reserved'),
         (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is reserved'),
         (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
@@ -400,10 +400,10 @@ def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> N
     [
         (f'"{BEACON}"}}', f'"{BEACON}", process: arm}}', 'fault of "beacon" would stop the arm'),
         ("port: 5020", "port: 5022", 'fault of "twin_arms" would stop the arm of "bridge"'),
-        ("process: arm}", "process: arm, nice: 3}", "give both the same nice"),
-        ("process: arm}", "process: arm, host: left}", "give both the same host"),
+        ("process: arm}", "process: arm, nice: 3}", "set the same nice for both nodes"),
+        ("process: arm}", "process: arm, host: left}", "set the same host for both nodes"),
         ("process: arm", "process: beacon", "is the name of another node"),
-        ("process: arm", "process: plan", "or reserved"),
+        ("process: arm", "process: plan", "or is reserved"),
         ("process: arm", "process: 3", "process"),
     ],
 )

@@ -228,7 +228,7 @@ def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
         return str(result.exception)
 
     assert "exactly one of" in failing()
-    assert "does not contain a subfolder" in failing("--pictures", str(tmp_path))
+    assert "contains no subfolders" in failing("--pictures", str(tmp_path))
     (tmp_path / "pose1").mkdir()
     assert "expected 42 files left*.png, one per pattern, found 0" in failing(
         "--pictures", str(tmp_path)

@@ -191,8 +191,16 @@ ONE, TWO = make_key_pair()[0], make_key_pair()[0]
 @pytest.mark.parametrize(
     ("main", "left", "said"),
     [
-        (ONE, None, "hosts.left: has no key, but other hosts do; create one on that host"),
-        (ONE, ONE, 'hosts.left.key: is also the key of host "main"; give each host its own key'),
+        (
+            ONE,
+            None,
+            "hosts.left: the host has no key, but other hosts have one; create one on that host",
+        ),
+        (
+            ONE,
+            ONE,
+            'hosts.left.key: the same key belongs to host "main"; create a separate key for',
+        ),
         (ONE, "secret", 'hosts.left.key: "secret" is not a public key'),
     ],
     ids=["one without", "two alike", "no key"],  # keys are redrawn; names of tests must not be

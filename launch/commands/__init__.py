@@ -1,4 +1,4 @@
 """Subcommands of `flexsheet`, one module per command.
 
-Commands import libraries when they run, so that help and `topic list` start quickly.
+Commands import libraries only when they run, so that `--help` and short commands start fast.
 """

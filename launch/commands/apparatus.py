@@ -1,4 +1,4 @@
-"""`flexsheet apparatus`: draw, show and compare true parameters of the simulation."""
+"""`flexsheet apparatus`: sample and show true parameters of simulated hardware (apparatus)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from flexsheet.launch.commands.output import (
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="Draw and show true parameters of the simulation, as differences from the scene.",
+    help="Sample and show an apparatus: true parameters of the simulated hardware.",
 )
 
 
@@ -40,7 +40,7 @@ def sample(
     seed: Annotated[
         int,
         typer.Option(
-            min=0, help="Seed of the draw; 0 to 99 are for development, others for evaluation."
+            min=0, help="Random seed; 0 to 99 are for development, higher ones for evaluation."
         ),
     ],
     output: Annotated[Path, output_file("Apparatus file to write.")],
@@ -49,7 +49,7 @@ def sample(
     scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw an apparatus from the table of tolerances, and write it to a file."""
+    """Sample an apparatus randomly within the tolerances of the hardware; write it to a file."""
     from flexsheet.launch.plans.apparatus import format_apparatus
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.files import write_file
@@ -74,12 +74,15 @@ def sample(
 def show(
     *,
     apparatus: Annotated[
-        str, typer.Argument(metavar="FILE|seed:N", help="Apparatus file, or a draw.")
+        str,
+        typer.Argument(
+            metavar="FILE|seed:N", help="Apparatus file, or seed:N for a random sample."
+        ),
     ],
     scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
-    """Check an apparatus, and list how it differs from its scene.
+    """Check an apparatus file, and list its differences from the scene.
 
     Exit code 2: the file has unknown keys or impossible values, or belongs to another scene.
     """
@@ -108,9 +111,7 @@ def show(
             (
                 row["parameter"],
                 _format(row["value"]),
-                "as the scene or node has it"
-                if row["nominal"] is None
-                else _format(row["nominal"]),
+                "value in scene or node" if row["nominal"] is None else _format(row["nominal"]),
                 row["unit"],
                 "" if row["simulated"] else "not simulated",
             )

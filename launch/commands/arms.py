@@ -43,7 +43,7 @@ TOPICS = ("arm_left", "arm_right")
 CONFIRMATION_TIMEOUT_S = 3.0
 MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
-ReasonOption = Annotated[str, typer.Option("--reason", help="Reason that is shown and logged.")]
+ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, which is shown and logged.")]
 
 
 @app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
@@ -54,9 +54,9 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 
 @app.command(epilog=examples("flexsheet arms enable"))
 def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Allow the arms to move; make sure first that nobody is near them.
+    """Allow the arms to move; first make sure that nobody is near them.
 
-    Exit code 1 if an arm refuses; prints its reason.
+    If an arm refuses, its reason is printed and the exit code is 1.
     """
     from flexsheet.messages.types import Arming
 
@@ -85,11 +85,12 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop, which latches; it does not replace the hard-wired e-stop.
+    """Engage the software e-stop of the arms, which stays engaged until it is reset.
 
-    Without --run, stops all graphs of this user on this computer.
+    It does not replace the hard-wired e-stop. Without --run, the arms of all graphs of this user on
+    this computer are stopped.
 
-    Exit code 0 if a launcher or a bridge has confirmed the stop, or both arms report it.
+    Exit code 0 if a launcher or an arm bridge has confirmed the stop, or both arms report it.
     """
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
@@ -104,7 +105,10 @@ def stop(
 async def _confirm_stop(
     run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
 ) -> int:
-    """Publish the stop unless a launcher has confirmed it; show the state of the arms."""
+    """Print the result of the stop attempts and the state of the arms; return the exit code.
+
+    If no launcher has confirmed the stop, it is also published on the topic estop.
+    """
     from flexsheet.launch.running.stopping import StopOutcome, StopPath
     from flexsheet.messages.types import EStop
 
@@ -127,7 +131,9 @@ async def _confirm_stop(
         silent += [side for side in SIDES if side not in arms.states]
         words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}")
     if any(one.outcome is StopOutcome.REFUSED for one in attempts):
-        words.print("another tool is using the endpoint of the topic estop")
+        words.print(
+            "the stop was not published on the topic estop, because another tool is writing it"
+        )
     return 0 if confirmed else FAILED
 
 
@@ -137,9 +143,9 @@ def reset(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Clear an e-stop and latched faults of arms at rest.
+    """Reset the e-stop and the stored faults of arms that are at rest.
 
-    Arms with `arming: manual` do not move until `flexsheet arms enable`. Simulated arms with
+    Arms with `arming: manual` then stay at rest until `flexsheet arms enable`. Simulated arms with
     `arming: auto` move as soon as they receive a target.
     """
     from flexsheet.messages.types import EStop
@@ -156,7 +162,7 @@ def reset(
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Return a text about what the arms do after a reset, from their bridges' `arming`."""
+    """Return a text that says when each arm moves after a reset; its bridge defines this."""
     from flexsheet.launch.plans.plan_model import ArmingMode
 
     arming = {
@@ -177,7 +183,7 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """Connection to the arms of a running graph, an async context: states and commands."""
+    """Asynchronous context that receives the states of a graph's arms and publishes commands."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -210,7 +216,7 @@ class _Arms:
         self.states[state.side], self._received_s[state.side] = state, self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
-        """Publish a message once, after its readers have connected."""
+        """Wait until readers have connected, then publish a message once."""
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
         self._writer = GraphWriter(self._plan, self._run, [topic])
@@ -218,7 +224,7 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish a stop immediately; it is latched, so later readers receive it too."""
+        """Publish an e-stop immediately; the topic is latched, so late readers receive it too."""
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
         from flexsheet.messages.bus import BusError
@@ -227,14 +233,14 @@ class _Arms:
         try:
             self._writer = GraphWriter(self._plan, self._run, ["estop"])
             self._writer.publish("estop", estop)
-            # Wait for a launcher, which stores the stop, to reconnect.
+            # Wait until a launcher, which stores the e-stop, has had time to connect.
             await asyncio.sleep(READER_RECONNECT_S)
         except BusError:
             outcome = StopOutcome.REFUSED
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Return whether states younger than MAX_STATE_AGE_S satisfy `done` before the timeout."""
+        """Wait until arm states younger than MAX_STATE_AGE_S satisfy `done`; False on timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             if done(
@@ -255,7 +261,10 @@ async def _command(
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
-    """Publish a command to both arms, wait for its effect, and print their states."""
+    """Publish a command to both arms, wait until `done`, and print the states of the arms.
+
+    command: topic and message; None only prints. Returns the exit code.
+    """
     from flexsheet.launch.running.tools import tools_host
 
     plan, run = running_graph(run_directory)

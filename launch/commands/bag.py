@@ -67,7 +67,7 @@ def record(
     ] = None,
     output: Annotated[
         Path | None,
-        output_file("Bag file to write; default: a file in runs/ named after the time.", "BAG"),
+        output_file("Bag file to write; default: runs/DATE-TIME.mcap.", "BAG"),
     ] = None,
     topics: TopicsOption = None,
     include: Annotated[
@@ -75,7 +75,8 @@ def record(
         typer.Option(
             "--include",
             metavar="TOPIC",
-            help="Further topic to record, such as stereo; repeat for several.",
+            help="Topic to record in addition to the default ones, such as stereo; repeat for "
+            "several.",
             autocompletion=complete.topics,
         ),
     ] = None,
@@ -86,7 +87,8 @@ def record(
             "--max-bag-size",
             metavar="MB",
             min=1.0,
-            help="Size at which another bag is started: BAG-2.mcap, BAG-3.mcap and so on.",
+            help="Maximum size of a file, MB; then recording continues in BAG-2.mcap, BAG-3.mcap "
+            "and so on.",
         ),
     ] = None,
     max_duration_s: Annotated[
@@ -96,14 +98,14 @@ def record(
             "--max-bag-duration",
             metavar="SECONDS",
             min=1.0,
-            help="Duration at which another bag is started.",
+            help="Maximum duration of a file, s; then recording continues in another file.",
         ),
     ] = None,
     duration: DurationOption = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Record the topics of the running graph until Ctrl-C; default: all topics that are logged."""
+    """Record topics of the running graph until Ctrl-C; default: all topics marked as logged."""
     running = running_graph(run)
     target = output or bag or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}.mcap"
     if target.exists():
@@ -153,7 +155,7 @@ def play(
         ),
     ] = 1.0,
     start: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Start position in the bag.", min=0.0)
+        float, typer.Option(metavar="SECONDS", help="Start position in the bag, s.", min=0.0)
     ] = 0.0,
     loop: Annotated[
         bool, typer.Option("-l", "--loop", help="Repeat playback until Ctrl-C.")
@@ -172,14 +174,17 @@ def play(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play the topics of a bag that are `external_topics` of the graph's launch file."""
+    """Publish recorded messages into a running graph, or into a graph started for this.
+
+    Only topics listed under `external_topics` in the launch file are played.
+    """
     request = PlayRequest(bag, tuple(topics or ()), rate, start, loop, as_json)
     raise typer.Exit(run_interruptible(_play(request, launch, run)))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
 def info(bag: BagArgument, as_json: JsonOption = False) -> None:
-    """Print the contents of a bag; a truncated bag is read up to its end."""
+    """Print the contents of a bag; a truncated bag is read as far as possible."""
     from flexsheet.messages.bag import info as bag_info
 
     summary = bag_info(bag)
@@ -250,7 +255,7 @@ def export(
     topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a bag to an MCAP file for Foxglove and Rerun."""
+    """Convert a bag to an MCAP file that the viewers Foxglove and Rerun can show."""
     from flexsheet.launch.bags.export import export as export_bag
 
     output = _require_output(output or target)
@@ -292,15 +297,15 @@ def verify(
     ] = 1e-6,
     as_json: JsonOption = False,
 ) -> None:
-    """Replay a node twice with its recorded inputs, and compare its outputs.
+    """Run a node twice on its recorded inputs, and compare the outputs.
 
     Exit code 1: the two runs differ, the node failed, or it cannot be replayed. Exit code 3: the
-    runs are equal but differ from the outputs published live, for example because the node reads
-    the system clock.
+    runs are equal but differ from the recorded outputs, for example because the node reads the
+    system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
-    if node.endswith(".mcap") and bag.suffix != ".mcap":  # the former order
+    if node.endswith(".mcap") and bag.suffix != ".mcap":  # former argument order
         bag, node = Path(node), str(bag)
     logs_on_stderr()
     with progress_bar(f"replaying {node} twice with {bag.name}") as progress:
@@ -332,8 +337,8 @@ def report(
 ) -> None:
     """Write an HTML report on a recording: faults, charts, tables and images.
 
-    The page needs no network connection. With --json, prints the values, and writes a page only if
-    --output is given. A truncated bag is read up to its end.
+    The page needs no network connection. With --json, the values are printed, and a page is written
+    only if --output is given. A truncated bag is read as far as possible.
     """
     from flexsheet.launch.bags.report.write import default_output
     from flexsheet.launch.bags.report.write import report as report_on
@@ -388,7 +393,7 @@ def plot(
 
 def _require_output(output: Path | None) -> Path:
     if output is None:
-        raise CommandError("missing the file to write; add --output FILE", BAD_INPUT)
+        raise CommandError("the output file is missing; add --output FILE", BAD_INPUT)
     return output
 
 
@@ -432,7 +437,7 @@ def _print_verification(result: Verification) -> None:
 
 
 def _describe_result(result: Verification) -> str:
-    """Describe the result of a verification, with the likely cause of a difference."""
+    """Describe the result of `bag verify`, with the likely cause of a difference."""
     if result.errors:
         return "the node failed; see its last error above"
     if not result.same_bytes:
@@ -445,7 +450,7 @@ def _describe_result(result: Verification) -> str:
     why = (
         f"{result.missing} messages that the node read are not in the bag"
         if result.missing
-        else "the code has changed, or the recording started after the node had stored state"
+        else "the code has changed, or the node already had internal state when the recording began"
     )
     return f"repeatable, but different from the live outputs: {why} (docs/replay.md)"
 
@@ -466,7 +471,7 @@ async def _record(
     running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
-    """Run a recorder node in this process, connected to the running graph."""
+    """Run a recorder node in this process, connected to the running graph; return exit code 0."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import tools_host
@@ -516,7 +521,7 @@ async def _record(
     try:
         await asyncio.wait((work,), timeout=seconds)
     finally:
-        # Close the bag properly after an interruption, too.
+        # Also after an interruption, wait until the recorder has closed the bag.
         countdown.cancel()
         stop.set()
         await work
@@ -524,7 +529,7 @@ async def _record(
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show the remaining time of a recording of known duration."""
+    """Show a progress bar for a recording; return at once if its duration is not limited."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -537,7 +542,7 @@ async def _show_remaining(label: str, duration_s: float | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlayRequest:
-    """Bag to play, with the topics, speed and start position."""
+    """Options of `bag play`: bag, topics, speed as a factor, and start position."""
 
     bag: Path
     topics: tuple[str, ...]
@@ -571,7 +576,8 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
         words.print(f"not played: {name}: {why}", markup=False)
     if not selection.topics:
         raise CommandError(
-            f"{request.bag}: contains no topic that can be played into {plan.launch_file}"
+            f"{request.bag}: contains no topic that can be played into {plan.launch_file}; "
+            "list the topics to play under external_topics there"
         )
     sent = 0
     while True:

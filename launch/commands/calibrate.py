@@ -1,4 +1,7 @@
-"""`flexsheet calibrate`: calibrate a stereo rig with images of a board, and check the result."""
+"""`flexsheet calibrate`: calibrate a stereo camera with images of a calibration board.
+
+Also checks such calibrations, and defines the functions that the other calibrations share.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +38,12 @@ app = typer.Typer(
 )
 
 LeftOption = Annotated[
-    str, typer.Option(metavar="GLOB", help="Pattern of the left images, sorted by name.")
+    str,
+    typer.Option(metavar="GLOB", help="File pattern of the left images, paired by sorted name."),
 ]
 RightOption = Annotated[
-    str, typer.Option(metavar="GLOB", help="Pattern of the right images, sorted by name.")
+    str,
+    typer.Option(metavar="GLOB", help="File pattern of the right images, paired by sorted name."),
 ]
 BoardOption = Annotated[
     str,
@@ -76,8 +81,8 @@ def stereo(
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="Source of a camera node for live capture, such as "
-            "'{kind: opencv, left: 0, right: 1}'.",
+            help="Camera for live capture, in the format of a camera node's parameter source, such "
+            "as '{kind: opencv, left: 0, right: 1}'.",
         ),
     ] = None,
     scene_file: Annotated[
@@ -85,12 +90,12 @@ def stereo(
         typer.Option(
             "--scene",
             metavar="FILE",
-            help="Scene file with the image size and exposure of the live camera.",
+            help="Scene file that contains the image size and exposure time of the live camera.",
         ),
     ] = None,
     twin: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="Scene file whose camera is simulated."),
+        typer.Option(metavar="SCENE", help="Simulate the camera of this scene file."),
     ] = None,
     seed: SeedOption = 1,
     pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
@@ -100,25 +105,26 @@ def stereo(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     device: Annotated[
-        str | None, typer.Option(help='Name of the rig; default: from the scene, else "stereo".')
+        str | None,
+        typer.Option(help='Name of the stereo camera; default: from the scene, else "stereo".'),
     ] = None,
     distance_mm: Annotated[
         float | None,
         typer.Option(
-            help="Distance at which the uncertainty is reported, mm; default: from the scene or "
-            "the board images.",
+            help="Distance from the camera at which the measurement uncertainty is reported, mm; "
+            "default: from the scene or the board images.",
             min=1.0,
         ),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder for a report with plots.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder to write a report with plots to.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate both cameras of a stereo rig and their relative pose.
+    """Calibrate both cameras of a stereo camera and their relative pose.
 
-    The images are files (--left, --right), captured live (--device-source, --scene) or simulated
-    (--twin).
+    The board images are files (--left, --right), captured live (--device-source, --scene) or
+    simulated (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
     from flexsheet.launch.calibration.corners import CalibrationError
@@ -140,7 +146,7 @@ def stereo(
         else:
             camera_scene = twin or scene_file
             if camera_scene is None:
-                raise CommandError("--device-source: missing --scene FILE", BAD_INPUT)
+                raise CommandError("--device-source requires --scene FILE; add it", BAD_INPUT)
             scene = load_scene(camera_scene)
             pose_capture = Capture(
                 described,
@@ -247,7 +253,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure a board of known size with a calibration, in images not used to calibrate."""
+    """Check a calibration: measure a board of known size in images not used to calibrate."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.messages.calibration import load_calibration
@@ -267,7 +273,8 @@ def check(
     reused = result["used_to_calibrate"]
     if isinstance(reused, list) and reused:
         words.print(
-            f"{', '.join(reused)}: used to calibrate, so errors are underestimated; use others",
+            f"{', '.join(reused)}: these images were used to calibrate, so the errors are "
+            "underestimated; use other images",
             markup=False,
         )
     if as_json:
@@ -296,9 +303,9 @@ def cross_check(
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration: measure each pair with a calibration from the other pairs.
+    """Cross-validate a calibration: measure each image pair with a calibration from the others.
 
-    Prints the errors beside those of plain OpenCV.
+    Prints the errors next to those of a calibration by OpenCV's functions alone.
     """
     from flexsheet.launch.calibration import check
     from flexsheet.launch.calibration.corners import CalibrationError
@@ -348,7 +355,10 @@ def print_board(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a board to print at true size: a chessboard, or a ChArUco board with --marker-mm."""
+    """Write an image of a calibration board, to be printed at true size.
+
+    It is a chessboard; with --marker-mm, it is a ChArUco board.
+    """
     from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
@@ -371,7 +381,7 @@ def _format(value: object) -> str:
 def _check_single_source(
     left: str, right: str, device_source: str | None, twin: Path | None
 ) -> None:
-    """Raise CommandError unless exactly one source of images is chosen."""
+    """Raise CommandError unless the options select exactly one source of images."""
     files = bool(left or right)
     chosen = [files, device_source is not None, twin is not None]
     if sum(chosen) != 1 or (files and not (left and right)):
@@ -386,7 +396,8 @@ def _find_images(option: str, pattern: str) -> list[Path]:
     paths = [Path(name) for name in sorted(glob.glob(pattern))]
     if not paths:
         raise CommandError(
-            f"{option} {pattern}: no file matches; put the pattern in quotes", BAD_INPUT
+            f"{option} {pattern}: no file matches; check the path, and put the pattern in quotes",
+            BAD_INPUT,
         )
     return paths
 
@@ -412,7 +423,10 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
 
 
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
-    """Return the given distance, else that of the scene's screen centre, else None, m."""
+    """Return the distance (m) at which the uncertainty is reported; None if it is not known.
+
+    Default is the distance of the left camera from the screen centre in the scene.
+    """
     if distance_mm is not None:
         return 1e-3 * distance_mm
     if scene is None:
@@ -422,9 +436,9 @@ def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float
 
 @contextmanager
 def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
-    """Yield a scene's YAML tree to change; then write it to `copy` with comments and layout.
+    """Yield the YAML tree of a scene file, and write the tree to `copy` after the caller's changes.
 
-    Raises BadInputError if the changed scene is invalid.
+    Comments and layout are preserved. Raises BadInputError if the changed scene is invalid.
     """
     from ruamel.yaml import YAML
 
@@ -443,7 +457,7 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 
 
 def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    """Load a stereo calibration for the scene's camera, or return None without a path."""
+    """Load a stereo calibration and check that it fits the scene's camera; None without a path."""
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
@@ -460,13 +474,13 @@ def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
 
 
 def round_digits(value: float) -> float:
-    """Round to 1e-9 m, rad or px, below the accuracy of any calibration; make -0.0 positive."""
+    """Round a calibrated value for a file to 1e-9 m, rad or px, and replace -0.0 by 0.0."""
     return round(float(value), 9) + 0.0
 
 
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Yield a function of (done, total, text) that updates a progress bar on stderr."""
+    """Show a progress bar on stderr; yield its update function (done, total, text)."""
     from rich.progress import Progress
 
     with Progress(console=words.console, transient=True) as bar:

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate arms`: measure the poses of the arm bases with a board on the flange."""
+"""`flexsheet calibrate arms`: measure the poses of the arm bases with a board on each flange."""
 
 from __future__ import annotations
 
@@ -96,13 +96,13 @@ def arms(
     left_arm: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Folder with joints.csv and the images of the left arm's poses."
+            metavar="FOLDER", help="Folder with joints.csv and board images of the left arm."
         ),
     ] = None,
     right_arm: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Folder with joints.csv and the images of the right arm's poses."
+            metavar="FOLDER", help="Folder with joints.csv and board images of the right arm."
         ),
     ] = None,
     twin: Annotated[
@@ -118,22 +118,22 @@ def arms(
         typer.Option(
             "--write-scene",
             metavar="FILE",
-            help="Scene file to write with the measured base poses.",
+            help="Copy of the scene to write, with the measured base poses.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the poses of the arm bases in the world frame of the stereo camera.
 
-    Mount the board rigidly on the flange, and record 15 to 20 poses at rest with different flange
-    orientations (docs/arms.md). Give a folder for each arm, or --twin.
+    Mount the board rigidly on the flange of an arm, and record 15 to 20 poses at rest with
+    different flange orientations (docs/arms.md). Give a folder for each arm, or --twin.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import save_arms_calibration
 
     check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
-        raise CommandError("give --left-arm, --right-arm or both, or else --twin", BAD_INPUT)
+        raise CommandError("give either --twin, or --left-arm, --right-arm or both", BAD_INPUT)
     if copy is not None:
         _check_new_file(copy, "--write-scene")
     scene = load_scene(scene_file)
@@ -173,7 +173,7 @@ def write_scene(
     output: Annotated[Path, output_file("Scene file to write.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Copy a scene with the base poses of an arm calibration."""
+    """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import load_arms_calibration
     from flexsheet.messages.calibration_file import CalibrationFileError
@@ -203,12 +203,12 @@ def capture(
     output: Annotated[
         Path,
         typer.Option(
-            "-o", "--output", metavar="FOLDER", help="New folder for joints.csv and the images."
+            "-o", "--output", metavar="FOLDER", help="New folder for joints.csv and board images."
         ),
     ],
     scene_file: SceneOption,
     places: Annotated[
-        int, typer.Option(help="Number of poses after which the command stops.", min=1)
+        int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
     ] = 20,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
@@ -216,10 +216,10 @@ def capture(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Record poses of an arm with a board on its flange, from the running graph.
+    """Record joint angles and board images for `calibrate arms`, from the running graph.
 
-    Move the arm with its teach pendant. A pose is recorded when the arm is at rest and the board
-    appears in a new pose; Ctrl-C stops.
+    Mount the board on the flange and move the arm with its teach pendant. A pose is recorded when
+    the arm is at rest and the board appears in a new pose. Ctrl-C stops.
     """
     from flexsheet.launch.calibration.arm_poses import PoseRecorder, make_lens_rig
     from flexsheet.launch.plans.plan import load_scene
@@ -257,7 +257,7 @@ async def _record_poses(
     images: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
 
     def on_stereo(pair: Any, _: Any) -> None:
-        # Drop pairs that arrive while one is being processed: the next pair is as good.
+        # Image pairs that arrive while another one is processed are dropped and not needed.
         if images.empty():
             images.put_nowait((pair, time.monotonic()))
 
@@ -401,7 +401,7 @@ def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None
 
 
 def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str, float]:
-    """Return the position and rotation error of the simulated base at the world origin."""
+    """Return the position and rotation errors of a simulated arm's base at the world origin."""
     import numpy as np
 
     from flexsheet.launch.calibration.arm_poses import draw_true_base
@@ -472,7 +472,7 @@ def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
         (f"{side} arm", f"{one['poses_used']} of {one['poses']} poses used"),
         (
             "uncertainty",
-            f"{1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
+            f"standard deviation {1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
             f"{math.degrees(one['rotation_std_rad']):.3f} degrees",
         ),
         (
@@ -482,7 +482,7 @@ def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "leave-one-out",
-            f"changes the base by up to {1e3 * one['max_change_m']:.2f} mm, "
+            f"omitting one pose moves the base by up to {1e3 * one['max_change_m']:.2f} mm, "
             f"{math.degrees(one['max_change_rad']):.3f} degrees; "
             f"jackknife ratio {one['jackknife_ratio']:.2f}",
         ),
@@ -512,7 +512,7 @@ def _format_pose(base: ArmBase) -> str:
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return the distance and angle between the measured and the scene's base, m and rad."""
+    """Return distance (m) and angle (rad) from the base pose in the scene to the measured one."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate marker`: fit the marker's position on the finger to touches."""
+"""`flexsheet calibrate marker`: determine the position of the marker on the finger."""
 
 from __future__ import annotations
 
@@ -47,29 +47,35 @@ def marker(
     output: Annotated[Path, output_file("Marker calibration file to write.")],
     rows: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="CSV file of touches; columns: docs/set-up-marker.md."),
+        typer.Option(
+            metavar="CSV",
+            help="CSV file of touches of known points; docs/set-up-marker.md lists its columns.",
+        ),
     ] = None,
     scene_file: SceneOption = CYLINDER,
     twin: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="Scene file whose finger is simulated instead."),
+        typer.Option(metavar="SCENE", help="Simulate the touches with the finger of this scene."),
     ] = None,
     apparatus: Annotated[
         str | None,
-        typer.Option(metavar="FILE|seed:N", help="Apparatus of the simulation, for --twin."),
+        typer.Option(
+            metavar="FILE|seed:N",
+            help="With --twin: true parameters of the simulated hardware; default: as the scene.",
+        ),
     ] = None,
     calibration_file: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", metavar="FILE", help="Stereo calibration of the camera, for --twin."
+            "--calibration", metavar="FILE", help="With --twin: stereo calibration of the camera."
         ),
     ] = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit where the marker is on the finger, relative to the pad.
+    """Determine the marker's position relative to the pad of the finger, which touches the sheet.
 
-    The touches of known points are rows of a CSV file (--rows, --scene) or are simulated (--twin).
+    Touches of known points are rows of a CSV file (--rows, --scene) or are simulated (--twin).
     """
     from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
@@ -84,7 +90,9 @@ def marker(
         raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
         if value is not None and twin is None:
-            raise CommandError(f"{name} {value}: is for --twin SCENE only; remove it", BAD_INPUT)
+            raise CommandError(
+                f"{name} {value}: the option is for --twin SCENE only; remove it", BAD_INPUT
+            )
     command = ["flexsheet", "calibrate", "marker"]
     if rows is not None:
         scene = load_scene(scene_file)

@@ -50,7 +50,7 @@ def projector(
     scene_file: SceneOption,
     output: Annotated[
         Path | None,
-        output_file("Scene file to write; may be that of --scene."),
+        output_file("Scene file to write with the result; may be the file of --scene."),
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -61,29 +61,31 @@ def projector(
     write_patterns: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Folder to write the Gray-code patterns to; no calibration."
+            metavar="FOLDER",
+            help="Only write the Gray-code patterns for --pictures to this folder.",
         ),
     ] = None,
     pictures: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Folder with one subfolder of images per pose: left00.png, right00.png, ...",
+            help="Folder with one subfolder per sheet pose, which contains one image per pattern "
+            "and camera: left00.png, right00.png, ...",
         ),
     ] = None,
     corners: Annotated[
         str | None,
         typer.Option(
             metavar="'X,Y X,Y X,Y X,Y'",
-            help="Pixels at the corners of --rectangle-mm on the virtual screen: bottom left, "
-            "bottom right, top right, top left, from the user's view.",
+            help="Projector pixels that hit the corners of --rectangle-mm on the virtual screen: "
+            "bottom left, bottom right, top right, top left, as the user sees them.",
         ),
     ] = None,
     rectangle_mm: Annotated[
         str,
         typer.Option(
             metavar="WIDTHxHEIGHT",
-            help="Size of the rectangle around the screen's centre for --corners, mm.",
+            help="Size of the rectangle for --corners, which is centred on the virtual screen, mm.",
         ),
     ] = "200x200",
     twin: Annotated[
@@ -92,14 +94,14 @@ def projector(
             "--twin", help="Calibrate a simulated projector that deviates from the scene."
         ),
     ] = False,
-    poses: Annotated[int, typer.Option(min=3, help="Number of poses of the simulated sheet.")] = 6,
+    poses: Annotated[int, typer.Option(min=3, help="Number of sheet poses for --twin.")] = 6,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate the projector and write the result into a scene.
+    """Calibrate pose and lens of the projector, and write the result into a scene.
 
-    The data are stereo images of Gray code on the sheet in three or more poses (--pictures), four
-    corners set manually (--corners), or simulated images (--twin).
+    The data are stereo images of Gray-code patterns on the sheet in three or more poses
+    (--pictures), four corners that were set manually (--corners), or simulated images (--twin).
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import (
@@ -156,7 +158,8 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
     for number, pattern in enumerate(patterns):
         write_file(folder / f"pattern{number:02}.png", encode_png(pattern))
     words.print(
-        f"{len(patterns)} patterns in {folder}: project each unscaled, capture with both cameras",
+        f"{len(patterns)} patterns written to {folder}; project each without scaling, and capture "
+        "it with both cameras",
         markup=False,
     )
 
@@ -167,7 +170,8 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
         raise CommandError(
-            f"--pictures {folder}: does not contain a subfolder for each pose", BAD_INPUT
+            f"--pictures {folder}: the folder contains no subfolders; make one for each sheet pose",
+            BAD_INPUT,
         )
     for pose in poses:
         sides = []
@@ -187,7 +191,7 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
 
 
 def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
-    """Yield the simulated images of the patterns on the sheet, one pair of lists per pose."""
+    """Yield the simulated left and right images of all patterns, for each pose of the sheet."""
     from rich.progress import track
 
     from flexsheet.launch.calibration.gray_code import make_patterns
@@ -202,7 +206,7 @@ def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Ite
 
 
 def _load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """Return the scene's camera with the optics of a calibration file."""
+    """Return the camera of the scene, with lenses and baseline from a calibration file if given."""
     optics = load_optics(calibration, scene)
     if optics is None:
         return scene.camera
@@ -235,7 +239,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
-    """Write the scene with this projector to `copy`, with comments and layout preserved."""
+    """Write a scene file with another projector to `copy`; preserve its comments and layout."""
     with edit_scene(scene_file, copy) as tree:
         lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
@@ -247,7 +251,7 @@ def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
 
 
 def _make_flow_list(values: Iterable[float]) -> Any:
-    """Make a YAML list of rounded values on one line."""
+    """Return a YAML list of rounded values that is written on one line."""
     from ruamel.yaml.comments import CommentedSeq
 
     row = CommentedSeq([round_digits(value) for value in values])
@@ -303,12 +307,13 @@ def _print_result(
     )
     for when, error in result.get("eye_error_mm", {}).items():
         words.print(
-            f"true error at the eye {when}: {error['mean']:.3f} mm mean, {error['max']:.3f} mm max"
+            f"true image error at the eye {when} the calibration: {error['mean']:.3f} mm mean, "
+            f"{error['max']:.3f} mm max"
         )
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the true image errors at the eye before and after the calibration, mm."""
+    """Return the true image errors (mm) at the eye, before and after a simulated calibration."""
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)

@@ -1,4 +1,4 @@
-"""`flexsheet calibrate sheet`: fit the sheet's force model to measured or simulated pushes."""
+"""`flexsheet calibrate sheet`: fit the force model of the sheet to measured or simulated pushes."""
 
 from __future__ import annotations
 
@@ -48,41 +48,49 @@ def sheet(
     output: Annotated[Path, output_file("Sheet calibration file to write.")],
     rows: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="CSV file of measured pushes; columns: docs/sheet.md."),
+        typer.Option(
+            metavar="CSV",
+            help="CSV file of measured pushes; columns: depth_mm, force_n, edge_distance_mm or "
+            "stretch_ratio; optional ones: docs/sheet.md.",
+        ),
     ] = None,
     scene_file: SceneOption = CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(
             metavar="SCENE",
-            help="Scene file whose sheet is pushed in simulation instead of measured.",
+            help="Scene file; its sheet is pushed in simulation instead of measured.",
         ),
     ] = None,
     places: Annotated[
         bool,
-        typer.Option(
-            "--places", help="Simulate pushes over the whole sheet, not only at its centre."
-        ),
+        typer.Option("--places", help="With --twin: push the whole sheet, not only its centre."),
     ] = False,
     table: Annotated[
-        bool, typer.Option("--table", help="Also store a table of the fitted model's residuals.")
+        bool,
+        typer.Option(
+            "--table", help="Also store a table of factors that correct the fitted model."
+        ),
     ] = False,
     mooney: Annotated[
         bool,
         typer.Option(
-            "--mooney", help="Also fit the Mooney weight; needs stretch ratios above 1.15."
+            "--mooney",
+            help="Also fit the weight of the Mooney term of the rubber model; requires stretch "
+            "ratios above 1.15.",
         ),
     ] = False,
     noise_n: Annotated[
         float,
-        typer.Option(help="Standard deviation of the simulated force gauge's noise, N.", min=0.0),
+        typer.Option(help="With --twin: standard deviation of the force noise, N.", min=0.0),
     ] = 0.005,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit modulus times thickness, slack width and cubic term of a sheet to measured forces.
+    """Fit the force model of a sheet to forces of a finger that pushes it.
 
-    The pushes are rows of a CSV file (--rows, --scene) or are simulated (--twin).
+    The fitted parameters are modulus times thickness, width without tension, and a cubic term. The
+    pushes are rows of a CSV file (--rows, --scene) or are simulated (--twin).
     """
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
@@ -127,9 +135,10 @@ def make_calibration(
     with_mooney: bool,
     with_table: bool,
 ) -> SheetCalibration:
-    """Fit the sheet model to pushes. Raises SheetModelFitError if they do not determine it.
+    """Fit the force model of the sheet to pushes, and return it as a calibration.
 
-    lines: number of each push's line in its file.
+    lines: line number of each push in its file. Raises SheetModelFitError if the pushes do not
+    determine the parameters.
     """
     from importlib.metadata import version
 
@@ -241,7 +250,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         return
     units = {
         "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
-        "slack_width_m": ("slack width", 1e3, "mm"),
+        "slack_width_m": ("width without tension", 1e3, "mm"),
         "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
         "mooney_ratio": ("Mooney weight", 1.0, ""),
         "hysteresis_ratio": ("energy lost in a cycle", 100.0, "%"),
@@ -268,5 +277,6 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
     )
     for one in calibration.left_out:
         words.print(
-            f"excluded line {one.line}: residual {100 * one.residual_ratio:+.0f} %", markup=False
+            f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %",
+            markup=False,
         )

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""Simulated poses per requested pair; not every pose adds coverage."""
+"""Number of simulated board poses per requested image pair, as not every pose is accepted."""
 
 
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
-    """Yield grey image pairs from a camera node's `source`, given in YAML.
+    """Yield grey image pairs of a camera.  `source` is a YAML text as for camera nodes.
 
-    Raises CommandError for an invalid source and for a device that fails.
+    Raises CommandError if the source is invalid or the device fails.
     """
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
@@ -47,13 +47,14 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
             mistakes = [(".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
             problem = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
-            f"--device-source {source}: {problem}; use the format of a camera node's source, such "
-            "as '{kind: opencv, left: 0, right: 1}'",
+            f"--device-source {source}: {problem}; use the format of a camera node's parameter "
+            "source, such as '{kind: opencv, left: 0, right: 1}'",
             BAD_INPUT,
         ) from error
     if described.kind == "twin":
         raise CommandError(
-            "--device-source twin: a running simulator has no board; use --twin SCENE", BAD_INPUT
+            "--device-source twin: the simulator of a graph shows no board; use --twin SCENE",
+            BAD_INPUT,
         )
     return _read_views(described, source, scene)
 
@@ -74,7 +75,7 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
 
 
 def simulate_views(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """Yield simulated image pairs of a board, one per pose. Raises CommandError."""
+    """Yield one simulated image pair per pose of a board.  Raises CommandError."""
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
 
@@ -87,10 +88,10 @@ def simulate_views(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iter
 
 
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
-    """Write the pairs that `capture` accepts as left01.png, right01.png, ... to a new folder.
+    """Write the image pairs that `capture` accepts to a new folder: left01.png, right01.png, ...
 
-    Stops at full coverage, after the last pair or at Ctrl-C, and prints the missing coverage.
-    Returns the number of pairs, at least one.
+    Stops when the board poses cover all required cases, after the last pair, or at Ctrl-C; prints
+    the missing cases. Returns the number of pairs, which is at least one.
     """
     if folder.exists():
         raise CommandError(f"--pictures {folder}: the folder exists; name a new folder", BAD_INPUT)
@@ -115,7 +116,8 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
         words.print(f"not covered: {listed}", markup=False)
     if not accepted:
         raise CommandError(
-            "no pair was accepted: the board was never at rest and visible in both images"
+            "no image pair was accepted, because the board was never at rest and fully visible in "
+            "both images; hold it still in view of both cameras"
         )
     words.print(f"{accepted} pairs in {folder}", markup=False)
     return accepted
@@ -123,7 +125,10 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 
 @contextmanager
 def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Yield a function of (hint, accepted) that updates the view, or prints lines if piped."""
+    """Show the coverage; yield its update function (hint, accepted).
+
+    If stderr is not a terminal, one line is printed per accepted pair.
+    """
     if not words.is_terminal:
 
         def print_accepted(hint: str, accepted: bool) -> None:
@@ -140,7 +145,7 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Draw the actual and required number of pairs per image cell, tilt and distance."""
+    """Return tables with actual and required numbers of pairs per image cell, tilt and distance."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""`flexsheet chart`: measure speed against accuracy of a method family."""
+"""`flexsheet chart`: measure computing time and accuracy of the methods in a method family."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def chart(
     family: Annotated[
         str | None,
         typer.Argument(
-            help="Method family to measure; default: all. system: configurations of the graph.",
+            help="Method family to measure; default: all. system: whole configurations of a graph.",
             autocompletion=complete.families,
         ),
     ] = None,
@@ -52,8 +52,8 @@ def chart(
         typer.Option(
             "--scene",
             metavar="SCENE",
-            help="Scene file for the measurements; default: cylinder.yaml. For system: repeat for "
-            "several; default: all shipped scenes.",
+            help="Scene to measure in; default: cylinder. For system: repeat for several; default: "
+            "all shipped scenes.",
             autocompletion=complete.scenes,
         ),
     ] = None,
@@ -62,7 +62,7 @@ def chart(
     ),
     redraw: Annotated[
         bool,
-        typer.Option("--redraw", help="Redraw the results stored in --output without measuring."),
+        typer.Option("--redraw", help="Draw the results stored in --output again; do not measure."),
     ] = False,
     cases: Annotated[
         bool,
@@ -75,7 +75,7 @@ def chart(
             metavar="N",
             min=1,
             max=1000,
-            help="For system: number of blocks; each runs every configuration once.",
+            help="For system: number of repetitions; each runs every configuration once.",
         ),
     ] = 12,
     seconds: Annotated[
@@ -85,7 +85,7 @@ def chart(
             metavar="SECONDS",
             min=2.0,
             max=600.0,
-            help="For system: duration of a stroke.",
+            help="For system: duration of each simulated stroke.",
         ),
     ] = 10.0,
     apparatuses: Annotated[
@@ -95,7 +95,8 @@ def chart(
             metavar="N",
             min=0,
             max=100,
-            help="For system: number of random apparatuses; every other block has one of them.",
+            help="For system: number of random samples of inaccurate hardware (apparatuses); every "
+            "other repetition uses one.",
         ),
     ] = 5,
     configurations: Annotated[
@@ -103,16 +104,16 @@ def chart(
         typer.Option(
             "--configuration",
             metavar="NAME",
-            help="For system: configuration to measure; repeat for several; default: all.",
+            help="For system: name of a configuration; repeat for several; default: all.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure and draw speed against accuracy of a family's methods on this computer.
+    """Measure computing time and error of the methods in a family on this computer; draw a chart.
 
-    Prints the maximum median time and the maximum error of each method over the cases in its range.
-    Methods on the Pareto front are marked "front". `system` runs whole graphs instead, and its
-    --output continues an interrupted measurement.
+    For each method, the maximum of the median times and of the errors is printed, over all cases in
+    the method's range. "front" marks methods of which no other is both faster and more accurate.
+    `system` runs whole graphs instead; if it was interrupted, the same --output continues it.
     """
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]
@@ -136,7 +137,10 @@ def chart(
     if redraw:
         results = charts.read_charts(output)
         if not results:
-            raise CommandError(f"--output {output}: does not contain charts to redraw", BAD_INPUT)
+            raise CommandError(
+                f"--output {output}: the folder contains no results to draw; measure first",
+                BAD_INPUT,
+            )
         for result in results:
             charts.write_chart(result, output)
         words.print(f"charts: {charts.write_overview(output)}")
@@ -144,7 +148,7 @@ def chart(
             print_json(results)
         return
     if len(chosen) > 1:
-        raise CommandError("--scene: a method family is measured on one scene", BAD_INPUT)
+        raise CommandError("--scene: only `chart system` accepts several scenes", BAD_INPUT)
     scene = load_scene(chosen[0] if chosen else find_file(CYLINDER, SCENES))
     try:
         families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]

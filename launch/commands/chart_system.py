@@ -1,4 +1,4 @@
-"""`flexsheet chart system`: measure whole configurations of the running graph."""
+"""`flexsheet chart system`: measure latency, load and errors of whole graph configurations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def measure_system(
     configurations: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Measure, draw and print the chart; the folder continues an interrupted measurement."""
+    """Measure configurations and draw a chart; the same folder continues a measurement."""
     import json
 
     from flexsheet.launch.methods.results import describe_load, replace_non_finite
@@ -59,7 +59,7 @@ def _print_points(result: dict[str, Any]) -> None:
     from flexsheet.launch.methods.system_chart import ERRORS
 
     front = {(one["scene"], one["configuration"]) for one in result["front"]}
-    columns = ("scene", "configuration", "cores", "to arm, ms", "to light, ms", *ERRORS)
+    columns = ("scene", "configuration", "cores", "to arm, ms", "to image, ms", *ERRORS)
     rows = [
         (
             point["scene"],

@@ -1,6 +1,7 @@
-"""Complete names in the shell; modules are imported only when they are needed.
+"""Shell completion of names on the command line.
 
-If no name matches, the shell completes file names.
+If no name matches, the shell completes file names. Modules are imported only when they are needed,
+because each completion is a separate process.
 """
 
 from __future__ import annotations
@@ -14,21 +15,21 @@ from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file, list
 
 
 def topics(incomplete: str) -> list[str]:
-    """Complete topic names."""
+    """Return the topic names that start with `incomplete`."""
     from flexsheet.messages.topics import TOPICS
 
     return _filter(TOPICS, incomplete)
 
 
 def node_types(incomplete: str) -> list[str]:
-    """Complete node types."""
+    """Return the node types that start with `incomplete`."""
     from flexsheet.nodes import NODES
 
     return _filter(NODES, incomplete)
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
-    """Complete the hosts of the launch file on the command line."""
+    """Return matching host names of the launch file that is named on the command line."""
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 
@@ -41,35 +42,35 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
-    """Complete the method families that `tune` can choose from."""
+    """Return matching names of the method families of `flexsheet tune`."""
     from flexsheet.launch.methods.tune import TUNABLES
 
     return _filter((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
-    """Complete gestures, or else CSV files."""
+    """Return matching names of gestures; if there are none, matching CSV files."""
     from flexsheet.launch.experiments.gestures import GESTURES
 
     return _filter(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
-    """Complete the directories of running graphs."""
+    """Return matching run directories of running graphs."""
     from flexsheet.launch.running.runs import list_live_runs
 
     return _filter((str(run.directory) for run in list_live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
-    """Complete the method families that `chart` can measure."""
+    """Return matching names of the method families of `flexsheet chart`."""
     from flexsheet.launch.methods.charts import FAMILIES
 
     return _filter([*FAMILIES, "system"], incomplete)
 
 
 def files(*suffixes: str) -> Callable[[str], list[str]]:
-    """Make a completion of files with these suffixes, and of the folders beside them."""
+    """Return a function that completes paths of files with these suffixes, and of folders."""
 
     def complete(incomplete: str) -> list[str]:
         folder, _, start = incomplete.rpartition("/")
@@ -79,7 +80,7 @@ def files(*suffixes: str) -> Callable[[str], list[str]]:
             return []
         matches = sorted(entry for entry in parent.iterdir() if entry.name.startswith(start))
         found = [prefix + entry.name for entry in matches if entry.suffix in suffixes]
-        # Without matching files, the shell's own completion of folders is better.
+        # Without matching files, return nothing, so that the shell completes folders by itself.
         folders = [f"{prefix}{entry.name}/" for entry in matches if found and entry.is_dir()]
         return found + folders
 
@@ -91,17 +92,17 @@ yaml_files = files(".yaml", ".yml")
 
 
 def launch_files(incomplete: str) -> list[str]:
-    """Complete launch files, and the names of those of the package."""
+    """Return matching names of shipped launch files, and matching YAML files."""
     return _filter(list_shipped(LAUNCH_FILES), incomplete) + yaml_files(incomplete)
 
 
 def scenes(incomplete: str) -> list[str]:
-    """Complete scene files, and the names of those of the package."""
+    """Return matching names of shipped scenes, and matching YAML files."""
     return _filter(list_shipped(SCENES), incomplete) + yaml_files(incomplete)
 
 
 def nodes(incomplete: str) -> list[str]:
-    """Complete the nodes of the running graph and the node types."""
+    """Return matching names of nodes of the running graph, and of node types."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:
@@ -112,7 +113,7 @@ def nodes(incomplete: str) -> list[str]:
 
 
 def node_parameters(incomplete: str) -> list[str]:
-    """Complete NODE.PARAMETER of the running graph."""
+    """Return the parameters of the running graph, as NODE.PARAMETER, that match."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:

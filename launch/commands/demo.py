@@ -1,4 +1,4 @@
-"""`flexsheet demo`: run the whole system once on this computer."""
+"""`flexsheet demo`: run a short measurement of the whole simulated system on this computer."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ def demo(
         str | None,
         typer.Option(
             metavar="NAME_OR_FILE",
-            help="Gesture, or CSV file of a recorded finger path (columns t_s,x_mm,y_mm,z_mm); "
-            "replaces the strokes.",
+            help="Finger path to follow instead of the strokes: name of a gesture, or CSV file "
+            "(columns t_s,x_mm,y_mm,z_mm).",
             autocompletion=complete.gestures,
         ),
     ] = None,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stroke, tilt and push the simulated sheet on this computer, and draw the results."""
+    """Simulate strokes on the sheet, a tilted and a pushed sheet; draw the measured errors."""
     from flexsheet.launch.experiments.demo import run_demo
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 

@@ -1,4 +1,4 @@
-"""`flexsheet doctor`: check this computer, a scene's reachability, and the hosts of a graph."""
+"""`flexsheet doctor`: check this computer, the hosts of a graph, and the reach of the arms."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def doctor(
     sweep: Annotated[
         bool,
         typer.Option(
-            "--sweep", help="First end processes left over from launchers that have exited."
+            "--sweep", help="First end processes that crashed launchers have left running."
         ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check this computer; exit code 1 if a check fails.
 
-    If a graph of several computers is running, also checks its hosts.
+    If a graph of several computers is running, all of them are checked.
     """
     if context.invoked_subcommand is not None:
         return
@@ -54,7 +54,7 @@ def doctor(
 
     if sweep:
         ended = sweep_leftovers()
-        words.print(f"ended {len(ended)} leftover processes")
+        words.print(f"ended {len(ended)} processes that crashed launchers had left running")
     findings = []
     with words.status("checking") as status:
         for finding in check_all():
@@ -84,14 +84,15 @@ def doctor(
 def check_scene(
     scene_file: SceneArgument,
     output: Annotated[
-        Path | None, output_file("Image file for the reachable range (.png or .svg).", "IMAGE")
+        Path | None,
+        output_file("Image file (.png or .svg) to write with the reachable range.", "IMAGE"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that both arms reach a scene's whole working range; exit code 1 if they do not.
+    """Check that both arms reach the whole working range of a scene; exit code 1 if they do not.
 
-    Checks every contact within the scene's tilt and depth, at minimum and maximum stretch, and
-    prints the maximum finger speed that the arms can follow.
+    Samples of the contact with all tilts and depths of the range are checked, at minimum and
+    maximum stretch of the sheet. Prints the maximum finger speed that the arms can follow.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
@@ -173,7 +174,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
     if not result["reachable"] and not result["remedies"]:
-        words.print("no single change that was tried makes the whole working range reachable")
+        words.print("none of the tested single changes makes the whole working range reachable")
 
 
 def _margin(value: float, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""`flexsheet doctor compliance`: compare the sheet's force with that of a scene's object."""
+"""`flexsheet doctor compliance`: check whether the sheet can feel as soft as a scene's object."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def compliance(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Sheet calibration file, written by `flexsheet calibrate sheet`."
+            metavar="FILE", help="Sheet calibration file from `flexsheet calibrate sheet`."
         ),
     ] = None,
     delay_ms: Annotated[
@@ -43,15 +43,16 @@ def compliance(
             metavar="MS",
             min=0.0,
             max=500.0,
-            help="Delay from a measured depth until the sheet has moved by it, ms.",
+            help="Delay from a measurement of the finger's depth to the sheet's motion, ms.",
         ),
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that the sheet can render the compliance of a scene's object; exit code 1 if not.
+    """Check that the sheet can feel as soft as the virtual object; exit code 1 if it cannot.
 
-    Compares the object's force with the rendered force, for pushes at the centre to the maximum
-    depth of the scene. Also checks that no hand can oscillate with the sheet at the delay.
+    For pushes at the centre up to the maximum depth of the scene, the force of the object is
+    compared with the rendered force. Also checks that hand and sheet cannot oscillate with the
+    given delay.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
@@ -91,7 +92,7 @@ def compliance(
             [
                 ("stretch", f"{result['stretch_ratio']:.3f}"),
                 ("maximum edge force", f"{result['max_edge_force_n']:.1f} N"),
-                ("advance per depth", f"{result['advance_per_depth']:.2f}"),
+                ("sheet motion per finger depth", f"{result['advance_per_depth']:.2f}"),
                 ("low-pass filter of the depth", f"{result['filter_ms']:.0f} ms"),
                 ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),
                 ("result", result["note"] or "the error is within the tolerance"),

@@ -47,7 +47,7 @@ def hosts(
         Path | None,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="Launch file; default: that of the graph running on this computer.",
+            help="Launch file; default: launch file of the graph running on this computer.",
             autocompletion=complete.launch_files,
             callback=find_launch_file,
         ),
@@ -56,21 +56,21 @@ def hosts(
         str | None,
         typer.Option(
             metavar="HOST",
-            help="Host name of this computer in the launch file; default: found by its address.",
+            help="Name of this computer in the launch file; default: determined from its address.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     timeout: Annotated[
         float,
         typer.Option(
-            metavar="SECONDS", help="Maximum time to wait for the hosts' answers.", min=1.5
+            metavar="SECONDS", help="Maximum time to wait for answers of the hosts, s.", min=1.5
         ),
     ] = TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
-    """Check all hosts of a launch file; exit code 1 if a check fails.
+    """Check all hosts (computers) of a launch file; exit code 1 if a check fails.
 
-    Before the graph is started, checks this computer and the network only.
+    If the graph is not running, only this computer and the network are checked.
     """
     plan, run = _find_graph(launch_file)
     here = find_host(plan, run, host)
@@ -88,7 +88,10 @@ def hosts(
 
 
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
-    """Return the findings about all hosts of the running graph; of a single host: self-checks."""
+    """Check the hosts of the running graph, if any, for `flexsheet doctor`.
+
+    For a graph on one host, only the findings of the nodes' self-checks are returned.
+    """
     from flexsheet.launch.health.doctor_hosts import SELF_CHECK
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.tools import tools_host
@@ -103,7 +106,7 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved launch file, and its run on this computer or None."""
+    """Return the resolved launch file, and its run on this computer; None if it is not running."""
     from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
@@ -118,7 +121,7 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 
 
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
-    """Return the name of this computer in the graph. Raises CommandError if it is ambiguous."""
+    """Return this computer's host name in the graph.  Raises CommandError if it is ambiguous."""
     from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN
@@ -138,7 +141,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
     if MAIN in found or len(found) == 1:
         return MAIN if MAIN in found else found[0]
     raise CommandError(
-        f"no address of this computer is in {plan.launch_file} "
+        f"no address of this computer matches exactly one host in {plan.launch_file} "
         f"({', '.join(plan.hosts.values())}); name the host with --host NAME",
         BAD_INPUT,
     )
@@ -147,7 +150,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
 async def check_hosts(
     plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
 ) -> list[HostFinding]:
-    """Return all findings, from checks of this computer and from the probes of the hosts."""
+    """Check this computer and probe all hosts over the network; return all findings."""
     import tempfile
 
     from flexsheet.launch.health.doctor_hosts import (
@@ -177,7 +180,7 @@ async def check_hosts(
 
 
 def print_findings(findings: list[HostFinding]) -> None:
-    """Print one line per host and check; only the first line of a host has its name."""
+    """Print a table with one line per finding; only the first line of a host shows its name."""
     rows = []
     before = ""
     for one in findings:

@@ -43,7 +43,7 @@ def graph(
         Path | None,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="Launch file; default: that of the running graph.",
+            help="Launch file; default: launch file of the running graph.",
             autocompletion=complete.launch_files,
             callback=find_launch_file,
         ),
@@ -51,14 +51,14 @@ def graph(
     scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None, output_file("File to draw the graph to: .svg, or .mmd for Mermaid.")
+        Path | None, output_file("Drawing to write: .svg image, or .mmd file for Mermaid.")
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print or draw the nodes of a graph, and the topics between them.
 
-    Topics of which any number of nodes are writers, such as estop and status, are left out.
+    Topics with any number of writers, such as estop and status, are omitted.
     """
     from flexsheet.launch.plans.drawing import lay_out, list_links, mermaid, svg, text_lines
     from flexsheet.launch.plans.plan import load_graph
@@ -71,7 +71,10 @@ def graph(
     if output is not None:
         check_folder("--output", output)
         if output.suffix not in (".svg", ".mmd"):
-            raise CommandError(f"--output {output}: name a .svg or .mmd file", BAD_INPUT)
+            raise CommandError(
+                f"--output {output}: unknown file type; name a .svg or .mmd file",
+                BAD_INPUT,
+            )
         write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))
         words.print(f"drawn: {output}", markup=False)
     if as_json:

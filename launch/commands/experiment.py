@@ -1,4 +1,4 @@
-"""`flexsheet experiment`: run the paper's experiments on a graph."""
+"""`flexsheet experiment`: run the experiments of Furukawa et al. 2007 ("the paper") on a graph."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ if TYPE_CHECKING:
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="Run the paper's experiments on a graph.",
+    help="Run the experiments of Furukawa et al. 2007, and further ones, on a graph.",
 )
 
 StrokeOption = Annotated[
     float,
     typer.Option(
-        "--duration", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke."
+        "--duration", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke, s."
     ),
 ]
 BothEyesOption = Annotated[
     bool,
     typer.Option(
         "--both-eyes",
-        help="Also measure the errors of each eye's image and of the disparity; triples the "
-        "duration.",
+        help="Also measure the image errors of each eye and the error of the disparity; this "
+        "triples the duration.",
     ),
 ]
 MapOption = Annotated[
@@ -63,13 +63,14 @@ MapOption = Annotated[
     typer.Option(
         "--map",
         metavar="IMAGE",
-        help="Image file (.png) of the error at each visible point; doubles the duration.",
+        help="Image file (.png) to write with the error at each visible point; this doubles the "
+        "duration.",
     ),
 ]
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create the folder for an experiment's bag and results, `output` or a new one in runs/."""
+    """Create the folder for an experiment's bag and results: `output`, or a new folder in runs/."""
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
@@ -119,20 +120,20 @@ def stroke(
         typer.Option(
             min=1,
             max=1000,
-            help="Number of strokes, each with another seed in a separate graph; gives the 95 % "
-            "interval of the mean.",
+            help="Number of strokes, each in a new graph with another random seed; several give "
+            "the 95 % confidence interval of the mean.",
         ),
     ] = 1,
     ablations: Annotated[
         bool,
         typer.Option(
             "--ablations",
-            help="Also measure without prediction, with each tracking method, with stretch only, "
-            "and at 15, 30 and 60 Hz.",
+            help="Also measure variants: without prediction, with each tracking method, with the "
+            "force rendered by stretch only, and with cameras of 15, 30 and 60 Hz.",
         ),
     ] = False,
     radii: Annotated[
-        bool, typer.Option("--radii", help="Also measure a cylinder of twice the radius.")
+        bool, typer.Option("--radii", help="Also measure on a cylinder of twice the radius.")
     ] = False,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
@@ -144,20 +145,23 @@ def stroke(
         list[Feature] | None,
         typer.Option(
             "--without",
-            help="Leave out the image, or the rendered force; both start no soft body. Without "
-            "image, the latencies of frames are null. Not for several strokes or variants.",
+            help="Part of the display to omit: the projected image or the rendered force. Without "
+            "the image, frame latencies are null. Not with several strokes or variants.",
         ),
     ] = None,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Stroke the cylinder over 60 degrees, and measure the sheet's errors (section V, Table I).
+    """Simulate a finger that strokes a cylinder over 60 degrees; measure the sheet's pose errors.
 
-    With several strokes or variants, the same --output continues an interrupted sweep.
+    This is the experiment of Furukawa et al. 2007, section V and Table I. If several strokes or
+    variants were interrupted, the same --output continues them.
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:
-        raise CommandError("--radii: measures the shipped cylinders; remove --scene", BAD_INPUT)
+        raise CommandError(
+            "--radii measures the shipped cylinder scenes only; remove --scene", BAD_INPUT
+        )
     if repeats > 1 or ablations or radii:
         from flexsheet.launch.experiments import stroke_table
 
@@ -218,7 +222,7 @@ def tilt(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure image errors on an inclined sheet (section VI-B, Fig. 11)."""
+    """Measure image errors on an inclined sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
 
     bag = make_result_folder(output, "tilt") / "tilt.mcap"
@@ -246,7 +250,7 @@ def push(
         typer.Option(
             "--at",
             metavar="MM",
-            help="Contact position along the cylinder's axis from its centre, mm.",
+            help="Contact position along the axis of the cylinder, relative to its centre, mm.",
         ),
     ] = 0.0,
     tilt_deg: Annotated[
@@ -254,7 +258,7 @@ def push(
         typer.Option(
             "--tilt",
             metavar="DEG",
-            help="Contact angle around the cylinder's axis, degrees; inclines the sheet.",
+            help="Contact angle around the axis of the cylinder, degrees; it inclines the sheet.",
         ),
     ] = 0.0,
     map_file: MapOption = None,
@@ -266,10 +270,10 @@ def push(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure image errors on a pushed sheet (section VI-C, Fig. 13).
+    """Measure image errors on a pushed sheet (Furukawa et al. 2007, section VI-C, Fig. 13).
 
-    As in the paper, the sheet is tilted but does not comply: the finger's whole push deflects it.
-    `--set planner.compliance_mode=force_curve` enables compliance.
+    As in that paper, the arms do not move the sheet back under the finger, so the whole push
+    deflects the sheet. `--set planner.compliance_mode=force_curve` makes it yield.
     """
     from flexsheet.launch.experiments.image import make_push_series
     from flexsheet.launch.experiments.run import make_settings
@@ -304,7 +308,7 @@ def compliance(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the force on the finger with the object's force, over the push depth."""
+    """Compare the force on the finger with that of the virtual object at several push depths."""
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
 
@@ -327,8 +331,8 @@ def compliance(
     print_table(columns, cells)
     moving = result["moving"]
     words.print(
-        f"in motion at {moving['speed_mm_per_s']:g} mm/s: {moving['rms_percent']:.0f} % rms, "
-        f"{moving['worst_percent']:.0f} % max; noticeable from "
+        f"force error in motion at {moving['speed_mm_per_s']:g} mm/s: "
+        f"{moving['rms_percent']:.0f} % rms, {moving['worst_percent']:.0f} % max; people notice "
         f"{result['noticed_percent'][0]:.0f} to {result['noticed_percent'][1]:.0f} %"
     )
     words.print(f"bag: {bag}")
@@ -404,7 +408,8 @@ def gestures(
         typer.Option(
             "--gesture",
             metavar="NAME",
-            help="Gesture to run; repeat for several; default: all.",
+            help="Name of a gesture to run, or CSV file with a fingertip path; repeat for several; "
+            "default: all gestures.",
             autocompletion=complete.gestures,
         ),
     ] = None,
@@ -415,7 +420,7 @@ def gestures(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the tracking error of a fingertip in strokes, taps, reaches, stops and turns."""
+    """Measure the accuracy of fingertip tracking in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
 
     selected = experiment.select_gestures(split_names(names))
@@ -434,7 +439,7 @@ def gestures(
 
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """Print one line per gesture: errors in mm, delays in ms."""
+    """Print a table of tracking errors (mm) and delays (ms), one line per gesture."""
 
     def shown(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
@@ -455,7 +460,10 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print one line per path: error between true sheet and true finger during contact."""
+    """Print how well the sheet followed the finger during contact, one line per fingertip path.
+
+    Δd and Δθ are the distance and angle errors of the true sheet to the true finger.
+    """
 
     def shown(values: dict[str, float] | None) -> list[str]:
         if values is None:
@@ -475,7 +483,7 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
-    """Print Table I of the paper beside the measured values, mean and standard deviation."""
+    """Print the measured errors beside Table I of the paper, as mean and standard deviation."""
     from flexsheet.launch.experiments.stroke import PAPER_TABLE_1
 
     columns = ["moving time"]
@@ -494,7 +502,7 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print one line per variant: means over the strokes with their 95 % intervals."""
+    """Print one line per variant, with mean errors over all strokes and 95 % intervals."""
 
     def shown(found: dict[str, Any] | None) -> str:
         if found is None:
@@ -530,16 +538,16 @@ def stability(
     scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     hands: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Number of drawn hands of each kind.")
+        int, typer.Option(metavar="N", min=1, max=100, help="Number of random hands per kind.")
     ] = 4,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the drawn hands.")] = 100,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the hands.")] = 100,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate whether a hand that touches the sheet oscillates; no graph is started.
+    """Simulate whether a hand in contact with the sheet starts to oscillate; starts no graph.
 
-    Varies the object's stiffness, the hand's impedance and the delay, with and without the
-    planner's bounds, and compares the critical gain with the prediction.
+    The stiffness of the object, the impedance of the hand and the delay are varied, with and
+    without the planner's bounds. The simulated critical gain is compared with the predicted one.
     """
     import json
 
@@ -577,7 +585,7 @@ def stability(
     error, median = result["boundary_error_percent"], result["boundary_median_percent"]
     if error is not None:
         words.print(
-            f"critical gain, predicted against simulated: {median:.0f} % median, "
-            f"{error:.0f} % at 95 %, {len(result['boundary'])} boundaries"
+            f"error of the predicted critical gain: {median:.0f} % median, "
+            f"{error:.0f} % at the 95 % quantile, in {len(result['boundary'])} simulated cases"
         )
     words.print(f"image: {image}")

@@ -1,4 +1,8 @@
-"""`flexsheet experiment robustness`, `sensitivity` and `follow`: truth that differs from belief."""
+"""`flexsheet experiment robustness`, `sensitivity` and `follow`.
+
+The first two simulate hardware whose true parameters (the apparatus) differ from the scene, which
+is what the nodes assume. The last follows a recorded finger.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +66,8 @@ def robustness(
         typer.Option(
             "--seeds",
             metavar="A-B",
-            help="Draws to evaluate; 0-99 are for development, the others for reports.",
+            help="Range of random seeds, one apparatus each; 0-99 are for development, higher ones "
+            "for reports.",
         ),
     ],
     profile: ProfileOption = "modern",
@@ -71,7 +76,7 @@ def robustness(
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
     keep_bags: Annotated[
-        bool, typer.Option("--keep-bags", help="Keep the bag of each trial in the folder.")
+        bool, typer.Option("--keep-bags", help="Keep the recording of each trial in the folder.")
     ] = False,
     launch_file: LaunchOption = DEMO,
     scene: OtherSceneOption = None,
@@ -79,10 +84,11 @@ def robustness(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Evaluate drawn apparatuses: sheet, fingertip, image and force over many laboratories.
+    """Measure errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
-    Each draw is a separate process with a graph and a stroke. Image and force are evaluated at
-    rest, without the graph. The same --output continues an interrupted sweep.
+    For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
+    separate process runs a graph with one stroke; image and force are evaluated at rest, without a
+    graph. If the command was interrupted, the same --output continues it.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -131,15 +137,15 @@ def sensitivity(
         typer.Option(
             "--parameter",
             metavar="KEY",
-            help="Row of the table of tolerances; repeat for several; default: all.",
+            help="Parameter in the table of tolerances; repeat for several; default: all.",
         ),
     ] = None,
     with_graph: Annotated[
         bool,
         typer.Option(
             "--graph",
-            help="Also run a graph for the parameters that matter in motion only, such as delays; "
-            "four strokes each.",
+            help="Also run a graph for parameters that have an effect only in motion, such as "
+            "delays: four strokes per parameter.",
         ),
     ] = False,
     profile: ProfileOption = "modern",
@@ -153,10 +159,10 @@ def sensitivity(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure what each tolerance does alone, at 1 and 3 standard deviations on both sides.
+    """Measure the errors that each inaccurate hardware parameter causes alone.
 
-    Without --graph, everything is evaluated at rest. The same --output continues an interrupted
-    sweep.
+    Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, all
+    are evaluated at rest. If the command was interrupted, the same --output continues it.
     """
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.launch.experiments.pictures import draw_sensitivity
@@ -221,7 +227,8 @@ def follow(
         typer.Option(
             "--finger-path",
             metavar="NAME_OR_FILE",
-            help="CSV file of a recorded finger (columns t_s,x_mm,y_mm,z_mm), or a gesture.",
+            help="CSV file with a recorded fingertip path (columns t_s,x_mm,y_mm,z_mm), or the "
+            "name of a gesture.",
             autocompletion=complete.gestures,
         ),
     ],
@@ -233,15 +240,16 @@ def follow(
         bool,
         typer.Option(
             "--simulated-time",
-            help="Run tracking, planning and arms in simulated time, without a graph.",
+            help="Run tracking, planning and arms in simulated time instead of in a graph.",
         ),
     ] = False,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Follow a recorded finger, and compare with what the arms' limits allow.
+    """Measure how well the sheet follows a recorded finger, and compare with a lower bound.
 
-    The lower bound is the smallest mean error of arms that know the whole recording in advance.
+    The bound is the minimum mean error that the limits of the arms allow, if the whole recording is
+    known in advance.
     """
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path
@@ -257,7 +265,7 @@ def follow(
     print_followed([result])
     bound = result["lower_bound_mm"]
     words.print(
-        f"lower bound of the arms: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
+        f"lower bound of the error: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
     )
     if bag is not None:
         words.print(f"bag: {bag}")

@@ -1,4 +1,7 @@
-"""`flexsheet explain`: print the meaning and remedy of an error or note."""
+"""`flexsheet explain`: print the meaning and the remedy of an error or of a node's note.
+
+A note is a short text in a node's status.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +26,15 @@ PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3
 MIN_WORD_LETTERS = 3
 MIN_SHARED_WORDS = 2
-"""Minimum number of words that a text and a close match have in common."""
+"""Minimum number of words that a text and an inexact match have in common."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One kind of error or note.
+    """Explanation of one kind of error or note.
 
-    name: name of the class, or empty. phrase: text that all notes of this kind contain, or empty.
+    name: name of the error class, or empty. phrase: text that all notes of this kind contain, or
+    empty.
     """
 
     code: str
@@ -42,7 +46,7 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return the entries of all errors, notes of nodes, and reasons that the console shows."""
+    """Return explanations of all errors, of nodes' notes, and of reasons that the console shows."""
     from flexsheet.messages.notes import (
         FINGERTIP_REMEDIES,
         SELF_CHECK_FINDINGS,
@@ -76,7 +80,7 @@ def entries() -> tuple[Entry, ...]:
 
 
 def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
-    """Yield the project's subclasses of an error, without those of tests and users."""
+    """Yield all subclasses of an error class that are defined in this package."""
     for derived in kind.__subclasses__():
         if derived.__module__.startswith("flexsheet."):
             yield derived
@@ -88,10 +92,10 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the entries for a code, a class name or an error text, the best match first.
+    """Return the explanations for a code, a class name or an error text, the best match first.
 
-    A text matches entries whose class name or phrase it contains; otherwise entries that have at
-    least `MIN_SHARED_WORDS` words in common with it, weighted by rarity.
+    An error text matches entries whose class name or phrase it contains. If there are none, it
+    matches entries with at least MIN_SHARED_WORDS common words; rare words have more weight.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:
@@ -124,7 +128,7 @@ def _words(text: str) -> set[str]:
     )
 )
 def explain(
-    message: Annotated[str, typer.Argument(help="Code, class name or text of an error or note.")],
+    message: Annotated[str, typer.Argument(help="Text, code or class name of an error or note.")],
     as_json: JsonOption = False,
 ) -> None:
     """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""
@@ -139,4 +143,6 @@ def explain(
             print()
         print_fields(entry.items())
     if not found:
-        raise CommandError(f'"{message}": unknown error or note; docs/errors.md lists all codes')
+        raise CommandError(
+            f'"{message}": no error or note matches; choose a code in docs/errors.md'
+        )

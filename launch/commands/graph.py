@@ -1,4 +1,4 @@
-"""Find the running graph, and run a command's event loop until it is interrupted."""
+"""Find the running graph, receive its messages, and run the event loop of a command."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """Return the graph and run of `directory`, default: of the newest running launcher.
+    """Return the graph and the run in a run directory; default: those of the newest running graph.
 
-    Raises CommandError for a directory without a plan, NoGraphError if no graph is running.
+    Raises CommandError if the directory contains no plan, and NoGraphError if no graph is running.
     """
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run, list_live_runs
@@ -35,7 +35,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
         run = Run(directory.resolve().name, directory.resolve())
         if not run.plan_file.is_file():
             raise CommandError(
-                f"--run {directory}: does not contain plan.json; name the directory of a run",
+                f"--run {directory}: the folder does not contain plan.json; name a run directory",
                 BAD_INPUT,
             )
     else:
@@ -53,7 +53,7 @@ async def receive_until(
     done: Callable[[], bool],
     timeout_s: float,
 ) -> bool:
-    """Pass messages to handlers by topic until `done()`; return whether it was in time."""
+    """Pass messages to the handler of their topic until `done()`; return False on a timeout."""
     from flexsheet.launch.running.tools import make_subscriber
 
     satisfied = asyncio.Event()
@@ -90,7 +90,7 @@ async def receive_until(
 
 
 def run_interruptible(work: Coroutine[Any, Any, int]) -> int:
-    """Run `work` in an event loop; SIGINT and SIGTERM cancel it and return 0."""
+    """Run `work` in an event loop and return its result; SIGINT and SIGTERM cancel it, result 0."""
 
     async def guarded() -> int:
         task = asyncio.ensure_future(work)

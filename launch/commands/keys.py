@@ -1,4 +1,4 @@
-"""`flexsheet keys`: create and show key pairs, and install public keys in a launch file."""
+"""`flexsheet keys`: manage the key pairs by which the hosts of a graph authenticate each other."""
 
 from __future__ import annotations
 
@@ -20,14 +20,18 @@ from flexsheet.launch.commands.output import (
 
 KEY_LENGTH = 40
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="Manage the key pairs of hosts.")
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="Manage the key pairs by which hosts authenticate each other.",
+)
 
 
 class KeyCommand(TyperCommand):
-    """Command whose last argument may be a key that starts with "-"."""
+    """Command that accepts a key that starts with "-" as its last argument."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert "--" before a key that starts with "-", which click would parse."""
+        """Insert "--" in front of a key that starts with "-"; it would be parsed as an option."""
         keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
         if keys and "--" not in args:
             args = [one for one in args if one not in keys] + ["--", *keys]
@@ -45,14 +49,14 @@ def new(
     replace: Annotated[
         bool,
         typer.Option(
-            "--replace", help="Replace the host's existing key, which cannot be restored."
+            "--replace", help="Overwrite an existing key of the host; it cannot be restored."
         ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Create the key pair of a host, and print its public key; run the command on that host.
+    """Create the key pair of this computer, and print the public key.
 
-    Stores the secret key in a file that only its owner can read.
+    Run the command on the host itself. The secret key is stored in a file that only you can read.
     """
     import re
 
@@ -71,7 +75,7 @@ def new(
         raise CommandError(str(error)) from error
     words.print(f"secret key: {file}; do not copy it to another computer", markup=False)
     words.print(
-        f"on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
+        f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
     )
     if as_json:
         print_json({"host": host, "public": public, "secret_file": str(file)})
@@ -89,14 +93,14 @@ def show(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the public keys of this computer's key pairs; exit code 1 if a key cannot be read."""
+    """Print the public keys stored on this computer; exit code 1 if a key cannot be read."""
     from flexsheet.launch.running.keys import directory, secret_file
     from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
         raise CommandError(
-            f"{directory()}: does not contain keys; create one: flexsheet keys new HOST"
+            f"{directory()}: the folder contains no keys; create one: flexsheet keys new HOST"
         )
     rows = []
     problems = []
@@ -131,14 +135,14 @@ def install(
     key: Annotated[
         str | None,
         typer.Argument(
-            metavar="KEY", help="Public key; default: from the key pair on this computer."
+            metavar="KEY", help="Public key; default: key of HOST stored on this computer."
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a host's public key into a launch file.
 
-    A graph that runs from that file uses the new key within two seconds, without a restart.
+    A running graph of this launch file uses the new key within two seconds, without a restart.
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file

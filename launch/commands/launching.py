@@ -58,13 +58,17 @@ def launch(
         str | None,
         typer.Option(
             metavar="HOST",
-            help="Host whose nodes are started; default: the nodes of all hosts.",
+            help="Start only the nodes of this host; default: the nodes of all hosts.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option("-p", "--dry-run", help="Print the resolved graph without starting it."),
+        typer.Option(
+            "-p",
+            "--dry-run",
+            help="Check the launch file and print the resolved graph without starting it.",
+        ),
     ] = False,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
@@ -73,24 +77,25 @@ def launch(
         typer.Option(
             "--without",
             metavar="NODE",
-            help="Node that is not started, for `flexsheet run NODE`; repeat for several.",
+            help="Node that is not started, because `flexsheet run NODE` starts it; repeat for "
+            "several.",
         ),
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="BAG", help="Bag file to write the logged topics to."),
+        typer.Option(metavar="BAG", help="Bag file to record the logged topics to."),
     ] = None,
     console: Annotated[
         bool,
-        typer.Option("--console", help="Add a browser console and its recorder to the graph."),
+        typer.Option("--console", help="Add a browser console and a recorder to the graph."),
     ] = False,
     duration: DurationOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
-    With --json, prints one line about the run when all nodes are ready; with --dry-run, the
-    resolved graph.
+    With --json, one line about the run is printed when all nodes are ready. With --dry-run, it is
+    the resolved graph.
 
     Exit codes: 0 stopped on request, 1 a node failed, 2 the input is invalid.
     """
@@ -119,14 +124,14 @@ def launch(
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """Return the run directory, plan hash and node names of a ready graph, for scripts."""
+    """Return run directory, plan hash and node names of a graph, for the JSON output."""
     nodes = [node.name for node in plan.nodes_on(host)]
     omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
-    """Print the nodes of the launch file that are not started, with the reasons."""
+    """Print the nodes of the launch file that were not started, with the reason for each."""
     from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 
     for one in plan.omitted:
@@ -142,8 +147,9 @@ async def run_graph(
     without: Collection[str] = (),
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
-    """Run a graph until a signal, or `duration_s` after it is ready; return the exit code.
+    """Run a graph until a signal arrives, and return the exit code.
 
+    duration_s: time after all nodes are ready when the graph is stopped; None for no limit.
     without: names of nodes that are not started.
     """
     from flexsheet.launch.running.supervisor import RunningGraph
@@ -161,7 +167,7 @@ async def run_graph(
 
 
 def _list_end_signals() -> list[int]:
-    """Return the signals that end a graph; SIGHUP stays ignored under `nohup`."""
+    """Return the signals that stop a graph; SIGHUP only if `nohup` has not disabled it."""
     hung_up = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
     return [signal.SIGINT, signal.SIGTERM, *hung_up]
 
@@ -172,7 +178,7 @@ async def _run_until(
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run the graph until `stop_requested`, or until `duration_s` after it is ready."""
+    """Run the graph until `stop_requested`, or until `duration_s` after all nodes are ready."""
     from flexsheet.launch.running.supervisor import NodeFailedError
     from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 
@@ -212,13 +218,13 @@ async def _run_until(
 
 
 def _print_log_line(node: str, line: str) -> None:
-    """Print one line of a node's log."""
+    """Print one line of a node's log with the node's name."""
     style, text = format_log_line(line)
     words.print(f"{node:>16} | {text}", style=style, markup=False)
 
 
 def format_log_line(line: str) -> tuple[str, str]:
-    """Return the style and the text of one line of a log; JSON from structlog becomes readable."""
+    """Return the colour style and the text of a log line; convert JSON of structlog into text."""
     style, text = "", line
     if line.startswith("{"):
         try:
@@ -238,14 +244,15 @@ def format_log_line(line: str) -> tuple[str, str]:
 
 
 def _format_settings(node: ResolvedNode) -> str:
-    """Format the parameters that differ from their defaults."""
+    """Return "name=value" for each parameter of a node that differs from its default."""
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes import node_class
     from flexsheet.nodes.node import find_parameters_type
 
     fields = find_parameters_type(node_class(node.type)).model_fields
-    # Convert defaults as plans do; a default factory has no fixed value to compare with.
+    # Defaults are converted to JSON types like the values in plans. A default factory has no fixed
+    # value to compare with.
     defaults = {
         name: to_jsonable_python(field.default)
         for name, field in fields.items()
@@ -261,7 +268,9 @@ def _format_settings(node: ResolvedNode) -> str:
 def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
     if plan.apparatus is not None:
-        words.print(f"apparatus {plan.apparatus['origin']}: differs from the scene")
+        words.print(
+            f"apparatus (true parameters of the simulated hardware): {plan.apparatus['origin']}"
+        )
     print_table(
         ("node", "type", "host", "process", "restart", "parameters"),
         [
@@ -277,7 +286,7 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
         ],
     )
     print_omitted(plan, host)
-    words.print("for parameters with default values: flexsheet node info TYPE", style="dim")
+    words.print("to list default parameter values: flexsheet node info TYPE", style="dim")
     print()
     print_table(
         ("topic", "from", "endpoints", "to"),

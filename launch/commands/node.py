@@ -1,4 +1,4 @@
-"""`flexsheet node`: list node types, and describe their ports and parameters."""
+"""`flexsheet node`: list nodes and node types, and describe their ports and parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="List and describe nodes.",
+    help="List nodes and node types, and describe their ports and parameters.",
 )
 
 
@@ -41,7 +41,7 @@ def list_nodes(run: RunOption = None, as_json: JsonOption = False) -> None:
 
 @app.command("types", epilog=examples("flexsheet node types"))
 def list_types(as_json: JsonOption = False) -> None:
-    """List the node types for launch files."""
+    """List the node types that launch files can use."""
     from flexsheet.nodes import NODES
 
     print_rows([{"type": name, "class": path} for name, path in NODES.items()], as_json=as_json)
@@ -57,7 +57,7 @@ def info(
     node: Annotated[
         str,
         typer.Argument(
-            help='Node of the running graph, or node type: its name, or "module:Class".',
+            help='Name of a node of the running graph, or a node type (name or "module:Class").',
             autocompletion=complete.nodes,
         ),
     ],
@@ -66,7 +66,7 @@ def info(
 ) -> None:
     """Print the ports, timers and parameters of a node or of a node type.
 
-    For a node of the running graph, prints its topics and the values of its parameters.
+    For a node of the running graph, topics and parameter values are printed too.
     """
     from flexsheet.nodes import UnknownNodeError, node_class
     from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers
@@ -121,7 +121,7 @@ def info(
 
 
 def _find_topic(node: ResolvedNode, port: str) -> str | None:
-    """Return the topic of a port in the running graph; None if it is not connected."""
+    """Return the topic to which a port of a node is connected; None if it is not connected."""
     ports = (*node.inputs, *node.outputs)
     return next((one.topic for one in ports if one.port == port and one.endpoints), None)
 
@@ -129,7 +129,7 @@ def _find_topic(node: ResolvedNode, port: str) -> str | None:
 def _parameter(name: str, field: Any) -> dict[str, Any]:
     from flexsheet.messages.field_types import describe_field_type
 
-    # Same text as in docs/parameters.md, without the links.
+    # This is the text of docs/parameters.md without Markdown links and escapes.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     kind = re.sub(r"[`\\]", "", kind)
     return {

@@ -1,6 +1,7 @@
-"""Declare the arguments and options that several commands share.
+"""Declare the command-line arguments and options that several commands share.
 
-Names of values are capital letters; `name_values` adds them to the options that declare none.
+The help shows the value of an option by a placeholder in capital letters, such as FILE.
+`name_values` adds it to options that declare none.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
-"""Names of the shipped launch file and scene that commands use by default."""
+"""Names of the shipped launch file and of the shipped scene that commands use by default."""
 
 FORMER_NAMES = {
     "also": "include",
@@ -35,16 +36,16 @@ FORMER_NAMES = {
     "service": "systemd",
     "stand-down": "disable",
 }
-"""Former names of options and commands with their current names; hidden in the help."""
+"""Current name of each renamed option and command; former names still work but are not shown."""
 
 
 def find_launch_file(given: Path | None) -> Path | None:
-    """Return the path of a launch file that is given by path or by its name in the package."""
+    """Return the path of a launch file, which is given as a path or as a shipped file's name."""
     return None if given is None else find_file(given, LAUNCH_FILES)
 
 
 def find_scene(given: Path | None) -> Path | None:
-    """Return the path of a scene that is given by path or by its name in the package."""
+    """Return the path of a scene file, which is given as a path or as a shipped file's name."""
     return None if given is None else find_file(given, SCENES)
 
 
@@ -52,7 +53,7 @@ LaunchArgument = Annotated[
     Path,
     typer.Argument(
         metavar="LAUNCH_FILE",
-        help="Launch file, or the name of a shipped one such as demo.",
+        help="Path of a launch file, or name of a shipped one such as demo.",
         autocompletion=complete.launch_files,
         callback=find_launch_file,
     ),
@@ -62,7 +63,7 @@ LaunchOption = Annotated[
     typer.Option(
         "--launch",
         metavar="LAUNCH_FILE",
-        help="Launch file of the graph.",
+        help="Launch file of the graph: path, or name of a shipped one such as demo.",
         autocompletion=complete.launch_files,
         callback=find_launch_file,
     ),
@@ -71,7 +72,7 @@ SceneArgument = Annotated[
     Path,
     typer.Argument(
         metavar="SCENE",
-        help="Scene file, or the name of a shipped one such as organ.",
+        help="Path of a scene file, or name of a shipped one such as organ.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -81,7 +82,7 @@ SceneOption = Annotated[
     typer.Option(
         "--scene",
         metavar="SCENE",
-        help="Scene file.",
+        help="Path of a scene file, or name of a shipped one.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -91,7 +92,7 @@ OtherSceneOption = Annotated[
     typer.Option(
         "--scene",
         metavar="SCENE",
-        help="Scene to use instead of that of the launch file.",
+        help="Scene that replaces the scene of the launch file.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -109,8 +110,8 @@ ApparatusOption = Annotated[
     typer.Option(
         "--apparatus",
         metavar="FILE|seed:N",
-        help="True parameters of the simulation: a file, or a draw such as "
-        "seed:7,paper,calibrated; default: the scene.",
+        help="True parameters of the simulated hardware: a file, or a random sample such as "
+        "seed:7,paper,calibrated; default: equal to the scene.",
     ),
 ]
 RunOption = Annotated[
@@ -118,7 +119,7 @@ RunOption = Annotated[
     typer.Option(
         "--run",
         metavar="FOLDER",
-        help="Directory of the run; default: the newest running graph.",
+        help="Run directory of the graph; default: the newest running graph.",
         autocompletion=complete.runs,
     ),
 ]
@@ -129,7 +130,7 @@ DurationOption = Annotated[
         "--duration",
         metavar="SECONDS",
         min=0.0,
-        help="Time after which the command stops; default: when Ctrl-C is pressed.",
+        help="Time after which the command stops, s; default: until Ctrl-C.",
     ),
 ]
 TopicArgument = Annotated[
@@ -158,7 +159,7 @@ ResultFolderOption = Annotated[
         "-o",
         "--output",
         metavar="FOLDER",
-        help="Folder for the bag and results; default: a new folder in runs/.",
+        help="Folder for the recording and the results; default: a new folder in runs/.",
     ),
 ]
 WorkersOption = Annotated[
@@ -168,7 +169,7 @@ WorkersOption = Annotated[
         metavar="N",
         min=1,
         max=64,
-        help="Number of simultaneous trials on this computer.",
+        help="Number of trials that run at the same time on this computer.",
     ),
 ]
 SchedulerOption = Annotated[
@@ -176,17 +177,22 @@ SchedulerOption = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Address of a dask.distributed scheduler whose workers do the work, such as "
-        "tcp://host:8786; default: this computer.",
+        help="Address of a dask.distributed scheduler that distributes the work, such as "
+        "tcp://host:8786; default: compute on this computer.",
     ),
 ]
 ProfileOption = Annotated[
     Literal["modern", "paper"],
-    typer.Option("--profile", help="Equipment that is drawn; modern: 60 Hz camera; paper: 30 Hz."),
+    typer.Option(
+        "--profile",
+        help="Equipment that is simulated; modern: 60 Hz camera; paper: 30 Hz camera.",
+    ),
 ]
 CalibratedOption = Annotated[
     bool,
-    typer.Option("--calibrated", help="Draw what remains after the devices' calibration."),
+    typer.Option(
+        "--calibrated", help="Sample only the errors that remain after the devices' calibration."
+    ),
 ]
 SeedOption = Annotated[
     int, typer.Option("--seed", metavar="N", help="Random seed of the simulation.")
@@ -194,19 +200,19 @@ SeedOption = Annotated[
 
 
 def output_file(text: str, metavar: str = "FILE") -> Any:
-    """Make the option -o/--output of a file to write."""
+    """Return the declaration of an option -o/--output, with `text` as its help."""
     return typer.Option("-o", "--output", metavar=metavar, help=text)
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
-    """Return the settings of a launch file, with the scene of --scene as the first one."""
+    """Return the values of --set, preceded by the setting that corresponds to --scene."""
     return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option; the former form "A,B" is several values, too.
+    """Return the values of a repeated option.  The former comma-separated form "A,B" also works.
 
-    Raises BadParameter for values without a name.
+    Raises BadParameter if the option is given but contains no name.
     """
     names = [name.strip() for one in given or () for name in one.split(",") if name.strip()]
     if given and not names:
@@ -218,7 +224,7 @@ _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "l
 
 
 def name_values(command: Any) -> None:
-    """Give each argument and option of a command the name of its value; a flag has none."""
+    """Set the placeholder that the help shows for the value of an option; flags have no value."""
     help_option = command.get_help_option(SimpleNamespace(help_option_names=["-h", "--help"]))
     for parameter in (*command.params, help_option):
         if getattr(parameter, "is_flag", False):

@@ -1,4 +1,7 @@
-"""Command output: data on stdout, messages on stderr, exit codes."""
+"""Output of all commands: data goes to stdout, messages for the user to stderr.
+
+Defines the exit codes too.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
 class CommandError(FlexsheetError):
-    """Error in a command's options or input; ends the command with an exit code."""
+    """Error that ends a command with an exit code, for instance a wrong option."""
 
     code = "command"
     remedy = "Correct the option or file that the error names."
@@ -33,15 +36,18 @@ class CommandError(FlexsheetError):
 
 
 def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError if the folder of an output file does not exist."""
+    """Raise CommandError, which names the option, if the folder of an output file is missing."""
     if not file.resolve().parent.is_dir():
-        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist", BAD_INPUT)
+        raise CommandError(
+            f"{option} {file}: the folder {file.parent} does not exist; create it", BAD_INPUT
+        )
 
 
 class Words:
-    """Printer of messages for the user on stderr; imports rich with the first message.
+    """Printer of messages for the user on stderr.
 
-    Uses progress bars in terminals only, and colours in terminals unless NO_COLOR is set.
+    Colours and status lines are used only in terminals; NO_COLOR disables colours. The module rich
+    is imported with the first message, so that commands start fast.
     """
 
     @cached_property
@@ -62,7 +68,7 @@ class Words:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
-        """Show a status line until the context ends, in terminals only."""
+        """Return a context that shows a status line while it is active, in terminals only."""
         return self.console.status(text)
 
 
@@ -77,7 +83,7 @@ def examples(*lines: str) -> str:
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """Return the calls formatted by `examples`."""
+    """Return the example calls in a help epilog that `examples` has formatted."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
@@ -88,12 +94,12 @@ def print_json(data: Any) -> None:
 
 
 def print_json_line(data: Any) -> None:
-    """Print a JSON document on one line of stdout, without buffering; see `print_json`."""
+    """Print a JSON document on one line of stdout and flush it; NaN and infinity become null."""
     print(json.dumps(replace_non_finite(data), allow_nan=False), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table on stdout; fold its cells if it is wider than the terminal."""
+    """Print a table on stdout; wrap the text in cells if the table is wider than the terminal."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
     in_terminal = sys.stdout.isatty()
@@ -117,7 +123,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace inner mappings by their values, named "interval_ms p50"."""
+    """Replace each inner mapping by its values, with joined names such as "interval_ms p50"."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
@@ -175,7 +181,7 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Show a progress bar on stderr, updated by (done, total); in terminals only."""
+    """Show a progress bar on stderr, in terminals only; yield its update function (done, total)."""
     if not words.is_terminal:
         yield lambda done, total: None
         return
@@ -200,9 +206,10 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
 
 
 def logs_on_stderr() -> None:
-    """Send warnings and errors that nodes and caches log inside a command to stderr.
+    """Write warnings and errors that are logged during a command to stderr.
 
-    Call this before any logger is created, since stdout is for the command's output.
+    The default is stdout, which is reserved for the command's data. Call this function before any
+    logger is created.
     """
     import logging
 

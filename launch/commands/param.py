@@ -34,13 +34,13 @@ app = typer.Typer(
 )
 
 STATUS_TIMEOUT_S = 3.0
-"""Nodes publish their status, with the changed parameters, once a second."""
+"""Maximum time to wait for statuses, which contain changed parameters and appear once a second."""
 
 ParameterArgument = Annotated[
     str,
     typer.Argument(
         metavar="NODE.PARAM",
-        help="Node and parameter, such as planner.max_age_s.",
+        help="Names of node and parameter, such as planner.max_age_s.",
         autocompletion=complete.node_parameters,
     ),
 ]
@@ -51,13 +51,15 @@ def list_parameters(
     node: Annotated[
         str | None,
         typer.Argument(
-            metavar="NODE", help="Node; default: all nodes.", autocompletion=complete.nodes
+            metavar="NODE",
+            help="Name of a node; default: all nodes.",
+            autocompletion=complete.nodes,
         ),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the parameters of the running graph, and whether they may change while it runs."""
+    """List the parameters of the running graph, and whether they can be changed while it runs."""
     plan, found = running_graph(run)
     nodes = [_find_node(plan, node)] if node else list(plan.nodes.values())
     changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
@@ -100,13 +102,13 @@ def get_parameter(
 )
 def set_parameter(
     parameter: ParameterArgument,
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value in YAML.")],
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value, in YAML syntax.")],
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Change a parameter of a running node until its next start.
+    """Change a parameter of a running node; the change is lost when the node restarts.
 
-    `flexsheet param list` shows which parameters may change while the graph runs.
+    `flexsheet param list` shows which parameters can be changed while the graph runs.
     """
     from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError
@@ -120,8 +122,8 @@ def set_parameter(
     if name not in _live(node):
         live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
         raise CommandError(
-            f"{parameter}: cannot change while the node runs; start the graph again with "
-            f"--set {parameter}={value} (may change: {live})",
+            f"{parameter}: this parameter cannot change while the node runs; start the graph again "
+            f"with --set {parameter}={value} (parameters that may change: {live})",
             BAD_INPUT,
         )
     try:
@@ -129,10 +131,10 @@ def set_parameter(
         kind = find_parameters_type(node_class(node.type))
         checked = kind.model_validate({**node.parameters, name: parsed})
     except YAMLError as error:
-        raise CommandError(f"VALUE {value}: is not YAML: {error}", BAD_INPUT) from error
+        raise CommandError(f"VALUE {value}: not a valid YAML value: {error}", BAD_INPUT) from error
     except ValidationError as error:
         text = "; ".join(one["msg"] for one in error.errors())
-        raise CommandError(f"{parameter}={value}: is invalid: {text}", BAD_INPUT) from error
+        raise CommandError(f"{parameter}={value}: invalid value: {text}", BAD_INPUT) from error
     new = checked.model_dump(mode="json")[name]
     run_interruptible(_set(plan, found, node.name, name, new))
     if as_json:
@@ -170,7 +172,7 @@ def _live(node: ResolvedNode) -> frozenset[str]:
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that running nodes have changed since their start."""
+    """Return the parameters (name: value) that were changed since the start, by node."""
     found: dict[str, dict[str, Any]] = {}
     if nodes:
         run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
@@ -180,7 +182,7 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Collect changed parameters from statuses until `done()`; return 1 if it times out."""
+    """Collect changed parameters from node statuses until `done()`; return 1 on a timeout."""
 
     def add(status: Status) -> None:
         found[status.node] = json.loads(status.changed_parameters)
@@ -189,7 +191,7 @@ async def _await_statuses(
 
 
 async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a change, and wait until the node's status confirms it."""
+    """Publish a parameter change, and wait until the node's status confirms it."""
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 
@@ -202,7 +204,7 @@ async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) 
         found: dict[str, dict[str, Any]] = {}
         if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
             raise CommandError(
-                f"{node}.{name}: the node has not confirmed the change; see flexsheet logs {node}"
+                f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}"
             )
     finally:
         writer.close()

@@ -1,4 +1,4 @@
-"""`flexsheet precompute`: compute a scene's cached tables before its graph starts."""
+"""`flexsheet precompute`: compute the tables that a graph reads from a cache, before it starts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def precompute(
     cache: Annotated[
         Path | None,
         typer.Option(
-            "--cache", metavar="FOLDER", help="Folder of the cache; default: the user's cache."
+            "--cache", metavar="FOLDER", help="Cache folder; default: the cache of this user."
         ),
     ] = None,
     skin_spacing_m: Annotated[
@@ -39,7 +39,8 @@ def precompute(
         typer.Option(
             "--skin-spacing",
             metavar="METRES",
-            help="Node spacing of the soft body's nonlinear table, m; also computes it (minutes).",
+            help="Also compute the nonlinear table of the soft body (minutes), with this spacing "
+            "of surface nodes, m.",
         ),
     ] = None,
     scheduler: SchedulerOption = None,
@@ -47,8 +48,9 @@ def precompute(
 ) -> None:
     """Compute the deflection shapes of a scene's sheet, unless the cache contains them.
 
-    If the scene sets `sheet_force: table`, also computes that table, which takes about two minutes.
-    Experiments and the demo compute missing shapes automatically.
+    The renderer draws a pushed sheet with these shapes. If the scene sets `sheet_force: table`, the
+    force table is computed too, which takes about two minutes. Experiments and the demo compute
+    missing shapes automatically.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import (
@@ -67,7 +69,7 @@ def precompute(
     scene = load_scene(scene_file)
     with progress_words() as progress:
         files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
-        progress("computing the bounds of the loop with the hand")
+        progress("computing the stability bounds of the control loop with the user's hand")
         load_or_compute_bounds(scene.camera.rate_hz, cache)
         if scene.methods.sheet_force == "table":
             files["force_table"] = precompute_force_table(scene, cache, progress)

@@ -1,4 +1,4 @@
-"""`flexsheet status`, `logs`, `stop` and `run`: look into running graphs, and end them."""
+"""`flexsheet status`, `logs`, `stop` and `run`: inspect and stop graphs, and run single nodes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 status_app, logs_app, stop_app, run_app = (typer.Typer(add_completion=False) for _ in range(4))
 
 STATUS_TIMEOUT_S = 3.0
-"""Nodes publish their status once a second."""
+"""Maximum time to wait for the statuses of all nodes, which are published once a second."""
 
 STOP_TIMEOUT_S = 20.0
 POLL_PERIOD_S = 0.05
@@ -61,9 +61,10 @@ NodeArgument = Annotated[
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Show the nodes of the running graph with rates, losses, notes and suspected causes.
+    """Show the nodes of the running graph with message rates, lost messages and notes.
 
-    Exit code 1 if a node does not report, or a self-check suspects a cause.
+    Also shows problems that the nodes' self-checks suspect. Exit code 1 if there is such a problem,
+    or if a node does not report its status.
     """
     plan, found = running_graph(run)
     statuses: dict[str, Status] = {}
@@ -104,7 +105,7 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 async def _collect_statuses(
     plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
 ) -> int:
-    """Collect the statuses of all nodes and launchers; stop waiting after a time-out."""
+    """Collect the statuses of all nodes and hosts until STATUS_TIMEOUT_S has passed."""
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),
         "host": lambda message: hosts.update({message.host: message}),
@@ -118,7 +119,7 @@ async def _collect_statuses(
 
 
 def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
-    """Return a row of the table of nodes; null where the node does not report."""
+    """Return the status of a node as a table row; values are null if it does not report."""
     row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
     if status is None:
         none: dict[str, Any] = {
@@ -180,7 +181,8 @@ def logs(
     if not file.is_file():
         known = sorted(one.stem for one in found.logs.glob("*.log"))
         raise CommandError(
-            f'"{node}": no such log in {found.logs}; {did_you_mean(node, known)}', BAD_INPUT
+            f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}',
+            BAD_INPUT,
         )
 
     def show(line: str) -> None:
@@ -195,19 +197,21 @@ def logs(
 
 
 def _newest_run(directory: Path | None) -> Run:
-    """Return a run by its directory; default: the newest live one, else the newest one."""
+    """Return the run in a directory; default: the newest running one, else the newest one."""
     from flexsheet.launch.running.runs import Run, list_live_runs, list_runs
 
     if directory is not None:
         return Run(directory.resolve().name, directory.resolve())
     runs = list_live_runs() or list_runs()
     if not runs:
-        raise NoGraphError("no graph has run on this computer")
+        raise NoGraphError(
+            "no logs of a graph were found on this computer; start one: flexsheet launch FILE"
+        )
     return runs[0]
 
 
 def _further_lines(text: Any, run: Run) -> Iterator[str]:
-    """Yield the lines that are added to a log while its run is alive."""
+    """Yield the lines that are added to a log file until its run ends."""
     part = ""
     while True:
         alive = run.is_alive()
@@ -227,9 +231,9 @@ def stop(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Stop the running graph as Ctrl-C in its terminal does; exit code 1 if it does not end.
+    """Stop the running graph, as Ctrl-C in its terminal does; exit code 1 if it does not end.
 
-    In an emergency use the hard-wired e-stop, then `flexsheet arms stop`.
+    In an emergency, use the hard-wired emergency stop, and then `flexsheet arms stop`.
     """
     from flexsheet.launch.running.runs import list_live_runs
 
@@ -279,7 +283,8 @@ def run_node(
     """Run one node of a launch file in this terminal until Ctrl-C.
 
     The node joins the running graph, which must be started without it:
-    `flexsheet launch LAUNCH_FILE --without NODE`. With --launch, it runs in a graph of its own.
+    `flexsheet launch LAUNCH_FILE --without NODE`. With --launch, a new graph with only this node is
+    started.
     """
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan import load_graph
@@ -290,11 +295,14 @@ def run_node(
     else:
         plan, found = running_graph(run)
         if given:
-            raise CommandError("--set and --scene: need --launch LAUNCH_FILE", BAD_INPUT)
+            raise CommandError(
+                "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
+                "fixed settings",
+                BAD_INPUT,
+            )
     if node not in plan.nodes:
         raise CommandError(
-            f'"{node}": {plan.launch_file} has no such node; '
-            f"{did_you_mean(node, list(plan.nodes))}",
+            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}',
             BAD_INPUT,
         )
     if launch_file is not None:
@@ -314,7 +322,7 @@ async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | No
 
     if (run.directory / f"{name}.status").exists():
         raise CommandError(
-            f'"{name}" runs already in {run.directory}; '
+            f'node "{name}" is already running in {run.directory}; '
             f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}"
         )
     words.print(f"running {name} in {run.directory}; press Ctrl-C to stop", markup=False)

@@ -1,4 +1,4 @@
-"""`flexsheet systemd`: run one host of a launch file under systemd."""
+"""`flexsheet systemd`: run the nodes of one host of a launch file as a systemd service."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ USER_PATTERN = "abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 @app.callback()
 def systemd() -> None:
-    """Run one host of a launch file as a systemd service."""
+    """Run the nodes of one host of a launch file as a systemd service."""
 
 
 @app.command(
@@ -37,16 +37,16 @@ def install(
         str, typer.Option(metavar="USER", help="Existing user account that runs the service.")
     ] = "flexsheet",
     root: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Root folder of the file system to write to.")
+        Path, typer.Option(metavar="FOLDER", help="Root folder below which the files are written.")
     ] = Path("/"),
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the files instead of writing them.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the unit flexsheet@.service, the host's environment file and the TCP settings.
+    """Install the systemd unit flexsheet@.service, its environment file, and kernel TCP settings.
 
-    Does not start the service.
+    The service is not started; the commands for that are printed.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.systemd import STATE_FOLDER, list_bags, make_files
@@ -65,8 +65,8 @@ def install(
     for bag in list_bags(plan, host):
         if not bag.is_relative_to(STATE_FOLDER):
             words.print(
-                f"{bag}: the service can only write to {STATE_FOLDER}; change the bag's path in "
-                "the launch file",
+                f"{bag}: the service can write only to {STATE_FOLDER}; change the path of the bag "
+                "in the launch file",
                 markup=False, style="yellow",
             )  # fmt: skip
     files = list(make_files(launch_file=launch_file, host=host, user=user, root=root))

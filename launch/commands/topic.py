@@ -46,7 +46,7 @@ WindowOption = Annotated[
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
-"""Time without a message after which that is reported."""
+"""Time without a message after which the command reports that none has arrived."""
 
 SHORT_ARRAY = 36
 """Maximum number of elements of an array that is printed in full."""
@@ -158,7 +158,7 @@ def hz(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the rate of each writer of a topic, from stamps and sequence numbers."""
+    """Measure the message rate of each writer of a topic, from timestamps and sequence numbers."""
     arrivals = _measure(topic, run, duration)
     print_rows(measure_rates([one.header for one in arrivals]), as_json=as_json)
 
@@ -170,7 +170,7 @@ def bw(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the bandwidth of each writer of a topic, from the sizes of its messages."""
+    """Measure the bandwidth of each writer of a topic, in bytes per second."""
     print_rows(measure_bandwidths(_measure(topic, run, duration)), as_json=as_json)
 
 
@@ -181,16 +181,19 @@ def delay(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the age of a topic's data, from the source to this command.
+    """Measure the age of a topic's data when it arrives at this command.
 
-    Messages of another computer's clock are not counted, because their age is not known here.
+    The age is counted from the source timestamp, for instance the camera exposure. Messages with
+    timestamps of another computer's clock are ignored, because their age is not known here.
     """
     from flexsheet.messages.clock import SystemClock
 
     own = SystemClock().id
     arrivals = [one for one in _measure(topic, run, duration) if one.header.clock_id == own]
     if not arrivals:
-        raise CommandError(f'"{topic}" is published on another computer; run the command there')
+        raise CommandError(
+            f'topic "{topic}" has timestamps of another computer; run the command there'
+        )
     print_rows(measure_delays(arrivals), as_json=as_json)
 
 
@@ -213,7 +216,7 @@ def pub(
             "--rate",
             metavar="HZ",
             min=0.01,
-            help="Rate at which the message is repeated; default: send it once.",
+            help="Rate at which the message is repeated, Hz; default: send it once.",
         ),
     ] = None,
     once: Annotated[
@@ -225,8 +228,8 @@ def pub(
 ) -> None:
     """Publish a message to the running graph.
 
-    The topic must allow several writers or be listed in the launch file's `external_topics`. Late
-    subscribers receive a latched message only while this command runs.
+    The topic must allow several writers, or be listed under `external_topics` in the launch file. A
+    latched message reaches subscribers that connect later only while this command runs.
     """
     found = _find_topic(topic)
     built = _parse_message(found, message)
@@ -256,7 +259,7 @@ def make_silence_error(topic: str, duration_s: float) -> CommandError:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Message that a measurement received; the stamps are of this computer's clock."""
+    """Message received during a measurement; `received_ns` is a time of this computer's clock."""
 
     header: Header
     size_bytes: int
@@ -264,7 +267,7 @@ class Arrival:
 
 
 def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list[list[Any]]:
-    """Group consecutive starts of writers; return one list per writer and start."""
+    """Group messages by writer and by start of the writer, since a restart resets its counts."""
     groups: dict[tuple[str, int], list[Any]] = {}
     for one in arrivals:
         groups.setdefault((header(one).writer, header(one).epoch), []).append(one)
@@ -272,7 +275,7 @@ def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list
 
 
 def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
-    """Return the rate, received and lost messages and stamp intervals of each writer."""
+    """Return the rate, the received and lost messages, and the publication intervals per writer."""
     import numpy as np
 
     rows = []
@@ -314,7 +317,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the age of the data of each writer at their arrival."""
+    """Return statistics of the data age at arrival for each writer, ms."""
     rows = []
     for own in _by_writer(arrivals, lambda one: one.header):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
@@ -329,7 +332,7 @@ def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def _summarize(values: list[float]) -> dict[str, float] | None:
-    """Return median, 99 % quantile and maximum; None without a value."""
+    """Return the median, 99 % quantile and maximum; None if there are no values."""
     import numpy as np
 
     if not values:
@@ -342,7 +345,7 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
-    """Convert a message or field to JSON types; summarize long arrays by type, shape and range."""
+    """Convert a message or field to JSON types; unless `full`, summarize long arrays."""
     import numpy as np
     from pydantic import BaseModel
 
@@ -424,7 +427,7 @@ def _get_field(message: Message, path: str | None, topic: str) -> Any:
 
 def _report_no_message(topic: Topic) -> None:
     when = (
-        "it is published on change only"
+        "this topic is published only when its value changes"
         if topic.rate_hz is None
         else "check its writer: flexsheet topic echo status"
     )
@@ -461,7 +464,7 @@ async def _read(
 
 
 def _measure(topic: str, run: Path | None, duration_s: float) -> list[Arrival]:
-    """Return what arrives on a topic within a duration; CommandError if nothing arrives."""
+    """Record the messages that arrive on a topic; raise CommandError if there are none."""
     arrivals: list[Arrival] = []
     run_interruptible(_collect(_find_topic(topic), run, arrivals, duration_s))
     if not arrivals:
@@ -492,12 +495,15 @@ async def _collect(
 def make_listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, raw: bool = False
 ) -> Subscriber:
-    """Make a subscriber to a topic of the running graph; CommandError without a writer."""
+    """Return a subscriber to a topic of the running graph.  Raises CommandError."""
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
-        raise CommandError(f'"{topic.name}" has no writer in the running graph {run.directory}')
+        raise CommandError(
+            f'topic "{topic.name}" has no writer in the running graph {run.directory}; '
+            "add a node that publishes it to the launch file"
+        )
     return make_subscriber(
         topic.name,
         plan,
@@ -523,7 +529,7 @@ def _parse_message(topic: Topic, text: str) -> Message:
     try:
         try:
             value = parse_json(text)
-        except ValueError:  # YAML's errors describe faults of both formats
+        except ValueError:  # JSON is valid YAML, so the YAML error describes faults in both
             value = parse_value(text)
     except YAMLError as error:
         raise CommandError(f"{source}: not valid YAML or JSON: {error}", BAD_INPUT) from error
@@ -558,7 +564,8 @@ async def _publish(
             writer.publish(topic.name, message)
             sent += 1
             on_sent(sent)
-        # Wait for readers that are still connecting, since a latched message ends with its writer.
+        # Wait for readers that are still connecting, because the latched message is lost with the
+        # publisher's socket.
         await asyncio.sleep(READER_RECONNECT_S / 2)
     finally:
         writer.close()

@@ -47,10 +47,11 @@ def try_it(
     duration: DurationOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Touch a virtual object in the browser, without hardware.
+    """Simulate the display, and touch a virtual object with the mouse in the browser.
 
-    Starts the demo graph with a console, prints the address of its page, and runs until Ctrl-C.
-    From another computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address.
+    Starts the demo graph with a console, prints the address of the console page, and runs until
+    Ctrl-C. To use it from another computer, run ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER there, and
+    open the same address.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.precompute import precompute_graph

@@ -1,4 +1,4 @@
-"""`flexsheet tune`: choose the cheapest methods that meet a scene's tolerances."""
+"""`flexsheet tune`: choose the fastest methods that meet the tolerances of a scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code if some family has no method within the tolerance; the best one is chosen."""
+"""Exit code if a method family has no method within the tolerance; the best one is chosen."""
 
 
 app = typer.Typer(add_completion=False)
@@ -51,14 +51,16 @@ def tune(
         ),
     ] = None,
     output: Annotated[
-        Path | None, output_file("File for the tuned copy; default: change SCENE.")
+        Path | None, output_file("Scene file to write; default: change SCENE itself.")
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the choices without writing a file.")
     ] = False,
     margin: Annotated[
         float,
-        typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance reserved as margin."),
+        typer.Option(
+            min=0.0, max=0.9, help="Fraction of each tolerance that is reserved as a margin."
+        ),
     ] = 0.2,
     runs: Annotated[
         int,
@@ -66,7 +68,8 @@ def tune(
             "--runs",
             min=0,
             max=100,
-            help="Strokes of each proposal through the graph; 0: choose each family on its own.",
+            help="Number of simulated strokes per configuration that is tested in the graph; 0: "
+            "choose each family separately, without a graph.",
         ),
     ] = 3,
     folder: Annotated[
@@ -74,18 +77,18 @@ def tune(
         typer.Option(
             "--runs-folder",
             metavar="FOLDER",
-            help="Folder of the runs; the same one continues an interrupted command.",
+            help="Folder for the test runs; the same folder continues an interrupted command.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the cheapest methods that meet a scene's tolerances, and write them into the scene.
+    """Choose the fastest methods that meet the tolerances of a scene; write them into the scene.
 
-    Measures each family on this computer over the scene's working range: seconds to minutes the
-    first time. Then adds up the errors along the chain, and runs the cheapest promising
-    configuration through the graph. It is accepted if all tolerances hold, latency and force
-    included. With --family, only those families are chosen, each on its own. Nodes whose parameter
-    is `auto` use the chosen method. Exit code 3: a tolerance is not met.
+    Each method family is measured on this computer over the working range of the scene, which first
+    takes seconds to minutes. Then the errors of combined methods are predicted, and the fastest
+    promising configuration is tested in a graph. It is accepted if all tolerances are met,
+    including latency and force. With --family, only those families are chosen, each separately.
+    Nodes use the chosen method if their parameter is `auto`. Exit code 3: a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune

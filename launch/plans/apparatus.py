@@ -1,4 +1,8 @@
-"""Read the apparatus that `--apparatus` names, and hand it to the simulator nodes of a graph."""
+"""Load the apparatus given by `--apparatus`, and pass it to the simulator nodes of a graph.
+
+The apparatus is the set of true parameters of the simulated hardware. It differs from the scene,
+which contains the parameters that the other nodes assume.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,7 @@ PROFILES = tuple(one.value for one in Profile)
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Parts of `seed:N[,modern|paper][,calibrated]`."""
+    """Random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile
@@ -40,7 +44,7 @@ class Draw:
 
 
 def parse_draw(text: str) -> Draw | None:
-    """Parse the value of `--apparatus`; None if it names a file.  Raises BadInputError."""
+    """Parse the value of `--apparatus`; return None if it is a file.  Raises BadInputError."""
     if not text.startswith("seed:"):
         return None
     match = _SEED.fullmatch(text)
@@ -48,18 +52,25 @@ def parse_draw(text: str) -> Draw | None:
     profiles = [Profile(word) for word in words if word in PROFILES]
     known = len(profiles) + words.count(CALIBRATED) == len(words) == len(set(words))
     if match is None or not known or len(profiles) > 1:
-        remedy = "write seed:N, seed:N,paper or seed:N,paper,calibrated, N a whole number"
+        remedy = "write seed:N, seed:N,paper or seed:N,paper,calibrated with a whole number N"
         raise BadInputError(
-            [Problem("--apparatus", (), f'"{text}" is not a draw', f"{remedy}; or name a file")]
+            [
+                Problem(
+                    "--apparatus",
+                    (),
+                    f'"{text}" is not a random sample',
+                    f"{remedy}; or name a file",
+                )
+            ]
         )
     profile = profiles[0] if profiles else Profile.MODERN
     return Draw(int(match["seed"]), profile, CALIBRATED in words)
 
 
 def load_apparatus(text: str, scene: Scene) -> Apparatus:
-    """Return the apparatus of a file or of a seed.
+    """Read an apparatus from a file, or sample it from a text such as "seed:7".
 
-    Raises BadInputError for a file that cannot be read, has unknown keys or impossible values, or
+    Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
     """
     draw = parse_draw(text)
@@ -78,21 +89,23 @@ def load_apparatus(text: str, scene: Scene) -> Apparatus:
 
 
 def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> list[Problem]:
-    remedy = "name the apparatus of this scene; flexsheet apparatus sample --scene FILE makes one"
+    remedy = (
+        "name an apparatus file of this scene; flexsheet apparatus sample --scene FILE makes one"
+    )
     if apparatus.scene != scene.name:
-        what = f'"{apparatus.scene}" is another scene than "{scene.name}"'
+        what = f'the file belongs to scene "{apparatus.scene}", but the scene is "{scene.name}"'
         return [document.problem(("scene",), what, remedy)]
     if apparatus.scene_id not in (None, identify_scene(scene)):
         what = (
-            f'"{apparatus.scene_id}" belongs to another object or to other devices than '
-            f'"{identify_scene(scene)}" of scene "{scene.name}"'
+            f'the file belongs to scene_id "{apparatus.scene_id}", but object or devices of scene '
+            f'"{scene.name}" have changed: its id is "{identify_scene(scene)}"'
         )
         return [document.problem(("scene_id",), what, remedy)]
     return []
 
 
 def format_apparatus(apparatus: Apparatus) -> str:
-    """Return the text of an apparatus file."""
+    """Return the YAML text of an apparatus file."""
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 4096
@@ -110,14 +123,14 @@ def give_apparatus(
     apparatus: Apparatus | None,
     document: Document,
 ) -> None:
-    """Set the apparatus as a parameter of all simulator nodes, and of no other node."""
+    """Set the apparatus as a parameter of all simulator nodes, and report problems."""
     simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
     for entry in simulators:
         if "apparatus" in entry.spec.parameters:
             document.report(
                 (*entry.key, "parameters", "apparatus"),
-                "is given in the launch file",
-                "remove it, and use the option --apparatus: all nodes need the same",
+                "an apparatus is not allowed in a launch file",
+                "remove it, and use the option --apparatus, which applies to all simulator nodes",
             )
         elif apparatus is not None and entry.parameters is not None:
             entry.parameters = entry.parameters.model_copy(update={"apparatus": apparatus})
@@ -128,7 +141,10 @@ def give_apparatus(
 
 
 def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> None:
-    """Check that only simulator nodes and the recorder read the apparatus."""
+    """Check that only simulator nodes and the recorder read the topic of the apparatus.
+
+    Other nodes must not know the true parameters, because experiments measure their errors.
+    """
     for entry in entries:
         if entry.type is None or find_role(entry.type) is NodeRole.RECORDER:
             continue
@@ -138,6 +154,6 @@ def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> No
             if topic.name == TOPIC:
                 document.report(
                     (*entry.key, "topics", port),
-                    f'"{entry.name}" would read the truth of the simulator',
-                    "disconnect the port: only the simulator and experiments may know it",
+                    f'node "{entry.name}" would read the ground truth of the simulator',
+                    "disconnect the port; only the simulator and experiments may read it",
                 )

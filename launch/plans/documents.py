@@ -50,7 +50,10 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""Maximum number of values; the parser needs a second for it, and the largest file has 300."""
+"""Maximum number of values in a file. The parser needs about one second for so many values.
+
+The largest shipped file contains 300.
+"""
 
 OPENING_TOKENS = (
     BlockMappingStartToken,
@@ -67,18 +70,18 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""Value types of the parser, which preserve formatting, with Python's own types."""
+"""Pairs of a YAML parser type, which preserves formatting, and the Python type that replaces it."""
 
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-"""Pydantic's error types whose texts name a class instead of a mapping."""
+"""Types of pydantic errors whose message names a Python class where the file needs a mapping."""
 
 Key = tuple[str | int, ...]
-"""Path of a value in a document: ("nodes", "planner", "parameters", "max_age_s")."""
+"""Path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One error: location, key, what is wrong, and what to do."""
+    """One error in an input file: location, key, what is wrong, and what to do."""
 
     where: str
     key: Key
@@ -106,13 +109,13 @@ class BadInputError(FlexsheetError, ValueError):
 
     @classmethod
     def single(cls, where: str, key: Key, what: str, remedy: str = "") -> Self:
-        """Make an error with one problem."""
+        """Return an error that contains one problem."""
         return cls([Problem(where, key, what, remedy)])
 
 
 @dataclass(slots=True)
 class Document:
-    """A YAML file as plain values, with the line of every key, and overridden values."""
+    """Values of a YAML file, with the line of every key and the origin of overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -121,10 +124,13 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     extended: dict[Key, Path] = field(default_factory=dict)
-    """Files of the keys that come from an extended file; see `extend`."""
+    """Source file of each key that was inherited from another file by `extend`."""
 
     def where(self, key: Key) -> str:
-        """Return file and line of `key` or its nearest parent, or the option that overrides it."""
+        """Return the location of `key` for error texts: "file:line", or the overriding option.
+
+        If `key` has no line, the line of its nearest parent is returned.
+        """
         for length in range(len(key), 0, -1):
             part = key[:length]
             if part in self.overrides:
@@ -134,16 +140,21 @@ class Document:
         return str(self.path)
 
     def folder(self, key: Key) -> Path:
-        """Return the folder to which a path at `key` is relative: of its file or of the command."""
+        """Return the folder to which a relative path in the value of `key` refers.
+
+        This is the folder of the file that contains `key`. For a value that an option overrides, it
+        is the current folder.
+        """
         if key in self.overrides:
             return Path.cwd()
         known = (key[:length] for length in range(len(key), 0, -1) if key[:length] in self.lines)
         return self.extended.get(next(known, ()), self.path).parent
 
     def extend(self, base: Document, levels: int) -> None:
-        """Add the values of `base` that this document does not contain.
+        """Inherit the values of `base` that this document does not contain.
 
-        Mappings are merged down to `levels`; deeper values replace those of `base` as a whole.
+        Mappings are merged down to the depth `levels`. A deeper mapping replaces the mapping of
+        `base` completely.
         """
         own = self.lines
         self.lines = {**base.lines, **own}
@@ -154,30 +165,35 @@ class Document:
         self.text = f"# {base.path}\n{base.text}\n# {self.path}\n{self.text}"
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
-        """Make a problem of a key of this document."""
+        """Return a problem with the location of `key` in this document."""
         return Problem(self.where(key), key, what, remedy)
 
     def report(self, key: Key, what: str, remedy: str = "") -> None:
-        """Add a problem, which `raise_problems` raises together with the others."""
+        """Store a problem, so that `raise_problems` raises all problems together."""
         self.problems.append(self.problem(key, what, remedy))
 
     def error(self, key: Key, what: str, remedy: str = "") -> BadInputError:
-        """Make an error with one problem of this document."""
+        """Return an error with one problem at `key` of this document."""
         return BadInputError([self.problem(key, what, remedy)])
 
     def raise_problems(self) -> None:
-        """Raise BadInputError if problems were reported."""
+        """Raise BadInputError if `report` has stored problems."""
         if self.problems:
             raise BadInputError(self.problems)
 
     def set(self, key: Key, value: Any, origin: str) -> None:
-        """Set the value at `key` and create missing mappings; errors name `origin`."""
+        """Override the value at `key`, and create missing parent mappings.
+
+        origin: option that sets the value; later errors name it as the location.
+        """
         target: dict[Any, Any] = self.values
         for part in key[:-1]:
             if target.get(part) is None:
                 target[part] = {}
             if not isinstance(target[part], dict):
-                raise BadInputError.single(origin, key, f'"{part}" is not a mapping')
+                raise BadInputError.single(
+                    origin, key, f'"{part}" is not a mapping, so it contains no keys'
+                )
             target = target[part]
         target[key[-1]] = value
         self.overrides[key] = origin
@@ -191,7 +207,7 @@ def _merge(base: Any, own: Any, levels: int) -> Any:
 
 
 def parse_value(text: str) -> Any:
-    """Parse a YAML value: "3" is a number, "[1, 2]" a list, "yes" a string.
+    """Parse a YAML value: "3" becomes a number, "[1, 2]" a list and "yes" a string.
 
     Raises YAMLError.
     """
@@ -199,7 +215,7 @@ def parse_value(text: str) -> Any:
 
 
 def _parse_tree(text: str) -> Any:
-    """Parse a text into a YAML tree with comments.  Raises YAMLError only."""
+    """Parse text into a YAML tree that includes comments.  All errors are raised as YAMLError."""
     try:
         _check_size(text)
         return YAML(typ="rt", pure=True).load(text)
@@ -207,7 +223,7 @@ def _parse_tree(text: str) -> Any:
         raise
     except RecursionError as error:
         raise YAMLError("values are nested too deeply") from error
-    # Invalid dates, numbers and tags make the parser raise errors of any type.
+    # For invalid dates, numbers and tags the parser raises errors of various types.
     except Exception as error:
         raise YAMLError(f"a value cannot be read: {error}"[:500]) from error
 
@@ -215,8 +231,8 @@ def _parse_tree(text: str) -> Any:
 def _check_size(text: str) -> None:
     """Reject a text whose parsing would be too slow.  Raises YAMLError.
 
-    The parser's time grows at least quadratically with the depth. Tokens are counted first, unless
-    the punctuation shows that there are few.
+    The parsing time grows at least quadratically with the nesting depth. Tokens are counted before
+    parsing, unless the punctuation shows that there are only a few.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
@@ -236,8 +252,9 @@ def _check_size(text: str) -> None:
 
 
 def parse_json(text: str) -> Any:
-    """Parse a JSON value of any size; JSON has no aliases that could expand it.
+    """Parse a JSON value of any size.
 
+    No size limit is needed: unlike YAML, JSON has no aliases that expand to more values.
     Raises ValueError for invalid JSON, NaN, infinity and duplicate keys.
     """
 
@@ -266,7 +283,9 @@ def read_document(path: Path) -> Document:
             str(path), (), f"cannot be read: {reason}", "check the path"
         ) from error
     except UnicodeDecodeError as error:
-        raise BadInputError.single(str(path), (), f"is not UTF-8 text: {error}") from error
+        raise BadInputError.single(
+            str(path), (), f"is not UTF-8 text: {error}; save the file as UTF-8"
+        ) from error
     if len(text) > MAX_TEXT_LENGTH:
         what = f"has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
         raise BadInputError.single(str(path), (), what)
@@ -294,10 +313,10 @@ def read_document(path: Path) -> Document:
 
 
 def plain(tree: Any) -> Any:
-    """Convert a YAML tree into Python's own types, without comments and quoting.
+    """Convert a YAML tree into Python's built-in types, without comments and quoting.
 
-    Raises YAMLError for keys that are lists or mappings, and if aliases expand to more than
-    MAX_VALUES values.
+    Raises YAMLError if a key is a list or a mapping, and if aliases expand to more than MAX_VALUES
+    values.
     """
     left = MAX_VALUES
 
@@ -345,7 +364,7 @@ def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
 
 
 def _name_type(value: Any) -> str:
-    """Return the YAML name of a value's type."""
+    """Return the name of a value's YAML type for error texts, such as "a list"."""
     match value:
         case None:
             return "empty"
@@ -364,7 +383,7 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return the remedy for an unknown name: the most similar name, or all names."""
+    """Return the remedy for an unknown name: the most similar known name, or all known names."""
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
@@ -372,7 +391,7 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
 
 
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
-    """Validate the values at `at` as a `model`.  Raises BadInputError with all problems."""
+    """Validate the values below the key `at`.  Raises BadInputError with all problems."""
     values: Any = document.values
     for part in at:
         values = values[part]
@@ -414,7 +433,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    Pydantic's locations also contain members of unions, which are not keys of the file.
+    The error locations of pydantic also contain members of unions, which are not keys of the file.
     """
     values: Any = document.values
     for number, part in enumerate(key):
@@ -429,10 +448,10 @@ def _existing_part(document: Document, key: Key) -> Key:
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return old to new names of the keys on the level of `key`."""
+    """Return the new names of renamed keys by old name, for the mapping that contains `key`."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
-        # A launch file may name a shipped node by its class, too.
+        # A launch file may also give the class path of a shipped node as its type.
         names = [name for name, path in NODES.items() if node_type in (name, path)]
         return NODE_PARAMETERS.get(names[0], {}) if names else {}
     return SCENE_KEYS if issubclass(model, Scene) else LAUNCH_KEYS
@@ -444,9 +463,9 @@ def _shorten(value: Any) -> str:
 
 
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """Return the key of the file for pydantic's `location`, and the type at that key.
+    """Convert the location of a pydantic error into a key of the file, and return its type too.
 
-    Inside a union of models pydantic's location also names the chosen member.
+    Inside a union of models, the location also names the chosen member, which is not a key.
     """
     key: list[str | int] = []
     for part in location:

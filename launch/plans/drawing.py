@@ -11,7 +11,7 @@ from flexsheet.messages.topics import TOPICS
 Position = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
-"""Size of a box, px."""
+"""Width and height of the box of a node, px."""
 
 STYLE = """
   text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
@@ -36,9 +36,10 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Arrow:
-    """Topics from one node to another, or a connection to a device (wire).
+    """Arrow for the topics from one node to another, or for a connection to a device.
 
-    path: points of the SVG polyline; label_at: position of the label.
+    path: points of the SVG polyline. label_at: position of the label, px. wire: label of a device
+    connection; empty for topics.
     """
 
     writer: str
@@ -52,9 +53,10 @@ class Arrow:
 
 @dataclass(frozen=True)
 class GraphDrawing:
-    """Drawing of a graph.
+    """Geometry of the drawing of a graph, px.
 
-    hosts: left, top, width and height by name.  boxes, devices: centres by name.
+    hosts: left, top, width and height of each host's frame. boxes, devices: centre of the box of
+    each node and device.
     """
 
     title: str
@@ -66,7 +68,7 @@ class GraphDrawing:
 
 
 def svg(drawing: GraphDrawing) -> str:
-    """Return the drawing as an SVG file, for light and dark colour schemes."""
+    """Return the text of an SVG file with the drawing, for light and dark colour schemes."""
     width, height = drawing.size
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
@@ -105,14 +107,14 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""Distances of the boxes of an automatic layout, px."""
+"""Outer margin, column and row pitch, and gap between hosts in an automatic layout, px."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
-    """Return the topics by (writer, reader), for nodes of the graph.
+    """Return the topics that connect each pair of nodes (writer, reader).
 
-    Left out are topics of which any number of nodes are writers, such as estop and status, and
-    nodes that read whatever is published, such as a recorder.
+    Topics with any number of writers, such as estop and status, are omitted. So are the inputs of
+    nodes that read all published topics, such as a recorder.
     """
     links: dict[tuple[str, str], list[str]] = {}
     for node in plan.nodes.values():
@@ -126,7 +128,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Return a column for each node, right of all its writers; links that close a loop excepted."""
+    """Assign each node a column right of all nodes whose topics it reads; ignore loops."""
     order: list[str] = []
     seen: set[str] = set()
 
@@ -150,7 +152,7 @@ def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> di
 
 
 def lay_out(plan: ResolvedGraph) -> GraphDrawing:
-    """Place the nodes of a graph in columns, writers left of readers, and one frame per host."""
+    """Lay out a graph automatically: writers to the left of readers, and one frame per host."""
     links = list_links(plan)
     columns = assign_columns(list(plan.nodes), list(links))
     boxes: dict[str, Position] = {}
@@ -174,7 +176,7 @@ def lay_out(plan: ResolvedGraph) -> GraphDrawing:
 
 
 def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Sequence[str]) -> Arrow:
-    """Draw an arrow to a box on the right, or below both boxes if it goes back."""
+    """Return an arrow: straight to a reader on the right, below both boxes to other readers."""
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]
     if x2 > x1:
         start, end = (x1 + WIDTH / 2, y1), (x2 - WIDTH / 2, y2)
@@ -204,7 +206,7 @@ def mermaid(plan: ResolvedGraph) -> str:
 
 
 def text_lines(plan: ResolvedGraph) -> Iterator[str]:
-    """Yield the nodes of each host, each with the topics that it sends and their readers."""
+    """Yield text lines that list the nodes of each host with their topics and the readers."""
     links = list_links(plan)
     for host, address in plan.hosts.items():
         yield f"{host} ({address})"

@@ -1,4 +1,4 @@
-"""Define the parts of a scene that a run can leave out; separate, so that commands start fast."""
+"""Parts of the display that a run can omit; a module of its own, so that commands start fast."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Feature(StrEnum):
-    """Parts of a scene that can be left out for one run: its image, or the rendered force."""
+    """Part of the display that can be omitted in a run: the projected image or rendered force."""
 
     IMAGE = "image"
     FORCE = "force"

@@ -1,4 +1,7 @@
-"""Check the hosts of a launch file: valid addresses and keys, each for one host only."""
+"""Check the hosts of a launch file: addresses and keys must be valid and unique.
+
+Also defines the names of nodes and writers that exist once per host.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from flexsheet.messages.security import is_key
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
-    """Check that addresses and keys are valid and unique."""
+    """Check that the hosts' addresses and keys are valid and unique; report problems."""
     if MAIN not in hosts:
         document.report(
             ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
@@ -31,20 +34,20 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
         if address.is_unspecified or address.is_multicast:
             document.report(
                 key,
-                f'"{host.address}" is not the address of one host',
-                "give the host's own address",
+                f'"{host.address}" is not the address of a single host',
+                "write the IP address of this host",
             )
         other = host_by_address.setdefault(host.address, name)
         if other != name:
             document.report(
                 key,
                 f'"{host.address}" is also the address of host "{other}"',
-                "merge the two hosts",
+                "correct one of the two addresses, or merge the two hosts",
             )
 
 
 def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
-    """Check that each host has a separate valid key, if any host has a key."""
+    """Check that, if any host has a key, every host has a valid key of its own."""
     host_by_key: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")
@@ -52,7 +55,7 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
             if any(other.key is not None for other in hosts.values()):
                 document.report(
                     ("hosts", name),
-                    "has no key, but other hosts do",
+                    "the host has no key, but other hosts have one",
                     f"create one on that host (flexsheet keys new {name}), then: "
                     f"flexsheet keys install FILE {name} KEY",
                 )
@@ -65,15 +68,15 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
         elif host_by_key.setdefault(host.key, name) != name:
             document.report(
                 where,
-                f'is also the key of host "{host_by_key[host.key]}"',
-                "give each host its own key",
+                f'the same key belongs to host "{host_by_key[host.key]}"',
+                "create a separate key for each host",
             )
 
 
 def load_keys(path: Path) -> dict[str, str]:
-    """Read the public key of each host from a launch file.
+    """Read the public key of each host from a launch file, which may have changed since the start.
 
-    The file may have changed since the start. Raises BadInputError.
+    Raises BadInputError.
     """
     document = read_launch_file(path)
     spec = validate(LaunchFile, document)
@@ -83,15 +86,15 @@ def load_keys(path: Path) -> dict[str, str]:
 
 
 def launcher_on(host: str) -> str:
-    """Return the writer name of a host's launcher."""
+    """Return the name under which the launcher of a host publishes messages."""
     return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 
 def clock_node(host: str) -> str:
-    """Return the name of the node that measures the other hosts' clocks for a host."""
+    """Return the name of the node on a host that measures the clocks of the other hosts."""
     return f"clock_{host}"
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether an IP address is on loopback."""
+    """Return whether an IP address is a loopback address."""
     return ipaddress.ip_address(address).is_loopback

@@ -21,56 +21,61 @@ from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
 RECORDER_NICE = 5
-"""The recorder's messages wait in queues, so its delay affects no other node."""
+"""Default niceness of the recorder.
+
+Its input messages wait in queues, so its delay affects no other node.
+"""
 
 CONSOLE_NICE = 10
-"""The console must not delay the nodes that it shows."""
+"""Niceness of the console that --console adds; it must not delay the nodes that it shows."""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""Path of the bags that the console records, relative to the working folder."""
+"""Bag file that is recorded from the console: strftime pattern, relative to the working folder."""
 
 MERGED_LEVELS = 4
-"""Mappings of an extended launch file are merged down to nodes.NAME.parameters."""
+"""Depth to which a launch file is merged with the file it extends: nodes.NAME.parameters.KEY."""
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
-"""Keys that scenes have and launch files do not have."""
+"""Keys by which a scene file is recognized, because launch files do not have them."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
 class HostSpec(StrictModel):
-    """Settings of one computer."""
+    """Settings of one host, which is a computer of the graph."""
 
-    address: str = Field(description="IP address on which its nodes listen")
+    address: str = Field(description="IP address on which the host's nodes listen")
     key: str | None = Field(
-        default=None, description="public key, as flexsheet keys show prints it"
+        default=None, description="public key of the host, as printed by flexsheet keys show"
     )
     may_reset_estop: bool | None = Field(
         default=None,
-        description="whether its nodes may reset an e-stop; null: only on the main host",
+        description="whether nodes of the host may reset an emergency stop; null: only if it is "
+        "the main host",
     )
 
 
 class NodeSpec(StrictModel):
-    """Settings of one node."""
+    """Settings of one node in a launch file."""
 
-    type: str = Field(description='name of a node type, or "module:Class"')
+    type: str = Field(description='node type: a shipped one, or "module:Class"')
     host: str = MAIN
     process: Name | None = Field(
         default=None,
-        description="process that runs the node with all others that name it; null: its own",
+        description="name of a process that several nodes share; null: the node has its own",
     )
     shares_arm_process: bool = Field(
         default=False,
-        description="for an arm bridge: allow nodes in its process that are not its simulator; "
-        "a fault of one of them stops the arm",
+        description="arm bridge only: allow nodes other than its simulator in the same process; "
+        "a fault of such a node stops the arm",
     )
     parameters: dict[str, Any] = Field(default={})
     always: bool = Field(
-        default=False, description="start the node even if neither scene nor graph needs it"
+        default=False, description="start the node even if neither the scene nor the graph needs it"
     )
     topics: dict[str, str | None] = Field(
-        default={}, description="topic by port, if the names differ; null disconnects a port"
+        default={},
+        description="topic of each port whose name differs from the topic; null: not connected",
     )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
@@ -78,24 +83,25 @@ class NodeSpec(StrictModel):
         default=15.0,
         ge=2.0,
         allow_inf_nan=False,
-        description="a node without a heartbeat for this time is killed as hung; null: never",
+        description="time without a heartbeat after which the node is killed as hung, s; "
+        "null: never",
     )
     nice: int = Field(
         default=0,
         ge=-20,
         le=19,
-        description="niceness of the process; below 0 (more priority) only if the user may set it",
+        description="niceness of the process; values below 0 (higher priority) need a permission",
     )
 
 
 class ClocksSpec(StrictModel):
-    """Required accuracy of the hosts' clocks; see docs/clocks.md."""
+    """Required accuracy of the clock comparison between hosts; see docs/clocks.md."""
 
     max_offset_uncertainty_s: float = Field(
         default=0.005,
         gt=0,
         allow_inf_nan=False,
-        description="with a larger uncertainty the arms do not move",
+        description="maximum uncertainty of a clock offset, s; above it the arms do not move",
     )
     max_drift_ratio: float = Field(
         default=5e-4,
@@ -103,16 +109,16 @@ class ClocksSpec(StrictModel):
         lt=0.1,
         description="maximum relative drift of one clock against another",
     )
-    rate_hz: float = Field(default=8.0, ge=1, le=100, description="rate of the clock pings")
+    rate_hz: float = Field(default=8.0, ge=1, le=100, description="rate of clock measurements, Hz")
 
 
 class LaunchFile(StrictModel):
-    """Keys of a launch file."""
+    """Content of a launch file: its keys with their types and defaults."""
 
     extends: str | None = Field(
         default=None,
-        description="launch file whose values are used where this file has none: a path relative "
-        "to this file, or the name of a shipped launch file, such as demo",
+        description="launch file from which missing values are inherited: a path relative to this "
+        "file, or the name of a shipped launch file, such as demo",
     )
     scene: str | None = Field(
         default=None,
@@ -121,18 +127,18 @@ class LaunchFile(StrictModel):
     hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
     nodes: dict[Name, NodeSpec]
     external_topics: list[str] = Field(
-        default=[], description="topics that tools such as `bag play` write"
+        default=[], description="topics that command-line tools such as `bag play` publish"
     )
     clocks: ClocksSpec = ClocksSpec()
     record: dict[str, Any] | None = Field(
-        default=None, description="parameters of a recorder on the main host"
+        default=None, description="parameters of a recorder node that is added to the main host"
     )
 
 
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
-    """Read a launch file and the files that it extends.  Raises BadInputError.
+    """Read a launch file and merge it with the files that it extends.  Raises BadInputError.
 
-    extending: files that extend this one, directly or through others.
+    extending: files that extend this one, directly or indirectly; they detect circular references.
     """
     document = read_document(path)
     if SCENE_KEY_SET & document.values.keys() and "nodes" not in document.values:
@@ -155,7 +161,9 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     chain = (*extending, path.resolve())
     if base.resolve() in chain:
         raise document.error(
-            ("extends",), f"{base} extends this file, too", "remove one of the two `extends`"
+            ("extends",),
+            f"circular reference: {base} also extends this file",
+            "remove one of the two `extends`",
         )
     document.extend(read_launch_file(base, chain), MERGED_LEVELS)
     nodes = document.values.get("nodes")
@@ -165,12 +173,12 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
 
 
 def apply_scene(document: Document, scene: Path) -> None:
-    """Apply an option --scene: use another scene than the launch file's."""
+    """Apply the option --scene: replace the scene of the launch file."""
     document.set(("scene",), str(scene.absolute()), f"--scene {scene}")
 
 
 def apply_setting(document: Document, setting: str) -> None:
-    """Apply an option --set node.parameter=value, or scene=FILE.  Raises BadInputError."""
+    """Apply one option --set NODE.PARAMETER=VALUE or --set scene=FILE.  Raises BadInputError."""
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")
     if target == "scene" and text:
@@ -204,11 +212,11 @@ def apply_setting(document: Document, setting: str) -> None:
 
 
 def apply_record(document: Document, bag: Path) -> None:
-    """Apply the option --record: set the bag of the recorder; add a recorder if necessary."""
+    """Apply the option --record: set the recorder's bag file; add a recorder if necessary."""
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError.single(
-            origin, (), "exists already", "name a new file; bags are never overwritten"
+            origin, (), "the file already exists", "name a new file; bags are never overwritten"
         )
     names = document.values.get("nodes")
     for name, spec in names.items() if isinstance(names, dict) else ():
@@ -236,7 +244,7 @@ def apply_console(document: Document) -> None:
 
 
 def _find_role(type_name: object) -> NodeRole | None:
-    """Return the role of a node type; None if it has none or cannot be imported."""
+    """Return the role of a node type; None if its class has none or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):

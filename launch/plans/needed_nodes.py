@@ -1,8 +1,8 @@
-"""Leave out the nodes of a graph that its scene and its other nodes do not need.
+"""Omit the nodes of a graph that its scene and its other nodes do not need.
 
-A scene without material needs no soft body, and one without projector needs no image.  A node that
-works for others only (`Node.on_demand`) needs a reader.  A recorder is a reader of the topics that
-its parameters name, and not of those that it records by default.
+Without a material in the scene, the soft body is not computed; without a projector, no image is
+rendered.  A node that only serves others (`Node.on_demand`) is omitted if no node reads its topics.
+A recorder counts as a reader of the topics in its parameters, but not of its default topics.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 REASON_TEXTS = {
     OmissionReason.RIGID_OBJECT: "the scene's object is rigid: it has no material",
     OmissionReason.NO_IMAGE: "the scene has no image: it has no projector",
-    OmissionReason.NO_READER: "no node of the graph reads its topics",
-    OmissionReason.NO_WRITER: "no node of the graph writes its inputs",
+    OmissionReason.NO_READER: "no node of the graph reads the topics that it publishes",
+    OmissionReason.NO_WRITER: "no node of the graph publishes the topics that it reads",
 }
 
 
 def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
-    """Return the scene without these features."""
+    """Return a copy of the scene without these parts of the display."""
     changes: dict[str, object] = {}
     if Feature.IMAGE in features:
         changes["projector"] = None
@@ -38,12 +38,12 @@ def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
 def omit_unneeded(
     entries: list[NodeEntry], scene: Scene | None, needed: Collection[str]
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
-    """Return the entries that are started, and the others with the reasons.
+    """Return the nodes that are started, and the omitted nodes with the reasons.
 
-    The inputs that a node does not use with the scene are disconnected.  A node of the graph that
-    publishes scenes may change to one that says more; the scene then decides nothing.
+    Inputs that a node does not use with this scene are disconnected.  If a node of the graph
+    publishes scenes, it may later publish one that needs more nodes, so the scene is ignored.
 
-    needed: topics that tools read.
+    needed: topics that command-line tools read.
     """
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
@@ -86,7 +86,7 @@ EXTERNAL_TOPICS = frozenset(name for name, topic in TOPICS.items() if topic.many
     "scene",
     "twin/apparatus",
 }
-"""Topics that the launcher or tools may write."""
+"""Topics that may be written by the launcher or by command-line tools."""
 
 
 def _required_inputs(entry: NodeEntry) -> set[str]:
@@ -96,7 +96,7 @@ def _required_inputs(entry: NodeEntry) -> set[str]:
 
 
 def _list_read_topics(entry: NodeEntry) -> set[str]:
-    """Return the topics that a node asks for."""
+    """Return the topics that a node reads; for a recorder, only those in its parameters."""
     if entry.type is None or entry.parameters is None:
         return set()
     if isinstance(entry.parameters, RecorderParameters):

@@ -1,8 +1,8 @@
 """Check a launch file and resolve it to nodes with hosts, parameters and endpoints.
 
-`load_graph` returns a `ResolvedGraph`, in which every endpoint is known before any process starts.
-All errors of the file are reported together. Every host resolves the same file to the same graph;
-hosts compare its hash.
+`load_graph` returns a `ResolvedGraph` with all defaults and network endpoints, before any process
+starts. All errors of the file are reported together. Every host must resolve the launch file to
+the same graph, so the hosts compare its hash.
 """
 
 from __future__ import annotations
@@ -80,13 +80,13 @@ def load_graph(
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
-    settings: "node.parameter=value" each, with a YAML value, or "scene=FILE"; they override the
+    settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
         file.
-    record: bag to record to; it overrides the file.
-    console: add a console and a paused recorder, unless the file has them.
-    apparatus: file or "seed:N" of the simulator's true devices; None: those of the scene.
+    record: bag file to record to; it overrides the file.
+    console: add a console and a paused recorder, unless the file contains them.
+    apparatus: true parameters of the simulated hardware: a file or "seed:N"; None: as in the scene.
     needed: topics that the caller reads, so that the nodes which write them are started.
-    without: parts of the scene that are left out.
+    without: parts of the display that are omitted.
     Raises BadInputError with all errors of the file.
     """
     document = read_launch_file(path)
@@ -185,7 +185,7 @@ def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -
     if scene is None and document.problems:  # the scene has errors, which are reported
         return None
     if scene is None:
-        what = "an apparatus differs from a scene, and the launch file has none"
+        what = "the option requires a scene, but the launch file names none"
         document.problems.append(Problem("--apparatus", (), what, 'name a scene file in "scene"'))
         return None
     try:
@@ -196,7 +196,7 @@ def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -
 
 
 def load_scene(path: Path) -> Scene:
-    """Read and check a scene file; raises BadInputError."""
+    """Read and check a scene file.  Raises BadInputError."""
     return make_scene(read_document(path))
 
 
@@ -258,14 +258,17 @@ def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
 
 
 def _device_address(parameters: NodeParameters) -> str | None:
-    """Return "host:port" of the device; None unless exactly one host and one port are marked."""
+    """Return "host:port" of the device that a node controls.
+
+    None unless exactly one parameter is marked as the device's host, and one as its port.
+    """
     hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
     ports = _marked(parameters, ParameterMark.DEVICE_PORT)
     return f"{hosts[0]}:{ports[0]}" if len(hosts) == len(ports) == 1 else None
 
 
 def _device_files(parameters: NodeParameters) -> tuple[str, ...]:
-    """Return the marked paths, sorted, without URLs of streams."""
+    """Return the sorted device files among the parameters; URLs of streams are not files."""
     files = _marked(parameters, ParameterMark.DEVICE_FILE)
     return tuple(sorted({file for file in files if not urlsplit(file).scheme}))
 

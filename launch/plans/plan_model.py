@@ -1,6 +1,7 @@
-"""Define the resolved form of a launch file: its nodes, their hosts, and the topics' endpoints.
+"""Data model of a resolved launch file, which is called the plan of a graph.
 
-The module is separate from the resolver (`launch.plans.plan`), so that tools start fast.
+It contains the nodes with their hosts and all defaults, and the network endpoints of every topic.
+The model is separate from the resolver (`launch.plans.plan`), so that tools start fast.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, OmissionReason
 
 MAIN = "main"
-"""Host of the launcher's own topics, the recorder and the command-line tools."""
+"""Name of the host on which the launcher's topics, the recorder and command-line tools run."""
 
 LAUNCHER, TOOLS = "launch", "tools"
-"""Writers that are not nodes: the launcher, and command-line tools with experiments."""
+"""Names of the topic writers that are not nodes: the launcher; command-line tools, experiments."""
 
 RUN_DIRECTORY = "@run"
-"""Placeholder of the run's directory in endpoints and parameters until the run starts."""
+"""Placeholder in endpoints and parameters; the start of a run replaces it by the run's folder."""
 
 
 ROLES_OF_TYPES = {
@@ -37,15 +38,15 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""Roles by node type, for plans in older bags that have no roles."""
+"""Node role by node type, for plans in older bags, which contain no roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""Names of calibration parameters, for plans in older bags that list no calibrations."""
+"""Parameters with a calibration file, for plans in older bags, which list no calibrations."""
 
 
 class ArmingMode(StrEnum):
-    """Values of the parameter `arming` of arm bridges."""
+    """Value of the arm bridge parameter `arming`: who permits the arm to move."""
 
     MANUAL = "manual"
     AUTO = "auto"
@@ -58,10 +59,11 @@ class StrictModel(LimitedModel):
 
 
 class RestartSpec(StrictModel):
-    """Behaviour when a node's process exits.
+    """Restart policy that is applied when the process of a node exits.
 
-    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`. After
-    `max_restarts` in `window_s` the node has failed, and the run ends.
+    The delay before a restart starts at `delay_s` and doubles with each restart in the last
+    `window_s`, up to `max_delay_s`. If the process exits after `max_restarts` restarts in this
+    time, the node has failed and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
@@ -72,7 +74,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """A writer of a topic, and its endpoints: ipc for its own host, tcp for others."""
+    """Writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
 
     name: str
     host: str
@@ -89,13 +91,17 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the endpoint for a subscriber on `host`, with the writer's identity."""
+        """Return the endpoint for a subscriber on `host`, with the writer's name.
+
+        The source names the writer's host only if it is another host, so that the subscriber can
+        authenticate it.
+        """
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
 class ResolvedPort(StrictModel):
-    """A port with its topic and endpoints: an output binds them, an input connects to them."""
+    """Port of a node with its topic; an output binds the endpoints, an input connects to them."""
 
     port: str
     topic: str
@@ -103,7 +109,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """All settings that are needed to start a node."""
+    """Complete settings with which a node is started."""
 
     name: str
     type: str
@@ -113,33 +119,39 @@ class ResolvedNode(StrictModel):
     outputs: tuple[ResolvedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
-    listen_ports: tuple[int, ...] = Field(default=(), description="TCP, on loopback")
+    listen_ports: tuple[int, ...] = Field(
+        default=(), description="TCP ports on the loopback interface"
+    )
     device_address: str | None = Field(
         default=None, description='"host:port" of the device that the node controls'
     )
     device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
-    calibrations: dict[str, str] = Field(default={}, description="file by parameter")
-    role: NodeRole | None = Field(default=None, description="declared by the node's class")
-    liveness_s: float | None = Field(default=None, description="None in older bags")
-    nice: int = Field(default=0, description="0 in older bags")
-    process: str = Field(default="", description="name of its process; the node's in older bags")
+    calibrations: dict[str, str] = Field(
+        default={}, description="calibration file by parameter name"
+    )
+    role: NodeRole | None = Field(default=None, description="role that the node class declares")
+    liveness_s: float | None = Field(
+        default=None, description="maximum time without a heartbeat, s"
+    )
+    nice: int = Field(default=0, description="niceness of the process; 0 in older bags")
+    process: str = Field(default="", description="process name; empty if it is the node's name")
 
     @property
     def arm_side(self) -> str | None:
-        """Return the side of the arm whose state the node publishes, or None."""
+        """Return "left" or "right", the arm whose state the node publishes; None for others."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
     @property
     def arming(self) -> ArmingMode | None:
-        """Return who arms the node's arm; None for a node without that parameter."""
+        """Return who permits the arm to move; None if the node has no parameter `arming`."""
         value = self.parameters.get("arming")
         return ArmingMode(value) if value in tuple(ArmingMode) else None
 
     @model_validator(mode="before")
     @classmethod
     def _add_missing_fields(cls, values: Any) -> Any:
-        """Derive the fields that plans of older bags do not contain."""
+        """Derive the fields that plans in older bags do not contain."""
         if not isinstance(values, dict):
             return values
         derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}
@@ -156,14 +168,14 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """A process with its nodes, which share host, niceness, restart policy and liveness."""
+    """Process with its nodes, which have equal niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
 
     @property
     def settings(self) -> ResolvedNode:
-        """Return a node, for the settings that all nodes of the process share."""
+        """Return the first node, whose process settings apply to all nodes of the process."""
         return self.nodes[0]
 
     @property
@@ -172,7 +184,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """Node of the launch file that is not started."""
+    """Node of the launch file that is not started, with the reason."""
 
     name: str
     type: str
@@ -181,7 +193,7 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """A resolved launch file: nodes, hosts, and the endpoints of all topics."""
+    """Resolved launch file: nodes and hosts with all defaults, and the endpoints of all topics."""
 
     launch_file: str
     launch_text: str
@@ -189,12 +201,13 @@ class ResolvedGraph(StrictModel):
     scene_text: str
     scene: dict[str, Any] | None
     apparatus: dict[str, Any] | None = Field(
-        default=None, description="true parameters of the simulation; null: those of the scene"
+        default=None,
+        description="true parameters of the simulated hardware; null: equal to the scene",
     )
-    hosts: dict[str, str] = Field(description="address by name")
+    hosts: dict[str, str] = Field(description="network address by host name")
     nodes: dict[str, ResolvedNode]
     omitted: tuple[OmittedNode, ...] = Field(default=(), description="nodes that are not started")
-    writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
+    writers: dict[str, tuple[Writer, ...]] = Field(description="writers by topic name")
     keys: dict[str, str] = Field(default={}, description="public key by host; not part of the hash")
     estop_resetters: tuple[str, ...] = Field(
         default=(MAIN,), description="hosts that may reset an e-stop"
@@ -202,19 +215,19 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer `name` of `topic`; None if it may not write the topic."""
+        """Return the writer called `name` of `topic`; None if it may not write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
-        """Return the endpoints for a subscriber of `topic` on `host`."""
+        """Return the endpoints to which a subscriber of `topic` on `host` connects."""
         return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """Return the endpoints for a subscriber of `topic` on `host`, with their writers."""
+        """Return endpoints and writers to which a subscriber of `topic` on `host` connects."""
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:
-        """Return the writers of e-stops that may reset one."""
+        """Return the names of the writers that may reset an emergency stop."""
         return tuple(
             writer.name
             for writer in self.writers.get("estop", ())
@@ -222,13 +235,13 @@ class ResolvedGraph(StrictModel):
         )
 
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
-        """Return the nodes of one host, or of all."""
+        """Return the nodes on one host; None selects all hosts."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def processes_on(
         self, host: str | None, *, without: Collection[str] = ()
     ) -> list[ResolvedProcess]:
-        """Return the processes of one host, or of all, in the order of their first nodes.
+        """Return the processes on one host (None: all hosts), in the order of their first nodes.
 
         without: names of nodes that are not started.
         """
@@ -240,7 +253,7 @@ class ResolvedGraph(StrictModel):
         return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """Return (node, TCP port) for each port on which a node listens."""
+        """Return (node, TCP port) for each port on which a node of the host listens."""
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
@@ -251,5 +264,5 @@ class ResolvedGraph(StrictModel):
 
 
 def tools_on(host: str) -> str:
-    """Return the writer name of the command-line tools on a host."""
+    """Return the name under which command-line tools on a host publish messages."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

@@ -1,4 +1,4 @@
-"""Check which nodes of a launch file share a process."""
+"""Check that the nodes of a launch file that share a process are allowed to do so."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from flexsheet.nodes.node import find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
-"""Keys that apply to a process as a whole."""
+"""Keys of a node that must be equal for all nodes in a process."""
 
 
 def check_processes(entries: list[NodeEntry], document: Document) -> None:
-    """Check that the nodes of a process agree in its settings, and that arm bridges are alone.
+    """Check that nodes in one process have equal process settings, and that arm bridges are alone.
 
-    The simulator of a bridge's own arm may share its process.
+    Only the simulator of the arm may share the process of its bridge.
     """
     names = {entry.name for entry in entries}
     processes: dict[str, list[NodeEntry]] = {}
@@ -30,28 +30,27 @@ def check_processes(entries: list[NodeEntry], document: Document) -> None:
         if name in RUN_FILES or (name in names and all(one.name != name for one in members)):
             document.report(
                 (*first.key, "process"),
-                f'"{name}" is the name of another node, or reserved',
-                "choose another name; log and configuration are named after the process",
+                f'"{name}" is the name of another node, or is reserved',
+                "choose another name, because log and configuration files have the process's name",
             )
         for entry, key in product(others, COMMON_KEYS):
             if getattr(entry.spec, key) != getattr(first.spec, key):
                 document.report(
                     (*entry.key, key),
-                    f'differs from "{first.name}", which is in the same process "{name}"',
-                    f"give both the same {key}, or separate processes",
+                    f'the value differs from that of "{first.name}" in the same process "{name}"',
+                    f"set the same {key} for both nodes, or use separate processes",
                 )
         for bridge, entry in product(members, members):
             if bridge is not entry and not _may_share(bridge, entry):
                 document.report(
                     (*bridge.key, "process"),
                     f'a fault of "{entry.name}" would stop the arm of "{bridge.name}"',
-                    "give them separate processes, or set shares_arm_process: true at "
-                    f"{bridge.name}",
+                    f"use separate processes, or set shares_arm_process: true for {bridge.name}",
                 )
 
 
 def _may_share(bridge: NodeEntry, entry: NodeEntry) -> bool:
-    """Return whether `entry` may run in the process of `bridge`; True if that is no arm bridge."""
+    """Return whether node `entry` may share the process of `bridge`, if that is an arm bridge."""
     if bridge.type is None or find_role(bridge.type) is not NodeRole.ARM_BRIDGE:
         return True
     if bridge.spec.shares_arm_process or bridge.parameters is None or entry.parameters is None:

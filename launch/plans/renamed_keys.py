@@ -1,4 +1,4 @@
-"""List keys and values of launch files and scenes that have new names, for the remedy in errors."""
+"""List renamed keys and values of launch files and scenes, so that errors name the new ones."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
     },
     "twin_eye": {"again_after_s": "min_interval_s", "most_waiting": "max_queue"},
 }
-"""Old to new parameter names, by node type."""
+"""New name by former name of node parameters, for each node type."""
 
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
-"""Old to new keys of scene files."""
+"""New key by former key of scene files."""
 
 REMOVED_KEYS = frozenset({"kinematics"})
-"""Keys of scenes and of node parameters that had one possible value and were removed."""
+"""Keys of scenes and node parameters that were removed, because only one value was left."""
 
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",
     "also": "include",
     "waits": "start_paused",
 }
-"""Old to new keys of launch files, including those of `record`."""
+"""New key by former key of launch files, including the keys below `record`."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
@@ -69,4 +69,4 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
-"""Old to new values, by key: names of methods, patterns and modes."""
+"""New value by former value of a key, for names of methods, patterns and modes."""

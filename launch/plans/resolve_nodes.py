@@ -31,16 +31,20 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""Files of a run's directory that are not named after nodes."""
+"""Names that nodes must not have, because files in the run's directory have them."""
 
 _PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
-"""Keys that contain a node's parameters directly; other nodes have a key `parameters`."""
+"""Keys of a launch file that contain the parameters of a node directly.
+
+Other nodes have their parameters below the key `parameters`.
+"""
 
 
 class NodeEntry:
-    """Data of a node while its launch file is checked.
+    """Node of a launch file while the file is resolved.
 
-    type, parameters: None until they are resolved. ports, unconnected: ports with their topics.
+    type, parameters: class and parameters of the node; None until they are resolved. ports,
+    unconnected: the connected and the unconnected ports, each with its topic.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -52,14 +56,14 @@ class NodeEntry:
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
-        """Return the topics of the inputs or outputs by port."""
+        """Return (port name, topic) of all connected ports of a direction, input or output."""
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs whose topics no node writes, unless the file names them."""
+        """Disconnect optional inputs without a writer, unless the launch file names a topic."""
         if self.type is None:
             return
         self.disconnect(
@@ -69,7 +73,7 @@ class NodeEntry:
         )
 
     def disconnect(self, ports: Iterable[str]) -> None:
-        """Disconnect inputs, unless the file names their topics."""
+        """Disconnect the named inputs, except those to which the launch file assigns a topic."""
         names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
             if port.name in names:
@@ -77,7 +81,7 @@ class NodeEntry:
                 self.unconnected.append((port, topic))
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
-        """Return the unconnected inputs or outputs."""
+        """Return the unconnected ports of a direction, input or output."""
         return tuple(
             ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
@@ -86,7 +90,7 @@ class NodeEntry:
 
 
 def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
-    """Return the entries of all nodes, with the recorder and the clock nodes."""
+    """Return the nodes of a launch file, with the recorder and clock nodes that are added to it."""
     entries = []
     for name, node_spec in spec.nodes.items():
         entries.append(NodeEntry(name, node_spec, ("nodes", name)))
@@ -107,7 +111,7 @@ def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
         if "recorder" in spec.nodes:
             document.report(
                 ("record",),
-                'the graph has a node "recorder" already',
+                'the graph already has a node "recorder"',
                 'remove either "record" or the node',
             )
         else:
@@ -129,7 +133,7 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 
 
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
-    """Find the node's class, connect its ports to topics, and check its parameters."""
+    """Find the node's class, connect its ports, check its parameters, and report problems."""
     key = entry.key
     type_name = entry.spec.type
     try:
@@ -168,7 +172,7 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
 
 
 def _describe_import_remedy(type_name: str, error: Exception) -> str:
-    """Return what to do about a node class that cannot be imported."""
+    """Return the remedy for a node class that cannot be imported."""
     module, _, name = type_name.partition(":")
     if isinstance(error, ModuleNotFoundError) and error.name:
         if module == error.name or module.startswith(f"{error.name}."):
@@ -184,7 +188,7 @@ def _describe_import_remedy(type_name: str, error: Exception) -> str:
 
 
 def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
-    """Insert `value` at `key` unless the document has that key already."""
+    """Insert `value` at `key`, unless the document already contains that key."""
     target: Any = document.values
     for part in key[:-1]:
         target = target[part]
@@ -223,16 +227,19 @@ def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> 
         elif topic.message is not port.message:
             document.report(
                 key,
-                f'topic "{topic.name}" carries {topic.message.__name__}, '
-                f'port "{port.name}" needs {port.message.__name__}',
-                "connect a topic of that type",
+                f'topic "{topic.name}" has message type {topic.message.__name__}, '
+                f'but port "{port.name}" requires {port.message.__name__}',
+                "connect a topic of the required type",
             )
         else:
             entry.ports.append((port, topic))
 
 
 def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Document) -> None:
-    """Check that no device is on another host: device protocols are not encrypted."""
+    """Check that each device is connected to the host of its node.
+
+    Device protocols are not encrypted, so their data must not cross the network between hosts.
+    """
     for entry in entries:
         if entry.parameters is None:
             continue
@@ -241,9 +248,9 @@ def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Doc
             if host.address == address and name != entry.spec.host and not is_loopback(address):
                 document.report(
                     (*entry.key, "parameters", *key),
-                    f'{address} is host "{name}": its data would cross the network '
-                    "without encryption",
-                    f"run {entry.name} there (host: {name})",
+                    f'{address} is the address of host "{name}": the device data would cross the '
+                    "network without encryption",
+                    f"run {entry.name} on that host (host: {name})",
                 )
 
 
@@ -255,7 +262,7 @@ CALIBRATION_MARKS = (
 
 
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
-    """Read the calibration files that parameters name, and compare them with the scene."""
+    """Read the calibration files in node parameters, and check that they fit the scene."""
 
     def check_camera(path: Path) -> None:
         measured = load_calibration(path)
@@ -288,9 +295,9 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
 
 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
-    """Return all parameters of a node as JSON values, defaults included.
+    """Return all parameters of a node as JSON values, including defaults.
 
-    resolve_paths: make paths absolute; those of the file are relative to the file.
+    resolve_paths: make paths absolute. Paths in the launch file are relative to its folder.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")
@@ -304,7 +311,7 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
-    """Return `dumped`, the JSON form of `value`, with its paths made absolute from `base`."""
+    """Return `dumped`, the JSON form of `value`, with paths relative to `base` made absolute."""
     if isinstance(value, Path):
         return _absolute(value, base)
     if isinstance(value, BaseModel):

@@ -1,4 +1,4 @@
-"""Assign writers, readers and endpoints to topics."""
+"""Determine which nodes write each topic, connect inputs, and assign network endpoints."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""Topics that tools on every host may write, so that each host can stop the arms."""
+"""Topics that tools on every host may write, so that the arms can be stopped from each host."""
 
 LAUNCHER_TOPICS = ("host", "estop")
-"""Topics that the launcher of each host writes."""
+"""Topics that the launcher on every host publishes."""
 
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
-"""TCP ports below the range of outgoing connections on Linux (32768 and above)."""
+"""Range of the TCP ports of topics, below Linux's ports of outgoing connections (from 32768)."""
 
 
 def list_writers(
@@ -31,7 +31,10 @@ def list_writers(
     has_scene: bool,
     has_apparatus: bool,
 ) -> dict[str, list[tuple[str, str]]]:
-    """Return the (writer, host) pairs of every topic, in the order of the file."""
+    """Return the (writer, host) pairs of each topic, in the order of the launch file.
+
+    Topics with more writers than allowed are reported to `document`.
+    """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
     if has_scene and not has_editor:
@@ -44,7 +47,7 @@ def list_writers(
             if others and (not topic.many_writers or entry.name in others):
                 document.report(
                     (*entry.key, "topics", port_name),
-                    f'topic "{topic.name}" is written by "{others[0]}" already',
+                    f'topic "{topic.name}" is already written by "{others[0]}"',
                     "connect one of the two ports to another topic, or to null",
                 )
             else:
@@ -57,7 +60,7 @@ def list_writers(
         elif name in writers and not TOPICS[name].many_writers:
             document.report(
                 ("external_topics", i),
-                f'topic "{name}" is written by "{writers[name][0][0]}" already',
+                f'topic "{name}" is already written by "{writers[name][0][0]}"',
                 "remove it from external_topics, or remove the node",
             )
         elif not TOPICS[name].many_writers:
@@ -76,7 +79,7 @@ def list_writers(
 def resolve_further_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Add the inputs of nodes whose topics depend on their parameters (recorder, console)."""
+    """Add the inputs that depend on a node's parameters, as of recorder and console."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:
@@ -93,9 +96,9 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Check that every input has a writer; disconnect optional inputs without one.
+    """Check that the topic of every input has a writer; disconnect optional inputs without one.
 
-    A topic without a writer is no error beside a node of unknown type, which might write it.
+    If a node has an unknown type, the check is omitted, because that node could be the writer.
     """
     if any(entry.type is None for entry in entries):
         return
@@ -119,9 +122,9 @@ def check_inputs(
 def make_endpoints(
     writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
-    """Return the endpoints of every writer: ipc for its own host, tcp for other hosts.
+    """Return the writers of each topic with their endpoints: ipc on one host, tcp between hosts.
 
-    Each topic can be read on each host; nothing is sent without a subscriber.
+    Each topic gets a tcp endpoint if there are several hosts. It sends data only to subscribers.
     """
     far = sorted(
         (host, writer, topic)
@@ -151,10 +154,11 @@ def _make_tcp_endpoint(address: str, port: int | None) -> str | None:
 
 
 def _assign_ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
-    """Return a TCP port for each (host, writer, topic), from the hash of its name.
+    """Return a TCP port for each (host, writer, topic), computed from the hash of these names.
 
-    Collisions are resolved in the order of the names, so a new topic changes only colliding ports.
-    Ports are unique over all hosts, as hosts may share a computer.
+    If two hashes collide, the later name gets the next free port. A new topic therefore changes
+    only ports that collide with its own. Ports are unique over all hosts, because several hosts of
+    a graph may be the same computer.
     """
     taken: dict[int, tuple[str, str, str]] = {}
     for link in links:

@@ -1,4 +1,4 @@
-"""Find launch files and scenes by their path, or by their name in the package."""
+"""Find launch files and scenes by path, or by the name of a file shipped with the package."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ SCENES = LAUNCH_FILES / "scenes"
 
 
 def list_shipped(folder: Path) -> list[str]:
-    """Return the names of the launch files or scenes in a folder of the package."""
+    """Return the names of the launch files or scenes in a folder of this package."""
     return sorted(file.stem for file in folder.glob("*.yaml"))
 
 
 def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
-    """Return the path of a YAML file that is given by its path or by its name in the package.
+    """Return the path of a YAML file that is given as a path or as the name of a shipped file.
 
-    shipped: `LAUNCH_FILES` or `SCENES`. folder: folder to which a path is relative. A file that
-    does not exist is returned as it is given.
+    shipped: folder of shipped files, LAUNCH_FILES or SCENES. folder: folder to which a relative
+    path refers. If neither exists, the given path is returned.
     """
     path, named = folder / given, shipped / f"{given}.yaml"
     return named if not (path.exists() or path.suffix) and named.is_file() else path

@@ -1,4 +1,4 @@
-"""Set up a node's process: it exits with its launcher and has the configured niceness."""
+"""Set up the process of a node, so that it ends with its launcher and has its niceness."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
-"""File descriptor of a pipe that is never written; it closes when the launcher exits."""
+"""Environment variable with the file descriptor of the lifeline.
+
+The lifeline is a pipe to which nothing is written. Reading from it ends when the launcher exits.
+"""
 
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""File with the niceness by which Linux schedules sessions against each other.
+"""File with the niceness of a whole session, by which Linux shares the processor among sessions.
 
 Each node is a separate session, so the niceness of its process alone has little effect."""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""Without privileges the kernel accepts one write in 0.1 s, over all processes."""
+"""Number of attempts to write AUTOGROUP, and the time between them.
+
+Without privileges, the kernel accepts only one write per 0.1 s from all processes together.
+"""
 
 GRACE_S = 3.0
 _PR_SET_PDEATHSIG = 1
@@ -31,8 +37,8 @@ _PR_SET_PDEATHSIG = 1
 def exit_with_parent() -> None:
     """End this process when its launcher exits: SIGTERM first, SIGKILL after `GRACE_S`.
 
-    The kernel's death signal also ends a process whose loop hangs. If the process ignores the
-    signal, the lifeline's thread kills it and all processes that it started.
+    The kernel sends SIGTERM when the launcher exits, even if the event loop of the process hangs.
+    If the process ignores it, a thread that reads the lifeline kills the process and its children.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
@@ -54,9 +60,9 @@ def _end_with_lifeline(lifeline: int) -> None:
 
 
 def apply_niceness() -> None:
-    """Add the niceness of this node's configuration to the process and its session.
+    """Add the niceness that the node's configuration requires to the process and its session.
 
-    A negative niceness takes precedence. Raises OSError if the system does not permit it.
+    A negative niceness means higher priority. Raises OSError if the system does not permit it.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
     if nice == 0:

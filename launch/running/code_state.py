@@ -1,4 +1,4 @@
-"""Find the commit of the running code, and whether its sources were changed since."""
+"""Determine the git commit of the running code, and whether its files have changed since."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
-"""Paths of the repository that contain all code that a run executes."""
+"""Paths in the repository that contain all the code of a run."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""Suffixes of new files that change a run.
+"""Suffixes of untracked files that count as a change of the code.
 
-A new launch file, scene or mesh affects a run only if a launch file names it."""
+Others, such as new launch files, scenes and meshes, affect a run only if a launch file names them.
+"""
 
 UNTRACKED = "??"
 
 
 def read_git_state(directory: Path) -> str:
-    """Return the commit of the code and whether its sources were changed since, as JSON.
+    """Return a JSON text with the commit of the code, and whether files have changed since.
 
-    directory: root of the repository. commit: outside of git the value of COMMIT_VARIABLE, else
-    null. changed: null outside of git.
+    directory: root of the repository. Outside of a git repository, commit is the value of
+    COMMIT_VARIABLE or null, and changed is null.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS
@@ -36,7 +37,7 @@ def read_git_state(directory: Path) -> str:
 
 
 def _has_changed_sources(listed: str) -> bool:
-    """Evaluate the output of `git status --porcelain -z`: entries of two letters and a path."""
+    """Return whether the output of `git status --porcelain -z` lists changed or new code files."""
     entries = [entry for entry in listed.split("\0") if entry]
     return any(
         not entry.startswith(UNTRACKED) or Path(entry).suffix in SOURCE_SUFFIXES
@@ -45,7 +46,7 @@ def _has_changed_sources(listed: str) -> bool:
 
 
 def _git(directory: Path, *arguments: str) -> str | None:
-    """Return what git prints, None where it fails or is missing."""
+    """Run git and return its output; None if git fails or is not installed."""
     try:
         result = subprocess.run(
             # Without this option git refuses a clone that belongs to another user.

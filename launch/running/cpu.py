@@ -1,9 +1,9 @@
-"""Measure how long nodes wait for a processor, and which programs use the processors.
+"""Measure how long nodes wait for a processor core, and which programs use the cores.
 
-Linux counts for each thread how long it was ready to run but did not (`/proc/PID/schedstat`).  The
-main thread of a node runs its loop, so its waiting delays the whole node.  Counters of the system
-(load, /proc/pressure) also count programs of high niceness, which wait by design.  They therefore
-do not show whether nodes are late.
+For each thread, Linux counts the time in which it was ready to run but did not get a core
+(`/proc/PID/schedstat`).  The main thread of a node runs its event loop, so this wait delays the
+whole node.  System-wide counters (load, /proc/pressure) also include programs of high niceness,
+which wait by design, so they do not show whether nodes are delayed.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""Maximum fraction of the time that a node waits; above it the computer is busy."""
+"""Fraction of the time that a node waits for a core, above which the computer is overloaded."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""Nodes of this niceness or more wait by design and are not counted."""
+"""Niceness from which a node waits by design, so that its waiting time is ignored."""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -32,16 +32,17 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """Total waiting time (s) by process id at one time (s)."""
+    """Sample of the total waiting time (s) of each process id, taken at `time_s`."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """Comparison of the kernel's counters with those of WINDOW_S before.
+    """Measurement of waiting and processor times over the last WINDOW_S.
 
-    Call `update` once a second. proc: folder of the kernel's counters. now_s: monotonic clock.
+    Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
+    the time of the monotonic clock, s.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -56,11 +57,12 @@ class CpuWatch:
         *,
         measure_programs: bool = False,
     ) -> CpuPressure | None:
-        """Return the pressure since the oldest sample of the window; None if it is unknown.
+        """Return the node that waited the longest fraction of the last WINDOW_S; None if unknown.
 
-        watched: process ids by node, for the nodes whose waiting counts.  named: process ids of
-        all nodes, to name them among the programs; default: `watched`.
-        measure_programs: measure programs even if the computer is not busy.
+        watched: process ids by node name, of the nodes whose waiting time is measured.
+        named: process ids of all nodes, so that programs are reported by node name; default:
+        `watched`.
+        measure_programs: also list the programs if the computer is not overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -86,7 +88,7 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return how long a process's main thread has waited so far (s); None if it is unknown."""
+        """Return the total waiting time (s) of a process's main thread; None if it is unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
@@ -94,7 +96,7 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs with most processor time since the last call, if there was one."""
+        """Return the programs that used most processor time since the last call, if recent."""
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)
@@ -108,7 +110,7 @@ class CpuWatch:
         return tuple(ProgramCpu(name=name, cores=one) for name, one in largest if one >= MIN_CORES)
 
     def _cpu_times(self) -> Iterator[tuple[str, int, float]]:
-        """Return name, id and processor time (s) of each process."""
+        """Yield the program name, process id and total processor time (s) of each process."""
         for folder in self._proc.iterdir():
             if not folder.name.isdigit():
                 continue
@@ -116,7 +118,8 @@ class CpuWatch:
                 text = (folder / "stat").read_text(errors="replace")
             except OSError:
                 continue  # the process has ended
-            # The name may contain brackets itself; user and system time are fields 14 and 15.
+            # The name in brackets can itself contain brackets, so it is split at the last one. User
+            # and system time are fields 14 and 15.
             head, _, tail = text.rpartition(")")
             user, system = tail.split()[11:13]
             yield head.partition("(")[2], int(folder.name), (int(user) + int(system)) / _TICKS_PER_S

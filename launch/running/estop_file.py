@@ -1,7 +1,7 @@
-"""Store an engaged e-stop so that it survives restarts of a host's launcher.
+"""Store an engaged emergency stop (e-stop) in a file, so that it survives a launcher's restart.
 
-Only a reset removes the file. A file that cannot be read counts as a stop. The file's name depends
-on the arms, so only graphs with the same arms share it.
+Only a reset of the e-stop removes the file. A file that cannot be read is treated as an e-stop. The
+file name contains a hash of the arms' addresses, so only graphs with the same arms share it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 from flexsheet.messages.types import EStop
 
 STATE_VARIABLE = "FLEXSHEET_STATE"
-"""Environment variable with the directory of state that survives a reboot."""
+"""Environment variable that replaces the default folder of state that survives a reboot."""
 
 
 def directory() -> Path:
-    """Return the directory of persistent state of this user's launchers."""
+    """Return the folder in which launchers of this user store state that survives a reboot."""
     configured = os.environ.get(STATE_VARIABLE)
     if configured:
         return Path(configured)
@@ -27,9 +27,9 @@ def directory() -> Path:
 
 
 class EStopFile:
-    """File with the e-stop of one host.
+    """File that stores the e-stop of one host.
 
-    arms: addresses of the arms.
+    arms: network addresses of the arms of the graph.
     """
 
     def __init__(self, host: str, arms: Sequence[str]) -> None:
@@ -37,7 +37,7 @@ class EStopFile:
         self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """Return the stored e-stop, or None.  A file that cannot be read counts as a stop."""
+        """Return the stored e-stop, or None.  An unreadable file also counts as an e-stop."""
         try:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:
@@ -47,7 +47,7 @@ class EStopFile:
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:
-        """Store the e-stop so that it survives a power failure; raises OSError."""
+        """Store the e-stop durably, so that it survives a power failure.  Raises OSError."""
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         with part.open("w") as file:
@@ -58,7 +58,7 @@ class EStopFile:
         self._sync_folder()
 
     def remove(self) -> None:
-        """Remove the file after a reset; raises OSError."""
+        """Remove the file after a reset of the e-stop.  Raises OSError."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             self._sync_folder()

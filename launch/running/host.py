@@ -1,9 +1,10 @@
-"""Publish the state of a host, and latch e-stops for nodes that start later.
+"""Publish the state of a host, and latch emergency stops for nodes that start later.
 
-The writer of an e-stop (a tool, or a node that crashed) may have exited when a bridge restarts.
-Each launcher therefore latches the last e-stop and publishes it to its host's nodes, until a
-permitted writer resets it. With manual arming it also stores the e-stop in a file, in case all
-launchers exit.
+A host is one computer of the graph, and an arm bridge is the node that controls an arm. When a
+bridge restarts, the tool or node that published the emergency stop (e-stop) may have exited. Each
+launcher therefore stores the last e-stop and publishes it to the nodes of its host, until a
+permitted writer resets it. If the arms are armed manually, the launcher also stores the e-stop in a
+file, so that it survives the exit of all launchers.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""Maximum length of a reason; the e-stop must fit into every message that repeats it."""
+"""Maximum number of characters of a reason, so that it fits into all messages that repeat it."""
 
 RESET_WITHIN_S = 5.0
-"""Time within which all arms must report that a reset was accepted."""
+"""Time within which all arms must confirm the reset of an e-stop."""
 
 ARMS = ("arm_left", "arm_right")
 
@@ -59,11 +60,12 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
-    """Publisher of a host's status that also latches e-stops, between `start` and `close`.
+    """Part of the launcher that publishes the status of its host and latches e-stops.
 
-    endpoints, sources: functions that fill in the run's directory. code: commit for `HostStatus`.
-    run_directory: folder of the socket for e-stops; None for no socket. pids: returns the process
-    ids of the running nodes by node.
+    It works between `start` and `close`. endpoints, sources: functions that replace the placeholder
+    of the run's directory. code: commit that `HostStatus` reports. run_directory: folder for the
+    socket that receives e-stops; None for no socket. pids: function that returns the process ids of
+    the running nodes by node name.
     """
 
     def __init__(
@@ -88,7 +90,7 @@ class HostAgent:
         self._sources = sources
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
-        # After a restart, other launchers provide the e-stop, because they repeat it.
+        # Launchers repeat the e-stop, so a restarted launcher gets it from the other launchers.
         self._launchers = {launcher_on(name) for name in plan.hosts}
         self._sequence = {"host": 0, "estop": 0}
         self.publishers: dict[str, Publisher] = {}
@@ -120,7 +122,7 @@ class HostAgent:
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
-        """Subscribe and start to publish; needs a running event loop."""
+        """Subscribe to e-stops and start to publish.  Requires a running event loop."""
         if self._stop_socket is not None:
             self._stop_socket.open()
         stored = None if self._file is None else self._file.read()
@@ -160,14 +162,14 @@ class HostAgent:
         return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Use reloaded keys."""
+        """Replace the keys of all sockets by reloaded ones."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
         for subscriber in self._subscribers:
             subscriber.renew_keys(change)
 
     async def close(self) -> None:
-        """Stop publishing and close all sockets; may be called twice."""
+        """Stop publishing and close all sockets.  A second call has no effect."""
         if self._stop_socket is not None:
             self._stop_socket.close()
         for task in (self._task, self._resetting):
@@ -180,7 +182,7 @@ class HostAgent:
             publisher.close()
 
     def _stop(self, reason: str) -> None:
-        """Engage an e-stop received through the socket."""
+        """Engage an e-stop that `flexsheet arms stop` sent through the local socket."""
         writer = tools_on(self._host)
         self._on_problem(f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
@@ -193,14 +195,15 @@ class HostAgent:
                 return
             if self._latched is None:
                 self._on_problem(f"e-stop of {header.writer}, {NodeNote.ESTOP_KEPT.phrase}")
-            # A stamp from the future would prevent every later reset.
+            # With a timestamp in the future, every later reset would be ignored as older.
             self._engage(estop, now_ns if clock_problem else min(header.source_ns, now_ns))
         elif header.writer in self._plan.may_reset_estop() and self._latched is not None:
-            # A late subscriber gets each writer's last message, so a reset may precede the stop.
+            # A late subscriber receives the last message of each writer in any order, so a reset
+            # that arrives last can be older than the stop.
             if header.source_ns < self._engaged_ns:
                 return
             if header.source_ns > now_ns + MAX_STAMP_AHEAD_NS:
-                clock_problem = clock_problem or "stamped in the future"
+                clock_problem = clock_problem or "its timestamp is in the future"
             if clock_problem:
                 self._on_problem(f"e-stop not reset by {header.writer}: {clock_problem}")
             elif self._resetting is None or self._resetting.done():
@@ -215,7 +218,7 @@ class HostAgent:
             self._update_file()
 
     async def _reset(self, writer: str, latched: EStop) -> None:
-        """Release the e-stop once all arms confirm the reset; moving arms refuse it."""
+        """Release the e-stop when all arms have confirmed the reset; arms in motion refuse it."""
         stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
         all_clear = asyncio.Event()
 
@@ -251,7 +254,7 @@ class HostAgent:
             self._update_file()
 
     def _update_file(self) -> None:
-        """Write or remove the file of the latched e-stop; retry later after an error."""
+        """Write or remove the file of the latched e-stop; after an error, retry periodically."""
         if self._file is None:
             return
         try:
@@ -302,7 +305,7 @@ class HostAgent:
             await asyncio.sleep(PERIOD_S)
 
     def _report_busy(self, status: HostStatus) -> None:
-        """Log that the computer has become busy, at most once in BUSY_REPORT_PERIOD_S."""
+        """Log that the processor became overloaded, at most once per BUSY_REPORT_PERIOD_S."""
         busy, now_ns = is_busy(status), self._clock.now_ns()
         began, self._was_busy = busy and not self._was_busy, busy
         if began and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9:
@@ -312,7 +315,7 @@ class HostAgent:
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
         processes, pids = self._processes(), self._pids()
-        # A starting node imports for seconds, and delays no messages yet.
+        # A starting node uses the processor for seconds but delays no messages, so it is ignored.
         watched = {
             one.name: pids[one.name]
             for one in processes
@@ -345,18 +348,18 @@ class HostAgent:
 
 
 def has_estop(state: ArmState) -> bool:
-    """Return whether an arm's bridge has an engaged e-stop."""
+    """Return whether an e-stop is engaged in the bridge of an arm."""
     return state.mode == "estop" or state.estop_engaged
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
-    """Return the address of each arm; for a bridge without one, its host and name."""
+    """Return the network address of each arm; "host/node" for a bridge without an address."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
-    """Return whether a user has to arm an arm of the graph."""
+    """Return whether at least one arm of the graph moves only after a user's command."""
     return any(node.arming is ArmingMode.MANUAL for node in plan.nodes.values())
 
 
@@ -365,7 +368,7 @@ def python_version() -> str:
 
 
 def software() -> str:
-    """Return the versions of the libraries that all hosts should share."""
+    """Return the versions of the libraries that should be equal on all hosts."""
     try:
         own = version("flexsheet")
     except PackageNotFoundError:
@@ -374,12 +377,15 @@ def software() -> str:
 
 
 def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
-    """Return the device files that the nodes open, sorted."""
+    """Return the sorted paths of the device files that the nodes open."""
     return sorted({file for node in nodes for file in node.device_files})
 
 
 def find_recording_folder(nodes: list[ResolvedNode]) -> Path:
-    """Return the folder of the recorder's bag; the working folder if it does not exist."""
+    """Return the folder of the recorder's bag file, whose free disk space is reported.
+
+    Without a recorder, or if the folder does not exist, this is the working folder.
+    """
     for node in nodes:
         if node.role is NodeRole.RECORDER:
             folder = Path(str(node.parameters["bag"])).parent

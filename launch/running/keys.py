@@ -1,8 +1,8 @@
-"""Store key pairs, install public keys in launch files, and pass keys to a run's processes.
+"""Manage the keys by which the hosts of a graph authenticate each other.
 
-The secret key of a host is a file with its name in `directory()`. Its public key is
-`hosts.NAME.key` of the launch file. For each local host, a file in the run's directory contains
-both keys for the host's processes.
+The secret key of a host is stored in `directory()`, in a file with the host's name. The public key
+is the value of `hosts.NAME.key` in the launch file. For the processes of a run, a key ring file in
+the run's directory contains the keys that a host needs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
-"""Environment variable that moves the directory of secret keys."""
+"""Environment variable that replaces the default folder of secret keys."""
 
 
 def directory() -> Path:
@@ -35,12 +35,15 @@ def directory() -> Path:
 
 
 def secret_file(host: str) -> Path:
-    """Return the path of a host's secret key."""
+    """Return the path of the file with the secret key of a host."""
     return directory() / f"{host}.secret"
 
 
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
-    """Write and check the key files of one host, or of all.  Raises BadInputError."""
+    """Write the key ring files of a run and load them; return the key rings by host.
+
+    host: write only the file of this host; None for all hosts. Raises BadInputError.
+    """
     rings = {}
     problems = []
     for name in plan.hosts if host is None else [host]:
@@ -56,7 +59,10 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 
 
 class KeyWatch:
-    """Detector of changed keys in a launch file, which passes them to a run's processes."""
+    """Detector of key changes during a run, in the launch file and in the secret key files.
+
+    Changes are written to the key ring files, which the processes of the run read.
+    """
 
     def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
         self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings
@@ -64,9 +70,9 @@ class KeyWatch:
         self._read_ns = 0
 
     def read_changes(self) -> dict[str, KeyChange]:
-        """Return the changes since the last call, by host.
+        """Update the key ring files, and return the changes since the last call by host.
 
-        Raises BadInputError, SecurityError and OSError.
+        Raises BadInputError, SecurityError and OSError if a file cannot be read or is invalid.
         """
         changed_ns = self._launch_file.stat().st_mtime_ns
         if changed_ns != self._read_ns:
@@ -81,7 +87,7 @@ class KeyWatch:
 
 
 def install(launch_file: Path, host: str, key: str) -> None:
-    """Write a host's public key into a launch file.  Raises BadInputError."""
+    """Write the public key of a host into a launch file.  Raises BadInputError."""
     document = read_document(launch_file)
     hosts = document.values.get("hosts")
     if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):
@@ -98,7 +104,7 @@ def install(launch_file: Path, host: str, key: str) -> None:
     yaml.preserve_quotes = True
     yaml.width = 1 << 16
     tree: CommentedMap = yaml.load(document.text)
-    # An unquoted key that begins with "?" would be invalid YAML.
+    # The key is quoted, because an unquoted value that begins with "?" is not valid YAML.
     tree["hosts"][host]["key"] = SingleQuotedScalarString(key)
     text = StringIO()
     yaml.dump(tree, text)

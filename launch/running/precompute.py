@@ -1,4 +1,4 @@
-"""Compute the cached tables of a graph's nodes before it starts."""
+"""Compute tables that the nodes of a graph read from a cache, before the graph starts."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from flexsheet.nodes.renderer import deflection_cache
 Progress = Callable[[str], None]
 
 REPORT_STEP_RATIO = 0.1
-"""Fraction of the work between two progress reports."""
+"""Fraction of the total work after which progress is reported again."""
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
-    """A soft body that cannot be computed; the text gives the reason and a remedy."""
+    """The soft body (FEM model of the virtual object) of a scene cannot be computed."""
 
     code = "no-soft-body"
     remedy = "Follow the remedy in the text; see docs/soft-body-reference.md and docs/soft-body.md."
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the cached tables of the graph's planners and renderers."""
+    """Compute the tables that planners and renderers of a graph need and the cache lacks."""
     scene = plan.scene_message()
     if scene is None:
         return
     for node in plan.nodes.values():
         if issubclass(node_class(node.type), node_class("planner")):
-            progress("computing the bounds of the loop with the hand")
+            progress("computing the stability bounds of the control loop with the user's hand")
             load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"])
         if node.role is NodeRole.RENDERER and _uses_deflection_shapes(
             scene, node.parameters["sheet_shape"]
@@ -46,7 +46,7 @@ def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
 
 
 def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
-    """Return whether a renderer draws a pushed sheet by the membrane's deflection shapes."""
+    """Return whether a renderer needs precomputed deflection shapes to draw a pushed sheet."""
     shape: SheetShapeMethod = resolve_method(requested, scene.methods.sheet_shape, "reduced_order")
     return shape == "reduced_order"
 
@@ -56,12 +56,14 @@ def precompute_deflection_shapes(
 ) -> Path:
     """Return the file with the deflection shapes of a scene's sheet; compute it if necessary.
 
-    If the membrane has no equilibrium, the reason is reported, and the renderer uses four
-    triangles.
+    If the membrane model finds no equilibrium, the reason is reported and no file is written. The
+    renderer then approximates the pushed sheet by four triangles.
     """
     folder = None if cache_dir is None else Path(cache_dir)
     try:
-        on_progress = _with_time_left("computing the sheet's deflection shapes, once", progress)
+        on_progress = _with_time_left(
+            "computing the deflection shapes of the sheet (only once)", progress
+        )
         deflection_cache.load_or_compute(scene, folder, on_progress)
     except NoEquilibriumError as error:
         progress(f"no deflection shapes for this sheet: {error}")
@@ -69,7 +71,7 @@ def precompute_deflection_shapes(
 
 
 def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return a function that reports (done, total) in steps, with the time left."""
+    """Return a function (done, total) that reports progress in steps with the remaining time."""
     from flexsheet.nodes.cache import EtaEstimator
 
     eta, next_ratio = EtaEstimator(), 0.0
@@ -85,13 +87,13 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
 
 
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """Return the file with the table of a scene's sheet force; compute it if necessary.
+    """Return the file with the force table of a scene's sheet; compute it if necessary.
 
-    Raises NoEquilibriumError if the membrane has no equilibrium.
+    Raises NoEquilibriumError if the membrane model finds no equilibrium.
     """
     from flexsheet.nodes.planner import force_table
 
-    on_progress = _with_time_left("computing the sheet's force, once", progress)
+    on_progress = _with_time_left("computing the force table of the sheet (only once)", progress)
     force_table.load_or_compute(scene, cache_dir, on_progress)
     return force_table.make_table_cache(scene).path(cache_dir)
 
@@ -105,8 +107,9 @@ def precompute_soft_body(
 ) -> Path:
     """Return the file with the nonlinear table of a soft body; compute it if necessary.
 
-    scheduler: as the parameter of the node fem_solver. Raises NoSoftBodyError if the scheduler
-    cannot be used, the body cannot be meshed, or memory is insufficient.
+    skin_spacing_m: spacing of the nodes at the surface. scheduler: address of a dask.distributed
+    scheduler; None computes here. Raises NoSoftBodyError if the scheduler cannot be used, the body
+    cannot be meshed, or memory is insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table

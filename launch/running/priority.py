@@ -1,4 +1,4 @@
-"""Determine how far this user may raise the priority of processes."""
+"""Determine how far the user may raise the priority of processes (negative niceness)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from flexsheet.launch.plans.plan_model import ResolvedNode
 
 MIN_NICE = -20
 CAP_SYS_NICE = 23
-"""Number of the Linux capability that allows any niceness."""
+"""Bit index of the Linux capability that permits any niceness."""
 
 
 def min_nice_step() -> int:
-    """Return the minimum niceness of a child process, relative to this process."""
+    """Return the minimum niceness that a child process may have, relative to this process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    # RLIMIT_NICE counts from 20 downwards: 25 allows -5.
+    # The limit RLIMIT_NICE is 20 minus the minimum niceness: 25 permits a niceness of -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
     allowed = MIN_NICE if _has_cap_sys_nice() else 20 - soft_limit
     return min(0, max(MIN_NICE, allowed) - own)
@@ -30,12 +30,12 @@ def _has_cap_sys_nice() -> bool:
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Describe which nodes cannot have their configured niceness; None if all can."""
+    """Describe which nodes have a niceness that is not permitted; None if there are none."""
     minimum = min_nice_step()
     names = [node.name for node in nodes if node.nice < minimum]
     if not names:
         return None
     return (
-        f"{', '.join(names)}: this user may not set nice below {minimum}, so these nodes run "
-        "without precedence; start as root or set `nice` in /etc/security/limits.conf"
+        f"{', '.join(names)}: this user may not set nice below {minimum}, so these nodes do not "
+        "get their priority; start as root or set `nice` in /etc/security/limits.conf"
     )

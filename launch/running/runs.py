@@ -1,8 +1,9 @@
 """Manage the runs of graphs on this computer: their directories and orphaned processes.
 
-The name of a run consists of its launcher's pid, start time and a count. It shows whether the
-launcher is alive. A process with the tag of a run whose launcher has exited is an orphan. The
-module imports little, because `flexsheet arms stop` uses it first.
+A run is one execution of a graph by a launcher. Its name consists of the launcher's process id and
+start time, and a count, so it shows whether the launcher is alive. A process of a run whose
+launcher has exited is an orphan. This module imports few others, because the emergency command
+`flexsheet arms stop` uses it and must start fast.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
-"""Environment variable that tags every process of a run."""
+"""Environment variable with the run's name, set in every process of the run."""
 
 ROOT_VARIABLE = "FLEXSHEET_RUNS"
-"""Environment variable that moves the directory of runs."""
+"""Environment variable that replaces the default folder of all runs."""
 
 MAX_FINISHED_RUNS = 10
 ORPHAN_GRACE_S = 3.5
@@ -43,7 +44,7 @@ _count = itertools.count(1)
 
 
 class RunDirectoryError(FlexsheetError, RuntimeError):
-    """The directory of runs cannot be used; the text gives the reason."""
+    """The folder that contains all runs cannot be used."""
 
     code = "run-directory"
     remedy = "Set `FLEXSHEET_RUNS` to a folder that belongs to you."
@@ -51,7 +52,7 @@ class RunDirectoryError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run and its directory of sockets, configurations, plan and logs."""
+    """One execution of a graph, with a directory for sockets, configurations, plan and logs."""
 
     id: str
     directory: Path
@@ -66,14 +67,14 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host whose nodes run in it; None for all hosts of its graph."""
+        """Return the host whose nodes the run started; None if it started all nodes."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
             return None
 
     def is_alive(self) -> bool:
-        """Return whether its launcher still runs it."""
+        """Return whether the run's launcher is alive and has not ended the run."""
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)
 
     def end(self) -> None:
@@ -89,14 +90,14 @@ def ring_file(run: Run, host: str) -> Path:
 
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Return endpoints with the run's directory filled in."""
+    """Replace the placeholder of the run's directory in endpoints by its path."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Return sources with the run's directory filled in."""
+    """Replace the placeholder of the run's directory in the sources' endpoints by its path."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
@@ -106,7 +107,7 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs; socket paths have at most 107 bytes."""
+    """Return the folder of this user's runs; it is short, as socket paths are limited."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
@@ -120,12 +121,13 @@ def create_run() -> Run:
     status = directory.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         raise RunDirectoryError(
-            f"{directory}: belongs to another user; set {ROOT_VARIABLE} to a folder of this user"
+            f"{directory}: is not a folder, or belongs to another user; "
+            f"set {ROOT_VARIABLE} to a folder of this user"
         )
     directory.chmod(0o700)
     run_id = f"{os.getpid()}.{_start_ticks(os.getpid())}.{next(_count)}"
     run = Run(run_id, directory / run_id)
-    # The final name is set last, so that no other launcher removes the run as dead.
+    # The directory gets its final name last, so that no other launcher removes it as a dead run.
     incomplete = Run(run_id, directory / f"{_INCOMPLETE_PREFIX}{run_id}")
     incomplete.directory.mkdir(mode=0o700)
     incomplete.logs.mkdir()
@@ -136,7 +138,7 @@ def create_run() -> Run:
 
 
 def list_runs() -> list[Run]:
-    """Return all runs that have a directory, newest first."""
+    """Return all runs whose directory exists, newest first."""
     if not root().is_dir():
         return []
     runs = [
@@ -153,7 +155,7 @@ def list_live_runs() -> list[Run]:
 
 
 def launcher_is_alive(run_id: str) -> bool:
-    """Return whether the launcher of the run is alive; compare its pid and start time."""
+    """Return whether a process has the pid and start time of the run's launcher."""
     pid, _, rest = run_id.partition(".")
     start, _, _ = rest.partition(".")
     return pid.isdigit() and str(_start_ticks(int(pid))) == start
@@ -169,7 +171,7 @@ def find_orphans() -> list[psutil.Process]:
             if process.uids().real != os.getuid() or process.pid == os.getpid():
                 continue
             run_id = process.environ().get(RUN_VARIABLE)
-            # In another PID namespace (a container) the number belongs to another process.
+            # In another PID namespace (a container), the same pid denotes another process.
             same_namespace = _pid_namespace(process.pid) == _pid_namespace()
             if run_id and same_namespace and not launcher_is_alive(run_id):
                 found.append(process)
@@ -180,7 +182,7 @@ def find_orphans() -> list[psutil.Process]:
 
 
 def sweep() -> list[int]:
-    """End orphans, clean up the directories of dead runs, and return the ended process ids."""
+    """End orphans and clean up the directories of dead runs; return the ids of the orphans."""
     import psutil
 
     found = find_orphans()
@@ -223,7 +225,7 @@ def _signal(processes: Iterable[psutil.Process], number: int) -> None:
 
 
 def _is_of_our_namespace(run: Run) -> bool:
-    """Return whether the launcher ran in our PID namespace; a container may share the folder."""
+    """Return whether the run's launcher has our PID namespace; a container has another one."""
     try:
         marker = json.loads((run.directory / _LAUNCHER_FILE).read_text())
     except FileNotFoundError:
@@ -238,7 +240,7 @@ def _pid_namespace(pid: int | str = "self") -> int:
 
 
 def _start_ticks(pid: int) -> int | None:
-    """Return the start time of a process in clock ticks since boot; None once it has ended."""
+    """Return the start time of a process in clock ticks since boot; None if it has ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):

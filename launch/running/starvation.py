@@ -1,4 +1,4 @@
-"""Distinguish a process that hangs from one that gets no processor."""
+"""Distinguish a process that hangs from one that gets no processor core."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """The kernel's counters of a process's main thread, in seconds.
+    """Kernel counters of a process's main thread since its start.
 
-    run_s: time on a processor. wait_s: time runnable without one, up to its last run. state: letter
-    of /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor core. wait_s: time in which it was ready to run but had no core, up
+    to the last time it ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -23,7 +23,7 @@ class ProcessorTime:
 
     @classmethod
     def read(cls, process: int) -> Self | None:
-        """Read the counters of a process; None without counters or once it has ended."""
+        """Read the counters of a process; None if there are none, or if it has ended."""
         try:
             run, wait, slices = Path(f"/proc/{process}/schedstat").read_text().split()
             stat = Path(f"/proc/{process}/stat").read_text()
@@ -38,10 +38,10 @@ class ProcessorTime:
 def compute_starved_s(
     before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float
 ) -> float:
-    """Return how long a process waited for a processor between two readings, s.
+    """Return how long a process waited for a processor core between two readings, s.
 
-    The result is at most `elapsed_s`. The kernel counts a wait only when it ends. A process that is
-    runnable now has therefore waited whenever it did not run.
+    The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
+    ends. For a process that is ready to run now, all time in which it did not run counts as a wait.
     """
     if before is None or now is None:
         return 0.0

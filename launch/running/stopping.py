@@ -1,13 +1,17 @@
-"""Send an e-stop to graphs from outside, on paths that no other tool can block.
+"""Send an emergency stop (e-stop) to running graphs, on paths that no other tool can block.
 
-Each launcher and each arm bridge of this computer has a socket for e-stops (`nodes.stop_socket`);
-all get the request at once.  A launcher latches the stop and publishes it to every host; a bridge
-stops its own arm.  Receivers that do not answer get SIGCONT, as they may be suspended.  If no
-launcher has answered then, the bridges that do not answer are killed, and their arms' watchdogs
-stop the arms.  Without any answer, the nodes that send sheet targets are killed: without targets
-the bridges of all hosts stop.
+Each launcher and each arm bridge (node that controls an arm) on this computer has a socket for
+e-stops (`nodes.stop_socket`). The steps are:
 
-The module imports little, so that the stop is sent without delay.
+1. All sockets get the request at once.  A launcher stores the stop and publishes it to every host;
+   a bridge stops its own arm.
+2. Receivers that do not answer get SIGCONT, because they may be suspended.
+3. If no launcher has answered, the bridges that do not answer are killed.  The watchdogs of their
+   arms then stop the arms.
+4. If nothing has answered, the nodes that send sheet targets are killed.  Without targets, the
+   bridges on all hosts stop.
+
+The module imports few others, so that the stop is sent without delay.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """Path on which an e-stop was sent."""
+    """Means by which an e-stop was sent: a socket, a topic, or a signal that kills a process."""
 
     LAUNCHER = "launcher"
     NODE = "node"
@@ -44,9 +48,10 @@ class StopPath(StrEnum):
 class StopOutcome(StrEnum):
     """Outcome of an attempt to stop.
 
-    confirmed: the receiver has engaged the stop. silent: it was sent, without confirmation. absent:
-    no process listens. published: sent on the topic, without confirmation. refused: another tool
-    uses the topic's endpoint. killed: the process was killed.
+    confirmed: the receiver has engaged the stop. silent: the stop was sent but not confirmed.
+    absent: no process listens. published: the stop was sent on the topic, without confirmation.
+    refused: not sent, because another tool uses the endpoint of the topic. killed: the process was
+    killed.
     """
 
     CONFIRMED = "confirmed"
@@ -59,7 +64,7 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """One attempt to stop: path, receiver, outcome, and time since the first packet (ms)."""
+    """One attempt to stop: means, receiver, outcome, and time since the first request (ms)."""
 
     path: StopPath
     receiver: str
@@ -81,10 +86,10 @@ class _Receiver:
 
 
 def send_early(arguments: Sequence[str]) -> None:
-    """Send the stop of `flexsheet arms stop ARGUMENTS` before the command line is imported.
+    """Send the e-stop of `flexsheet arms stop ARGUMENTS` before the slow import of the command.
 
-    Nothing is sent for invalid arguments, which the command rejects later. `sent_early` stores the
-    attempts for the command.
+    If the arguments are invalid, nothing is sent, and the command later reports the error. The
+    attempts are stored in `sent_early` for the command.
     """
     options = {"--run": "", "--reason": DEFAULT_REASON}
     rest = [argument for argument in arguments if argument != "--json"]
@@ -99,11 +104,14 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""Attempts of `send_early`, at most one list of them."""
+"""Result of `send_early` for the command: empty, or one list of attempts."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
-    """Engage the e-stop in the runs with these directories, within `KILL_AFTER_S`."""
+    """Engage the e-stop in the runs with these directories; wait KILL_AFTER_S for answers.
+
+    The module docstring describes the steps.
+    """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
 
@@ -128,7 +136,8 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
                 note(receiver.path, receiver.name, StopOutcome.CONFIRMED)
             for receiver in waiting if signalled else ():
                 _send_signal(receiver.process, signalled or 0)
-        # A suspended bridge commands no arm, and gets the launcher's latched stop when it resumes.
+        # If a launcher stores the stop, a suspended bridge need not be killed. It commands no arm,
+        # and receives the stop when it resumes.
         is_latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
         for receiver in waiting:
             kill = receiver.path is StopPath.NODE and not is_latched
@@ -158,7 +167,7 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Remove and return the receivers that confirm before `until_s` of the monotonic clock."""
+    """Remove and return the receivers that confirm before `until_s` on the monotonic clock."""
     confirmed = []
     poll = select.poll()
     by_number = {one.connection.fileno(): one for one in waiting}
@@ -204,7 +213,7 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
 
 
 def _send_signal(process: int, number: int) -> bool:
-    """Return whether the signal was sent; process 0 stands for an unknown process."""
+    """Send a signal to a process id, if it is known (above 0); return whether it was sent."""
     if process <= 0:
         return False
     try:

@@ -4,10 +4,11 @@
         await graph.wait_ready()
         ...
 
-Every process is a separate session, and reports through a pipe that its nodes are set up. It
-contains one node, or those that name it. When it exits, its restart policy applies. To stop, it
-gets SIGINT, SIGTERM, then SIGKILL. The launcher uses no threads: exits arrive as readable pidfds,
-logs and readiness through pipes.
+Every process is a separate session. It runs one node, or all nodes whose launch file entry names
+the same process, and reports through a pipe that they are set up. When the process exits, its
+restart policy is applied. To stop it, the launcher sends SIGINT, SIGTERM and finally SIGKILL. The
+launcher needs no threads: the event loop reads exits from pidfds, and logs and readiness from
+pipes.
 """
 
 from __future__ import annotations
@@ -71,26 +72,26 @@ STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
-"""Time for a hanging node to write its stacks to its log."""
+"""Time that a hanging node gets to write its call stacks to its log before it is killed."""
 
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
-"""Function of (node, line) for each line of log; for the launcher the node is "launch"."""
+"""Function (node, line) that is called for each log line. The launcher's node name is "launch"."""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
-    """A node that exited or was late more often than its restart policy allows."""
+    """A node exited, hung or was not ready in time more often than its restart policy allows."""
 
     code = "node-failed"
     remedy = (
-        "Read the node's log above the text, or in the folder `logs` of the run. Its first error "
-        "is the cause."
+        "Read the node's log above this text, or in the folder `logs` of the run. The first error "
+        "in it is the cause."
     )
 
 
 class Child:
-    """A process with its nodes, from its start to its exit."""
+    """Operating system process that runs one or more nodes, from its start to its exit."""
 
     def __init__(
         self,
@@ -118,7 +119,8 @@ class Child:
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             write_file(config_file, with_pipe.model_dump_json())
-            # SIGINT would raise while Python starts; the node's first statement unblocks it.
+            # During the start of Python, SIGINT would raise KeyboardInterrupt. The first statement
+            # of the process unblocks the signal.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
                 self._process = subprocess.Popen(
@@ -152,7 +154,7 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Send a signal to the node and all processes that it started, unless it has exited."""
+        """Send a signal to the process and all processes that it started, unless it has exited."""
         if not self.exited.done():
             # The process is not reaped yet, so its id cannot belong to another process.
             os.killpg(self.pid, number)
@@ -173,12 +175,12 @@ class Child:
             self._loop.remove_reader(self._ready_fd)
 
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
-        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own
-        polling.
+        """Wait until the process has sent no heartbeat for `seconds`.
 
-        Polls are counted instead of clock time, because a suspended or starved launcher receives no
-        heartbeat either. Time in which the process waited for a processor does not count. When only
-        that time prevents the timeout, `on_starved` is called with it, once.
+        The time is the number of the launcher's polls times their period. Clock time is not used,
+        because a suspended launcher would receive no heartbeats either. Time in which the process
+        waited for a processor core is subtracted. If the timeout has not been reached only because
+        of this time, `on_starved` is called once with it, in s.
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -198,13 +200,13 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Make Python's fault handler write the stacks to the log, then kill the process."""
+        """Make Python's fault handler write the call stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log and report its lines; return False at the end."""
+        """Copy available output to the log and report its lines; return whether there was any."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -218,7 +220,7 @@ class Child:
         return True
 
     def _handle_line(self, line: bytes) -> None:
-        """Write a line to the log of its node, or of the process if it names none; report it."""
+        """Report a line and write it to the log of the node that it names, else of the process."""
         node = self._find_node(line)
         self._logs[node].write(line + b"\n")
         if self._reports:
@@ -242,7 +244,7 @@ class Child:
         if self.exited.done():
             return
         if self._process.returncode is None:
-            # The zombie reserves the number of its process group.
+            # Until it is reaped, the id of its process group is not given to other processes.
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
         for fd in (self._pidfd, self._output, self._ready_fd):
@@ -258,11 +260,11 @@ class Child:
 
 
 class RunningGraph:
-    """The processes of a graph's nodes.
+    """Supervisor of the processes that run the nodes of a graph.
 
-    host: start only the nodes of this host; None starts all on this computer. without: names of
-    nodes that are not started. report: called with
-    (node, line) for every line of log; `run.logs` contains all lines, too.
+    host: start only the nodes assigned to this host; None starts all nodes on this computer.
+    without: names of nodes that are not started. report: called with (node, line) for every log
+    line. The folder `run.logs` also contains all lines.
     """
 
     def __init__(
@@ -293,14 +295,14 @@ class RunningGraph:
 
     @property
     def run(self) -> Run:
-        """Return the run: its directory, logs and id.  Raises RuntimeError before the start."""
+        """Return the run (directory, logs, id).  Raises RuntimeError before the start."""
         if self._run is None:
             raise RuntimeError("the graph has not been started")
         return self._run
 
     @property
     def pids(self) -> dict[str, int]:
-        """Return the process ids of the running nodes; nodes of one process have the same."""
+        """Return the process id of each running node; nodes in one process share an id."""
         return {
             node.name: child.pid
             for name, child in self._children.items()
@@ -348,10 +350,12 @@ class RunningGraph:
             everyone.cancel()
             await asyncio.gather(end, everyone, *waiting, return_exceptions=True)
         late = [name for name, event in self._ready.items() if not event.is_set()]
-        raise TimeoutError(f"not ready within {timeout_s} s: {', '.join(late)}; see their logs")
+        raise TimeoutError(
+            f"nodes not ready within {timeout_s} s: {', '.join(late)}; see their logs"
+        )
 
     async def wait_ready_again(self, node: str, restarts: int) -> None:
-        """Wait until the node was restarted `restarts` times in total and is ready."""
+        """Wait until the node has been restarted at least `restarts` times and is ready."""
         supervisor = next(
             self._supervisors[name]
             for name, process in self._processes.items()
@@ -373,7 +377,7 @@ class RunningGraph:
                     supervisor.result()
 
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
-        """Send a signal to a node's process to simulate a fault."""
+        """Send the signal `number` to the process of a node, to simulate a fault."""
         os.kill(self.pids[node], number)
 
     def kill_all(self) -> None:
@@ -382,7 +386,7 @@ class RunningGraph:
             child.signal(signal.SIGKILL)
 
     async def stop(self) -> None:
-        """End all nodes (SIGINT, SIGTERM, SIGKILL) and remove sockets; may be called twice."""
+        """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets; may be called twice."""
         self._stopping = True
         watches = [] if self._keys_watch is None else [self._keys_watch]
         for task in (*self._supervisors.values(), *watches):
@@ -408,7 +412,7 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        """End the processes; those that only read end last, to receive the final messages."""
+        """End all processes. Nodes that only read topics end last, to receive final messages."""
         readers = {
             name
             for name, process in self._processes.items()
@@ -444,7 +448,7 @@ class RunningGraph:
             self._supervisors[name] = asyncio.create_task(self._supervise(process), name=name)
 
     def _publish_latched(self, topic: str, message: Message | None) -> None:
-        """Publish a message that all later subscribers get too."""
+        """Publish a message that subscribers also receive if they connect later."""
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
             return
@@ -506,7 +510,7 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Pass changed keys of the launch file and of this user's key files to the processes."""
+        """Pass key changes in the launch file and the user's key files to the processes."""
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -556,7 +560,7 @@ class RunningGraph:
                 self.restarts[node.name] += 1
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
-        """Run a process once and return why it failed; None if it ended without error."""
+        """Run a process until it ends, and return the failure; None if it ended without error."""
         child = self._spawn(process)
         await asyncio.wait(
             (child.ready, child.exited),
@@ -571,7 +575,7 @@ class RunningGraph:
                 self._ready[node.name].set()
             self._report(LAUNCHER, f"{_describe_process(process)} ready, pid {child.pid}")
         hangs = not late and await self._detect_hang(child, process)
-        # `stop` awaits the future too, so a cancelled task must not cancel it.
+        # `stop` also awaits this future, so cancelling the supervisor task must not cancel it.
         code = await asyncio.shield(child.exited)
         for node in process.nodes:
             self._ready[node.name].clear()
@@ -582,14 +586,14 @@ class RunningGraph:
         if hangs:
             seconds = process.settings.liveness_s
             missing = f"{NodeNote.NODE_HUNG.phrase} for {seconds:g} s"
-            return f"{missing}; its log contains the stacks"
+            return f"{missing}; its log contains the call stacks"
         return describe_exit(code)
 
     def _set_exit_code(self, process: ResolvedProcess, code: int) -> None:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
     async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
-        """Return True and end the process if it hangs; return False when it exits."""
+        """Watch a process until it hangs or exits; end a hanging process and return True for it."""
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
@@ -597,8 +601,8 @@ class RunningGraph:
         def on_starved(waited_s: float) -> None:
             self._report(
                 LAUNCHER,
-                f"{process.name} is starved, not hung: it waited {waited_s:.1f} s for a processor; "
-                "this computer is overloaded",
+                f"{process.name} sends no heartbeat but does not hang: it waited {waited_s:.1f} s "
+                "for a processor core; this computer is overloaded, run fewer programs on it",
             )
 
         silence = asyncio.ensure_future(child.wait_until_silent(liveness_s, on_starved))
@@ -622,7 +626,7 @@ class RunningGraph:
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
-        # The processes of the graph use the cores already; BLAS threads would compete with them.
+        # The processes of the graph already use all cores; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
         config = ProcessConfig(
@@ -634,7 +638,7 @@ class RunningGraph:
         return child
 
     def _write_run_files(self) -> None:
-        """Write the files for the recorder and for tools that find the graph."""
+        """Write the files that the recorder stores, and those by which tools find the graph."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -648,7 +652,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write the scenes beside the graph's own as JSON, for nodes that publish them."""
+        """Write all scenes in the folder of the scene file as JSON, for nodes that publish them."""
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
@@ -692,7 +696,7 @@ async def _terminate(children: list[Child]) -> None:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """Return the configuration of a node, with the run's directory filled in."""
+    """Return the configuration of a node; replace the placeholder of the run's directory."""
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
@@ -742,7 +746,7 @@ def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
 
 
 def describe_exit(code: int) -> str | None:
-    """Describe an exit code; None for 0."""
+    """Describe how a process with this exit code failed; return None for 0."""
     if code == 0:
         return None
     if code < 0:
@@ -771,7 +775,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
                 [
                     read_launch_file(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
-                        f"{address} is not loopback, and the hosts have no keys",
+                        f"{address} is not a loopback address, and the hosts have no keys",
                         f"create a key on each host (flexsheet keys new {name}) and install all "
                         f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
                     )

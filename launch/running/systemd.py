@@ -1,4 +1,4 @@
-"""Write the systemd unit of one host, and notify systemd of the launcher's state (sd_notify)."""
+"""Create the systemd files for one host, and report the launcher's state to systemd (sd_notify)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
 SOFTWARE = Path(__file__).resolve().parents[2]
 STATE_FOLDER = Path("/var/lib/flexsheet")
-"""The only folder to which the service can write."""
+"""The only folder to which the systemd service has write access."""
 SOCKET_VARIABLE, WATCHDOG_VARIABLE = "NOTIFY_SOCKET", "WATCHDOG_USEC"
 
 
 def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
-    """Yield the bags that a host's recorders write."""
+    """Yield the paths of the bag files that the recorders on a host write."""
     for node in plan.nodes_on(host):
         if node.role is NodeRole.RECORDER:
             yield Path(node.parameters["bag"])
@@ -30,7 +30,7 @@ def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class SystemFile:
-    """A file to write: path, text and mode."""
+    """File to install: path, text and permission bits."""
 
     path: Path
     text: str
@@ -40,10 +40,10 @@ class SystemFile:
 def make_files(
     *, launch_file: Path, host: str, user: str, root: Path, flexsheet: Path | None = None
 ) -> Iterator[SystemFile]:
-    """Yield the unit, the settings for TCP and the host's environment file.
+    """Yield the systemd unit, the kernel's TCP settings, and the environment file of a host.
 
-    root: root folder of the system; "/" outside of tests.
-    flexsheet: path of the command; default: the one beside this Python.
+    root: root folder of the file system; "/" except in tests.
+    flexsheet: path of the command; default: the command installed next to this Python.
     """
     command = flexsheet or Path(sys.executable).parent / "flexsheet"
     unit = TEMPLATE.read_text()
@@ -63,7 +63,7 @@ def make_files(
 
 
 def notify_systemd(text: str) -> None:
-    """Send a line of sd_notify(3); do nothing if systemd did not request it."""
+    """Send a state line to systemd, see sd_notify(3), if the process runs as a service."""
     address = os.environ.get(SOCKET_VARIABLE)
     if not address:
         return
@@ -73,7 +73,7 @@ def notify_systemd(text: str) -> None:
 
 
 async def beat_watchdog() -> None:
-    """Notify systemd three times in each watchdog period, without end."""
+    """Reset the systemd watchdog three times per watchdog period, until the task is cancelled."""
     period = os.environ.get(WATCHDOG_VARIABLE)
     if not period:
         return

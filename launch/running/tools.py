@@ -1,7 +1,7 @@
-"""Read and write topics of a running graph from tools on any of its hosts.
+"""Read and write topics of a running graph from command-line tools and experiments.
 
-On the main host, tools write the topics that no node writes. On other hosts they write e-stops
-only. They use the keys of their host.
+On the main host, tools may write the topics that no node writes. On other hosts they may write only
+e-stops. They authenticate with the keys of their host.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Time after which readers have connected; they retry every half second."""
+"""Time after which all readers have connected to a new writer, as they retry every 0.5 s."""
 
 
 @dataclass(slots=True)
 class ToolCounts:
-    """Counts of the messages that a tool's subscriber lost or refused."""
+    """Numbers of messages that the subscriber of a tool has lost or rejected."""
 
     dropped: int = 0
     gaps: int = 0
@@ -39,17 +39,17 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the host to whose tools this process belongs."""
+    """Return the name of the host on which this tool runs."""
     return run.host or MAIN
 
 
 def list_tool_topics(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
-    """Return the topics that a tool on a host may write in this graph."""
+    """Return the topics of the graph that a tool on a host may write."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
 def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
-    """Return the keys of this host; None if the graph has none."""
+    """Return the authentication keys of this host; None if the graph uses no keys."""
     return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
 
 
@@ -62,7 +62,7 @@ def make_subscriber(
     on_problem: Problem,
     raw: bool = False,
 ) -> Subscriber:
-    """Make a subscriber to all writers of a topic in a running graph, without starting it."""
+    """Return a subscriber, not yet started, to all writers of a topic in a running graph."""
     definition = find_topic(topic)
     return Subscriber(
         definition,
@@ -82,10 +82,10 @@ async def read_topic(
 ) -> AsyncIterator[tuple[Message, Header]]:
     """Yield the messages of a topic of a running graph with their headers, as they arrive.
 
-    count: number of messages; None for no end.  A slow reader's messages queue up.
+    count: number of messages; None for no limit.  If the caller is slow, messages wait in a queue.
     Raises KeyError for a topic that does not exist.
     """
-    # Commands that inspect a graph start faster without it.
+    # Imported here, so that commands that do not call this function start faster.
     import structlog
 
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
@@ -105,9 +105,10 @@ async def read_topic(
 
 
 class GraphWriter:
-    """Writer of topics of a running graph from outside; needs a running event loop.
+    """Writer of topics for tools outside the running graph.  Requires a running event loop.
 
-    Raises BadInputError for a topic that a node writes, BusError if another tool is writing it.
+    Raises BadInputError for a topic that tools may not write, and BusError if another tool is
+    writing it.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
@@ -131,7 +132,7 @@ class GraphWriter:
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
         """Send a message with the next sequence number.
 
-        source_ns: stamp of the data; default: now.
+        source_ns: source timestamp of the data; default: the present time.
         """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()
@@ -154,18 +155,18 @@ class GraphWriter:
 
 
 def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
-    """Make the error for a topic that tools on a host may not write."""
+    """Return the error for a topic that tools on a host may not write."""
     from flexsheet.launch.plans import documents
 
     may = ", ".join(list_tool_topics(plan, host))
     if topic in list_tool_topics(plan):
         key: tuple[str, ...] = ("hosts", host)
         what = f'topic "{topic}" cannot be written by tools on host "{host}"'
-        remedy = f'run the tool on host "{MAIN}" ({plan.hosts[MAIN]}); open here: {may}'
+        remedy = f'run the tool on host "{MAIN}" ({plan.hosts[MAIN]}); tools here may write: {may}'
     else:
         key = ("external_topics",)
         owners = ", ".join(one.name for one in plan.writers.get(topic, ()))
         what = f'topic "{topic}" '
         what += f"is written by {owners}" if owners else "is not part of the graph"
-        remedy = f'list it in "external_topics"; open now: {may}'
+        remedy = f'list it in "external_topics"; tools may now write: {may}'
     return documents.BadInputError.single(plan.launch_file, key, what, remedy)
