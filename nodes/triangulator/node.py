@@ -182,7 +182,8 @@ class Triangulator(Node):
         detection: StereoDetection,
     ) -> None:
         if reason == "ok" and measured is not None:
-            self._check.on_finger(measured.point_world, measured.reprojection_px, at_ns)
+            pad = measured.point_world - self.pad_to_marker_m
+            self._check.on_finger(pad, measured.reprojection_px, at_ns)
         marks = (*detection.markers, *detection.clutter)
         self._check.on_marks([one.point for one in marks], at_ns)
         self.self_checks = self._check.results()

@@ -91,7 +91,7 @@ class CameraCheck:
         return bool((np.linalg.norm(self._marks - point, axis=1) <= MARK_RADIUS_M).any())
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
-        """Add the triangulated marker (3,) m of the finger with its reprojection error."""
+        """Add the finger pad (3,) m by its triangulated marker, with the reprojection error."""
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:
             return
