@@ -127,7 +127,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """Deviations of the sheet from the scene's, and properties that the scene lacks."""
+    """Deviations of the true sheet from the scene's sheet, and properties not in the scene."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0

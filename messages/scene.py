@@ -25,7 +25,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Part(MessagePart, LimitedModel):
-    """Base class of the parts of scenes and calibrations; checks limits for each unit."""
+    """Base class of the parts of scenes and calibrations; checks each number by its unit."""
 
 
 class Pose(Part):

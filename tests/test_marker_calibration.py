@@ -125,7 +125,10 @@ def test_contradicting_touches_are_refused() -> None:
         (HEADER.replace("tilt_y_deg", "tilt_z_deg"), r"tilt_z_deg: unknown column"),
         (HEADER.rpartition(",")[0] + "\n", r"tilt_y_deg: missing column"),
         (f"{HEADER}\n{ROW}\nnan,20,30,10,20,22,0,0", r':3: marker_x_mm: .* found "nan"'),
-        (f"{HEADER}\n{ROW}\n10,20,30,10,20,22,0,300", r":3: tilt_y_deg: expected a magnitude of at most 120"),
+        (
+            f"{HEADER}\n{ROW}\n10,20,30,10,20,22,0,300",
+            r":3: tilt_y_deg: expected a magnitude of at most 120",
+        ),
         (f"{HEADER}\n10,20", r":2: expected 8 values, found 2"),
         (f"{HEADER},normal_x,normal_y,normal_z\n{ROW},0,0,0.5", r"normal_x: .* length 0\.5"),
     ],

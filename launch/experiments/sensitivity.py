@@ -125,9 +125,9 @@ def run_sensitivity(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Evaluate deviations of single parameters; return `experiment sensitivity --json` results.
+    """Vary one parameter at a time and return the results of `experiment sensitivity --json`.
 
-    folder: for the rows of finished trials. with_graph: also run the graph for parameters whose
+    folder: where the results of finished trials are stored. with_graph: also run the graph for parameters whose
     effect occurs only in motion. seconds: duration of a stroke.
     """
     plan = load_graph(launch_file, settings=settings)

@@ -202,7 +202,7 @@ def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Summarize the errors of strokes as `summarize_strokes` describes."""
+    """Return the mean over the strokes' mean errors, and its confidence interval."""
     means = np.array([one["mean"] for one in strokes])
     interval = None
     if len(means) > 1:

@@ -1,6 +1,7 @@
 """Run one configuration of the graph, and measure its speed and all of its errors.
 
-The finger strokes around the object, pushes its front and rests for two images. Processor time and
+The finger strokes around the object, pushes its front and stays at rest for two images of the
+simulated eye. Processor time and
 latency are measured during the stroke. All errors are computed from the bag, relative to the
 simulator's ground truth, by the code of the other experiments.
 """
@@ -272,8 +273,8 @@ def split_sheet_error(
 ) -> Floats:
     """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
 
-    The total is the object point under the true finger, lowered by the commanded offset, minus the
-    contact point of the true sheet. Vectors are in the object's frame.
+    The total is the object's point nearest to the true finger, moved inward by the commanded
+    offset, minus the contact point of the true sheet. Vectors are in the object's frame.
     """
     world_from_object = stroke.object_pose(recording.scene)
     object_from_world = inverse(world_from_object)

@@ -501,7 +501,7 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Follow the target; from rest, check the path to it first."""
+        """Follow the target. An arm at rest first checks the path to the target."""
         self._waited_s = 0.0
         if not _is_valid(goal.motion):
             return self._latch_fault("sheet target is not a rigid pose", geometry, step_s)

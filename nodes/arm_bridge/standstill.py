@@ -81,7 +81,10 @@ class StandstillMonitor:
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Update from a command to joints (6,) rad with their velocity, for `step_s` seconds."""
+        """Update the monitor after a command that is valid for `step_s`.
+
+        joints_rad (6,): commanded joint angles. velocity_rad_per_s (6,): their velocities.
+        """
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
         decay = max(0.0, 1.0 - step_s / MEMORY_S)

@@ -111,7 +111,10 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front point."""
+        """Return the response without contact, with the stiffness at the front.
+
+        The front is the surface point that faces the user.
+        """
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),

@@ -165,10 +165,9 @@ class CubicInterpolator:
             self._powers.append(np.array(rows)[:, first : first + 4])
 
     def weights_at(self, depth_m: float) -> tuple[int, Floats]:
-        """Return the four weights (4,) that interpolate at a depth.
+        """Return (first, weights (4,)) for the interpolation at a depth.
 
-        They apply to four successive depths, the index of the first of which is returned before
-        them.
+        The weights apply to the table's depths `first` to `first + 3`.
         """
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])

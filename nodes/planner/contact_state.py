@@ -222,7 +222,11 @@ class ContactStateMachine:
     def _roll_within_sheet(
         self, contact: SheetContact, found: Nearest
     ) -> tuple[SheetContact, SheetReason | None]:
-        """Roll to a surface point, or to the limit on the sheet; also return the reached limit."""
+        """Roll the sheet on the object until the contact is at the surface point.
+
+        The motion ends earlier where the contact reaches the limit of the sheet's usable area.
+        Also returns that limit, or None.
+        """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         excess = np.abs(rolled.position_sheet_m) - limit

@@ -157,7 +157,10 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the rotation of `axes` about the normal, relative to `home` rotated to the normal."""
+    """Return the angle of `axes` about its normal.
+
+    The angle is counted from `home`, rotated so that its normal agrees with that of `axes`.
+    """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
 

@@ -186,7 +186,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet of a case, and a function that returns its error measure.
+    """Return the predicted sheet pose of a case, and a function that measures the image error.
 
     The function computes the measure in the first call only.
     """

@@ -74,7 +74,11 @@ def pose_matrix(pose: Pose) -> Floats:
 
 
 def projector_homography(scene: Scene) -> Floats:
-    """Return the homography (3, 3) from the imaginary screen, m, to undistorted pixels."""
+    """Return the homography (3, 3) from the world's plane z = 0 to the projector's pixels.
+
+    Points of the plane (the imaginary screen of Furukawa et al. 2007) are (x, y) in m. The pixels
+    are those without lens distortion.
+    """
     lens = require_projector(scene).lens
     return pixel_from_screen(
         fx_px=lens.fx_px,

@@ -307,8 +307,8 @@ def _match_blobs(
 ) -> list[BlobPair]:
     """Return all pairs of blobs whose rays meet in front of the cameras, with their costs.
 
-    A pair outside the finger's volume gets a rejection reason, and so does one whose radius does
-    not match its depth.
+    A pair outside the finger's working volume, or with a radius that does not match its depth,
+    gets a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (

@@ -334,9 +334,10 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 
 
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
-    """Return where markers are printed black (1) at board positions (..., 2), in squares.
+    """Return 1 where a marker is printed black and 0 elsewhere.
 
-    share: side length of a marker as a fraction of its square. It is 0 outside markers.
+    squares: board positions (..., 2) in units of squares. share: side length of a marker as a
+    fraction of its square.
     """
     rows, columns, cells, _ = markers.shape
     column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)

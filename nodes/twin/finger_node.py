@@ -113,7 +113,7 @@ class TwinFingerNode(Node):
             self._follow(self.twin__finger_path.message)
 
     def _make_resting(self, rest: Floats) -> FingerMotion:
-        """Make a finger that rests at `rest`, with the unsteadiness that the apparatus states."""
+        """Make a finger that rests at `rest`, with the tremor of the apparatus."""
         given = self.parameters
         if given.apparatus is None:
             return FingerMotion.resting(rest, seed=given.seed)
