@@ -127,8 +127,8 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Vary one parameter at a time and return the results of `experiment sensitivity --json`.
 
-    folder: where the results of finished trials are stored. with_graph: also run the graph for parameters whose
-    effect occurs only in motion. seconds: duration of a stroke.
+    folder: where the results of finished trials are stored. with_graph: also run the graph for
+    parameters whose effect occurs only in motion. seconds: duration of a stroke.
     """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
