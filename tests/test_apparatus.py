@@ -242,8 +242,11 @@ def test_a_file_holds_all_of_a_draw(scene: Scene, tmp_path: Path) -> None:
         ),
         ("scene: cylinder\nfinger: {hand_mass_kg: 1}\n", ("hand_mass_kg", "all three or none")),
         ("scene: cylinder\nfinger: {tremor_width_hz: 30}\n", ("tremor_width_hz", "less than")),
-        ("scene: sphere\n", ('1: scene: "sphere" is another scene', "apparatus sample")),
-        ("scene: cylinder\nscene_id: '0'\n", ('2: scene_id: "0" belongs', "apparatus sample")),
+        ("scene: sphere\n", ('1: scene: the file belongs to scene "sphere"', "apparatus sample")),
+        (
+            "scene: cylinder\nscene_id: '0'\n",
+            ('2: scene_id: the file belongs to scene_id "0"', "apparatus sample"),
+        ),
         ("sheet: {}\n", ('"scene" is missing', 'add "scene"')),
     ],
 )

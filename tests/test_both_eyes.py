@@ -115,7 +115,7 @@ async def test_frames_for_one_eye_are_seen_from_that_eye(monkeypatch: pytest.Mon
     for which in ("left", "right", "left"):
         await bench.show(frame("a", stereo="frame_sequential", eye=which))
     await bench.show(frame("a", stereo="frame_sequential"))
-    assert "frames of one view only" in bench.node.note
+    assert "with two views" in bench.node.note
     await bench.finish()
     await bench.node.close()
     assert [eye.viewpoint for eye, _ in bench.sent] == ["left", "right"]

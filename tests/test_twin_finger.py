@@ -380,7 +380,7 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     )
     await node.step("twin__finger_path", fast, header())
     assert node.errors == 1
-    assert "give it more time" in node.last_error
+    assert "increase the times" in node.last_error
     assert np.array_equal(node.truth(10**9).position, before)
 
 
