@@ -184,7 +184,7 @@ def rewritten(
     ("name", "why"),
     [
         ("arm_left_bridge", "commands an arm"),
-        ("twin_arms", "over TCP"),
+        ("twin_arms", "over the network"),
         ("twin_finger", "takes images by its own clock"),
         ("recorder", "recorded this bag"),
     ],
