@@ -80,7 +80,7 @@ def test_a_bridge_is_addressed_by_its_marked_parameters(tmp_path: Path) -> None:
 
 
 def test_an_own_bridge_may_not_reach_its_arm_across_the_network(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r'controller: 192.0.2.2 is host "left"'):
+    with pytest.raises(BadInputError, match=r'controller: 192.0.2.2 is the address of host "left"'):
         graph_with(tmp_path, host="main")
 
 
