@@ -221,7 +221,9 @@ def test_an_arm_s_own_protocol_does_not_cross_the_network(tmp_path: Path) -> Non
         "parameters": {"side": "left", "host": "192.0.2.2"},
         "topics": {"arm": "arm_left", "other_arm": None, "sheet_target": None, "scene": None},
     }
-    with pytest.raises(BadInputError, match=r'192.0.2.2 is host "left".*run bridge there'):
+    with pytest.raises(
+        BadInputError, match=r'192.0.2.2 is the address of host "left".*run bridge on that host'
+    ):
         load_graph(write(tmp_path, {"bridge": bridge}, hosts=given))
     bridge["host"] = "left"
     load_graph(write(tmp_path, {"bridge": bridge}, hosts=given))
