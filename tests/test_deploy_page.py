@@ -49,6 +49,6 @@ def test_a_bag_that_the_service_cannot_write_is_reported(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     install(launch_file=LAB, host="main", root=tmp_path, dry_run=True)
-    assert "can only write to /var/lib/flexsheet" in " ".join(capfd.readouterr().err.split())
+    assert "can write only to /var/lib/flexsheet" in " ".join(capfd.readouterr().err.split())
     install(launch_file=LAB, host="left", root=tmp_path, dry_run=True)
     assert capfd.readouterr().err == ""

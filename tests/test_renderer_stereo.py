@@ -198,8 +198,8 @@ def test_a_lens_that_folds_the_image_is_rejected() -> None:
     assert clip_lens(load_scene().projector.lens, 800, 600) is None
     assert clip_lens(LENS, 800, 600) is not None
     folded = LENS.model_copy(update={"distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)})
-    folded = r"projector\.lens\.distortion.*maps several rays to one pixel"
-    with pytest.raises(ValueError, match=folded):
+    expected = r"projector\.lens\.distortion.*maps several rays to one pixel"
+    with pytest.raises(ValueError, match=expected):
         clip_lens(folded, 800, 600)
 
 
