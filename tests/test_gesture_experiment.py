@@ -269,7 +269,7 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
     hand = tmp_path / "hand.csv"
     hand.write_text("t_s,x_mm,y_mm,z_mm\n0,0,0,0\n1,20,30,-40\n2,0,10,5\n")
     assert gestures.finger_path(launch_file, str(hand)).label == "hand"
-    wrong = r'"stopp" is not a gesture or a file; did you mean "stop"\?'
+    wrong = r'"stopp" is neither a gesture nor a file; did you mean "stop"\?'
     with pytest.raises(ExperimentError, match=wrong):
         gestures.finger_path(launch_file, "stopp")
     with pytest.raises(ExperimentError, match=r"absent\.csv: cannot be read"):
