@@ -181,7 +181,7 @@ def test_a_chunk_is_unpacked_no_further_than_it_claims(tmp_path: Path, claimed: 
     bag = rewritten(tmp_path / "b.mcap", [(op, chunk if op == 6 else body) for op, body in records])
     tracemalloc.start()
     try:
-        with pytest.raises(BagError, match="uncompressed (size|bytes)"):
+        with pytest.raises(BagError, match=r"uncompressed (size|bytes)"):
             list(BagReader(bag))
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
