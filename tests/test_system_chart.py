@@ -37,6 +37,7 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.scene import Methods, Scene
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
+from tests.waiting import wait_until
 
 Floats = NDArray[np.float64]
 
@@ -390,7 +391,7 @@ def test_a_stopped_trial_leaves_no_worker_that_holds_its_pipes() -> None:
     worker = int(process.stdout.readline())
     sweep._end(process)
     assert process.returncode is not None
-    assert not _is_running(worker)
+    wait_until(lambda: not _is_running(worker), "the worker to end")
 
 
 def _is_running(pid: int) -> bool:

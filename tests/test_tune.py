@@ -466,7 +466,7 @@ def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path:
     for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
         method, spacing_m = choose_method(table, "auto", by_hand_m)
         said = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
-        assert said.endswith(f"--skin-spacing {effective})")
+        assert said.endswith(f"--skin-spacing {effective}")
         dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
         assert dragging.pending_note(table, method, []) == "", "there never is a table"
     assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
