@@ -388,10 +388,14 @@ class Heartbeat:
                 os.write(self._fd, b".")
 
 
+class LoggedNodeError(Exception):
+    """Failure of a node that is already logged with the node's name."""
+
+
 async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
     """Run all nodes of a process until `stop` is set; if one fails, stop the others.
 
-    Raises the first error of a node, which is logged with the node's name.
+    Raises LoggedNodeError for the first node that failed; its error is logged.
     """
     heartbeat = Heartbeat(config.ready_fd, len(config.nodes))
     local = None
@@ -407,7 +411,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
             structlog.get_logger().error(
                 "node failed", node=node.name, error=str(error), exc_info=True
             )
-            raise
+            raise LoggedNodeError(node.name) from error
         finally:
             stop.set()
 
@@ -440,6 +444,6 @@ def main(config_path: str) -> int:
     )
     try:
         uvloop.run(run_until_signal(config))
-    except Exception:
-        return 1  # `run_nodes` has logged the error
+    except LoggedNodeError:
+        return 1
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from flexsheet.launch.experiments.stability import (
     make_cases,
     measure_map,
 )
-from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.hand_loop import (
     HANDS,
     LIMITING_HANDS,
@@ -29,7 +29,9 @@ from flexsheet.nodes.models.hand_loop import (
     compute_offset_bounds,
 )
 from flexsheet.nodes.planner.oscillation_watchdog import FADE_S, OscillationWatchdog
+from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
+from tests.test_planner import SCENE
 
 PERIOD_S = 1.0 / 60.0
 WRIST = HANDS["wrist"]
@@ -243,27 +245,16 @@ def test_a_sheet_that_retreats_stays_with_a_finger_that_leaves() -> None:
         assert offset <= depth
 
 
-def test_the_planners_bounds_keep_drawn_hands_stable(rubber_scene: object) -> None:
-    scene, model, curve, folder = rubber_scene  # type: ignore[misc]
+def test_the_planners_bounds_keep_drawn_hands_stable(tmp_path: Path) -> None:
+    depths = SCENE.working_range.push_depth_m * np.linspace(0.0, 1.0, 12)
     rows = measure_map(
-        scene,
-        model,
-        curve,
+        SCENE,
+        make_force_model(SCENE.sheet),
+        np.column_stack([depths, 58.0 * depths]),
         StabilitySettings(hands=1, seed=300, delays_s=(0.07,), object_ratios=(4.0,)),
         lambda text: None,
-        cache_dir=folder,
+        cache_dir=tmp_path,
     )
     bounded = [row for row in rows if row["kind"] == "bounded"]
     assert all(row["stable"] for row in bounded)
     assert any(not row["stable"] for row in rows if row["kind"] == "predicted")
-
-
-@pytest.fixture(scope="module")
-def rubber_scene(tmp_path_factory: pytest.TempPathFactory) -> object:
-    from flexsheet.nodes.planner.sheet_force import make_force_model
-    from tests.test_planner import SCENE
-
-    sheet: SheetSpec = SCENE.sheet
-    depths = SCENE.working_range.push_depth_m * np.linspace(0.0, 1.0, 12)
-    curve = np.column_stack([depths, 58.0 * depths])
-    return SCENE, make_force_model(sheet), curve, tmp_path_factory.mktemp("cache")

@@ -220,6 +220,7 @@ def _further_lines(text: Any, run: Run) -> Iterator[str]:
         yield from whole
         if not alive:
             return
+        # A file has no event for added lines that Python can await portably.
         time.sleep(POLL_PERIOD_S)
 
 
@@ -247,6 +248,7 @@ def stop(
         os.kill(int(each.id.partition(".")[0]), signal.SIGTERM)
     end_s = time.monotonic() + STOP_TIMEOUT_S
     while any(one.is_alive() for one in chosen) and time.monotonic() < end_s:
+        # The launchers are not children of this process, so their end cannot be awaited.
         time.sleep(POLL_PERIOD_S)
     rows = [{"run": str(one.directory), "stopped": not one.is_alive()} for one in chosen]
     print_rows(rows, as_json=as_json)

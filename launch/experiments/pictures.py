@@ -11,17 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from flexsheet.launch.experiments.image import EyeImage
-from flexsheet.launch.experiments.stroke import PAPER_TABLE_1, StrokeErrors, StrokeRecording
-
-EVENTS = (
-    "fingertip",
-    "sheet target",
-    "soft body",
-    "left arm command",
-    "right arm command",
-    "frame begun",
-    "frame drawn",
+from flexsheet.launch.experiments.stroke import (
+    PAPER_TABLE_1,
+    LatencyEvent,
+    StrokeErrors,
+    StrokeRecording,
 )
+
+EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGHT)
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)

@@ -9,6 +9,7 @@ Errors (Fig. 9): delta d is the distance from D to D', delta theta the angle bet
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from flexsheet.messages.types import (
     Fingertip,
     Frame,
     SheetTarget,
+    Side,
     SoftBody,
     Status,
     TwinArms,
@@ -53,8 +55,26 @@ PAPER_TABLE_1 = {
 }
 """Errors in Table I of the paper: mean and standard deviation, by duration of the stroke (s)."""
 
-
 NO_VALUES: Floats = np.empty(0)
+
+
+class LatencyEvent(StrEnum):
+    """Event that an exposure of the camera causes; its latency counts from the exposure."""
+
+    FINGERTIP = "fingertip"
+    SHEET_TARGET = "sheet target"
+    SOFT_BODY = "soft body"
+    LEFT_ARM_COMMAND = "left arm command"
+    RIGHT_ARM_COMMAND = "right arm command"
+    FRAME_BEGUN = "frame begun"
+    FRAME_DRAWN = "frame drawn"
+    LIGHT = "light"
+
+
+ARM_EVENTS: dict[Side, LatencyEvent] = {
+    "left": LatencyEvent.LEFT_ARM_COMMAND,
+    "right": LatencyEvent.RIGHT_ARM_COMMAND,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +234,7 @@ class StrokeRecording:
 
     def arm_delays_s(self) -> Floats:
         """Return the delays (n,) from exposure to the sent command, for both arms together, s."""
-        both = [self.delays_s.get(f"{side} arm command", NO_VALUES) for side in ("left", "right")]
+        both = [self.delays_s.get(event, NO_VALUES) for event in ARM_EVENTS.values()]
         return np.concatenate(both)
 
 
@@ -232,26 +252,26 @@ def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats
     return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
 
 
-def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
+def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, int]]:
     """Return when a frame was begun, drawn and (if it was) displayed, as (event, time in ns)."""
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
-    events = [("frame begun", begun_ns), ("frame drawn", drawn_ns)]
-    return [*events, ("light", frame.light_ns)] if frame.light_ns else events
+    events = [(LatencyEvent.FRAME_BEGUN, begun_ns), (LatencyEvent.FRAME_DRAWN, drawn_ns)]
+    return [*events, (LatencyEvent.LIGHT, frame.light_ns)] if frame.light_ns else events
 
 
-def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
+def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, int, int]]:
     """Return the events for latency measurements in a message: (event, exposure ns, time ns)."""
     exposure_ns = header.source_ns
     match message:
         case Fingertip() if message.valid:
-            return [("fingertip", exposure_ns, header.publish_ns)]
+            return [(LatencyEvent.FINGERTIP, exposure_ns, header.publish_ns)]
         case SheetTarget():
-            return [("sheet target", exposure_ns, header.publish_ns)]
+            return [(LatencyEvent.SHEET_TARGET, exposure_ns, header.publish_ns)]
         case SoftBody():
-            return [("soft body", exposure_ns, header.publish_ns)]
+            return [(LatencyEvent.SOFT_BODY, exposure_ns, header.publish_ns)]
         case ArmState() if message.target_source_ns and message.command_sent_ns:
-            event = f"{message.side} arm command"
+            event = ARM_EVENTS[message.side]
             return [(event, message.target_source_ns, message.command_sent_ns)]
         case Frame():
             events = frame_events(message, header.publish_ns)
@@ -334,8 +354,8 @@ def read_recording(bag: Path) -> StrokeRecording:
     if apparatus is not None:
         late_s = apparatus.projector.latency_offset_s
         frames = frames.shifted(round(1e9 * late_s))
-        if "light" in delays_s:
-            delays_s["light"] += late_s
+        if LatencyEvent.LIGHT in delays_s:
+            delays_s[LatencyEvent.LIGHT] += late_s
     return StrokeRecording(
         scene=scene,
         fingertip=make_motion(fingertip, "fingertip"),
@@ -687,11 +707,15 @@ def stroke_result(
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
             "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
-            "exposure_to_frame": percentiles_ms(recording.delays_s.get("frame drawn", NO_VALUES)),
-            "exposure_to_frame_begun": percentiles_ms(
-                recording.delays_s.get("frame begun", NO_VALUES)
+            "exposure_to_frame": percentiles_ms(
+                recording.delays_s.get(LatencyEvent.FRAME_DRAWN, NO_VALUES)
             ),
-            "exposure_to_light": percentiles_ms(recording.delays_s.get("light", NO_VALUES)),
+            "exposure_to_frame_begun": percentiles_ms(
+                recording.delays_s.get(LatencyEvent.FRAME_BEGUN, NO_VALUES)
+            ),
+            "exposure_to_light": percentiles_ms(
+                recording.delays_s.get(LatencyEvent.LIGHT, NO_VALUES)
+            ),
         },
         "drops": recording.drops,
         "bag": str(bag),

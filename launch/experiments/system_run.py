@@ -250,12 +250,11 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
         for event, exposure_ns, at_ns in stroke.list_events(message, header):
             if begin_ns <= exposure_ns <= end_ns:
                 delay_s = 1e-9 * (at_ns - exposure_ns)
-                if event == "light":
+                if event is stroke.LatencyEvent.LIGHT:
                     to_light.setdefault(exposure_ns, delay_s)
-                else:
+                elif event in stroke.ARM_EVENTS.values():
                     to_arm.setdefault((event, exposure_ns), delay_s)
-    arm_s = [delay_s for (event, _), delay_s in to_arm.items() if event.endswith("arm command")]
-    return np.array(arm_s), np.array(list(to_light.values())) + late_s
+    return np.array(list(to_arm.values())), np.array(list(to_light.values())) + late_s
 
 
 def read_offsets(bag: Path) -> stroke.SampledMotion:

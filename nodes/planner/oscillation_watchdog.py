@@ -38,19 +38,17 @@ class OscillationWatchdog:
     """
 
     def __init__(self) -> None:
-        self.weight = 1.0
         self.triggers = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again with the weight 1; called when there is no contact."""
+        self.weight = 1.0
         self._slow: tuple[float, float] | None = None
         self._last = (0.0, 0.0)
         self._samples: deque[tuple[float, float, float]] = deque()
         self._span_s = self._driven_s = 0.0
         self._fading = False
-
-    def reset(self) -> None:
-        """Start again with the weight 1; called when there is no contact."""
-        triggers = self.triggers
-        self.__init__()  # type: ignore[misc]
-        self.triggers = triggers
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
         """Return the weight after a measurement.

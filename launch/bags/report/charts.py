@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.series import Grid, Spread, States
 from flexsheet.launch.bags.report.session import Session
+from flexsheet.launch.experiments.stroke import ARM_EVENTS, LatencyEvent
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, render_svg
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
@@ -36,8 +37,13 @@ HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop"
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
-ARM_EVENTS = ("left arm command", "right arm command")
-EVENTS = ("fingertip", "sheet target", *ARM_EVENTS, "soft body", "frame drawn")
+EVENTS = (
+    LatencyEvent.FINGERTIP,
+    LatencyEvent.SHEET_TARGET,
+    *ARM_EVENTS.values(),
+    LatencyEvent.SOFT_BODY,
+    LatencyEvent.FRAME_DRAWN,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +211,7 @@ def latencies(session: Session) -> Chart | None:
         p50, p99 = 1e3 * spread.quantiles_s(0.5), 1e3 * spread.quantiles_s(0.99)
         axes.plot(seconds, p99, "-", linewidth=0.9, color=COLOURS[4], label="99 %")
         axes.plot(seconds, p50, "-", linewidth=1.4, color=COLOURS[0], label="median")
-        if session.scene is not None and event in ARM_EVENTS:
+        if session.scene is not None and event in ARM_EVENTS.values():
             allowed_ms = 1e3 * session.scene.tolerances.latency_s
             axes.axhline(allowed_ms, linestyle="--", color=INK, linewidth=1.0, label="tolerance")
         axes.set_ylim(0.0, 1.15 * float(np.nanquantile(p99, 0.98)))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from flexsheet.launch.experiments.stroke import ARM_EVENTS
 from flexsheet.messages.busy import BUSY_REMEDY
 
 Gravity = Literal["bad", "doubtful"]
@@ -185,8 +186,7 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         return
     tolerances = numbers["scene"]["tolerances"]
     allowed_ms = 1e3 * tolerances["latency_s"]
-    for side in ("left", "right"):
-        event = f"{side} arm command"
+    for event in ARM_EVENTS.values():
         p99 = numbers["latency_ms"].get(event, {}).get("p99")
         if p99 is not None and p99 > allowed_ms:
             text = (
