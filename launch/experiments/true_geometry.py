@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import ArmSpec, Pose, Scene
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.arms import forward, solve_inverse_kinematics
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.sheet_pull import SheetPull
@@ -62,6 +63,7 @@ class ArmPair:
         specs, true_specs = scene.arms, true_scene.arms
         self._believed = ArmModel.of(specs.left), ArmModel.of(specs.right)
         self._true = ArmModel.of(true_specs.left), ArmModel.of(true_specs.right)
+        self._specs, self._sheet = (specs.left, specs.right), scene.sheet
         self._offsets_rad = (
             np.array(apparatus.arms.left.joint_offsets_rad),
             np.array(apparatus.arms.right.joint_offsets_rad),
@@ -72,13 +74,27 @@ class ArmPair:
     def hold(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
 
-        The pull of the sheet displaces the flanges. Backlash and servo lag are not included.
+        The bridges correct their commands by the scene's joint offsets and flange compliances. The
+        pull of the true sheet displaces the true flanges. Backlash and servo lag are not included.
         """
+        across = edges[1][:3, 3] - edges[0][:3, 3]
+        length_m = float(np.linalg.norm(across))
+        sheet = self._sheet
+        tension_n = edge_force_n(
+            length_m / sheet.width_m,
+            young_modulus_pa=sheet.young_modulus_pa,
+            width_m=sheet.width_m,
+            height_m=sheet.height_m,
+            thickness_m=sheet.thickness_m,
+        )
         flanges = []
-        for side, edge in enumerate(edges):
+        for side, (spec, wanted) in enumerate(zip(self._specs, edges, strict=True)):
+            edge, outwards = wanted.copy(), (-1.0, 1.0)[side]
+            moved_m = spec.flange_compliance_m_per_n * tension_n
+            edge[:3, 3] += outwards * moved_m * across / length_m
             joints_rad = self._believed[side].solve_joints(edge, self._guesses[side])
             self._guesses[side] = joints_rad
-            true_rad = joints_rad + self._offsets_rad[side]
+            true_rad = joints_rad + self._offsets_rad[side] - np.array(spec.joint_offsets_rad)
             flanges.append(self._true[side].world_from_base @ forward(true_rad))
         left, right = flanges
         clamps = [arm.flange_from_edge for arm in self._true]
