@@ -71,11 +71,10 @@ class ArmPair:
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
         self._guesses = [START_GUESS_RAD, START_GUESS_RAD]
 
-    def hold(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
+    def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+        """Return the commanded joint angles (6,) of both arms, rad, for poses `edges` (4, 4).
 
-        The bridges correct their commands by the scene's joint offsets and flange compliances. The
-        pull of the true sheet displaces the true flanges. Backlash and servo lag are not included.
+        The bridges correct their commands by the scene's joint offsets and flange compliances.
         """
         across = edges[1][:3, 3] - edges[0][:3, 3]
         length_m = float(np.linalg.norm(across))
@@ -87,14 +86,30 @@ class ArmPair:
             height_m=sheet.height_m,
             thickness_m=sheet.thickness_m,
         )
-        flanges = []
+        commanded = []
         for side, (spec, wanted) in enumerate(zip(self._specs, edges, strict=True)):
             edge, outwards = wanted.copy(), (-1.0, 1.0)[side]
             moved_m = spec.flange_compliance_m_per_n * tension_n
             edge[:3, 3] += outwards * moved_m * across / length_m
             joints_rad = self._believed[side].solve_joints(edge, self._guesses[side])
             self._guesses[side] = joints_rad
-            true_rad = joints_rad + self._offsets_rad[side] - np.array(spec.joint_offsets_rad)
+            commanded.append(joints_rad - np.array(spec.joint_offsets_rad))
+        return commanded[0], commanded[1]
+
+    def hold(
+        self, edges: tuple[Floats, Floats], *, play_rad: tuple[Floats, Floats] | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
+
+        The pull of the true sheet displaces the true flanges. Servo lag is not included.
+        play_rad: position of each joint (6,) of both arms within its backlash.
+        """
+        commanded = self.solve_joints(edges)
+        flanges = []
+        for side, joints_rad in enumerate(commanded):
+            true_rad = joints_rad + self._offsets_rad[side]
+            if play_rad is not None:
+                true_rad = true_rad + play_rad[side]
             flanges.append(self._true[side].world_from_base @ forward(true_rad))
         left, right = flanges
         clamps = [arm.flange_from_edge for arm in self._true]

@@ -131,7 +131,8 @@ class ArmGeometry:
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
-        return solve_next_joints(base_from_flange, near_rad + offsets_rad) - offsets_rad
+        joints_rad = solve_next_joints(base_from_flange, near_rad + offsets_rad) - offsets_rad
+        return np.asarray(joints_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the sheet at rest between this arm's edge and the other one.
