@@ -214,6 +214,9 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
     marks = off.size
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     spread = found.jac[:marks] @ covariance @ found.jac[:marks].T
+    # The marks of one pose share the error of the joints, so each pose counts once.
+    poses = len({tuple(row.joints_rad.tolist()) for row in rows})
+    spread *= len(rows) / poses
     base, clamp = model.transforms(unknowns)
     return EdgeFit(
         arm=arm.model_copy(
@@ -226,9 +229,11 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         ),
         residual_rms_m=residual_rms_m,
         edge_std_m=float(sigma_m * np.sqrt(np.trace(spread) / len(rows))),
-        compliance_std_m_per_n=float(np.sqrt(covariance[COMPLIANCE, COMPLIANCE])),
+        compliance_std_m_per_n=float(
+            np.sqrt(covariance[COMPLIANCE, COMPLIANCE] * len(rows) / poses)
+        ),
         marks=len(rows),
-        poses=len({tuple(row.joints_rad.tolist()) for row in rows}),
+        poses=poses,
     )
 
 
