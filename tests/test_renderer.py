@@ -27,7 +27,6 @@ from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer import gl
 from flexsheet.nodes.renderer.correction import (
     ScreenPlane,
-    correct,
     make_flat_screen,
     make_pushed_screen,
 )
@@ -37,6 +36,7 @@ from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surf
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
+from tests.correction_reference import correct
 from tests.fingertips import fingertip
 from tests.node_harness import NodeHarness
 from tests.packing import pack
