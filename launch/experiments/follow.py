@@ -39,12 +39,18 @@ from flexsheet.launch.experiments.run import (
     run_experiment,
 )
 from flexsheet.launch.experiments.simulated_time import follow_in_simulated_time
-from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges, pose_matrix
+from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
-from flexsheet.nodes.models.rigid import apply, inverse, rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
+    pose_matrix,
+    rotation_from_vector,
+    transform,
+)
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.twin.arms import (
     ACCELERATION_RAD_PER_S2,

@@ -17,9 +17,8 @@ from flexsheet.nodes.console.snapshot import (
     SceneSnapshot,
     rays,
     select_ray_vertices,
-    transform_from_pose,
 )
-from flexsheet.nodes.models.rigid import apply, quaternion_from_rotation, transform
+from flexsheet.nodes.models.rigid import apply, pose_matrix, quaternion_from_rotation, transform
 
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
@@ -261,7 +260,7 @@ class SceneView:
     def _add_devices(self, scene: Scene) -> None:
         """Add the stereo camera, the projector and the user's eyes, with their lenses."""
         camera = scene.camera
-        left = transform_from_pose(camera.world_from_left)
+        left = pose_matrix(camera.world_from_left)
         baseline_m = -float(camera.right_from_left[0, 3])
         self._add_device(
             "/devices/camera",
@@ -273,7 +272,7 @@ class SceneView:
         if scene.projector is not None:
             self._add_device(
                 "/devices/projector",
-                transform_from_pose(scene.projector.world_from_projector),
+                pose_matrix(scene.projector.world_from_projector),
                 ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
                 [(0.0, 0.0, -0.005)],
                 0.02,
@@ -295,9 +294,7 @@ class SceneView:
         """Add name labels above the devices."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
-        centre = apply(
-            transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
-        )
+        centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
         positions = {
             "stereo camera": centre + NAME_ABOVE_M,
             "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,

@@ -11,6 +11,8 @@ from math import atan2, cos, hypot, inf, isfinite, nan, sin, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flexsheet.messages.scene import Pose
+
 Floats = NDArray[np.float64]
 
 _UNIT: Floats = np.eye(4)
@@ -116,6 +118,11 @@ def transform(rotation: Floats, position: ArrayLike) -> Floats:
 def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
     """Return the transform of a position (m) and roll, pitch, yaw (rad), as in scene files."""
     return transform(rotation_from_rpy(rpy_rad), position_m)
+
+
+def pose_matrix(pose: Pose) -> Floats:
+    """Return a pose as a homogeneous matrix (4, 4)."""
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def inverse(a_from_b: Floats) -> Floats:

@@ -24,7 +24,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
@@ -150,7 +150,7 @@ class TrueProjector:
         vertices: (vertices, 3) of the sheet in the world frame. triangles: (triangles, 3) indices.
         """
         pose, lens = projector.world_from_projector, projector.lens
-        self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_projector = pose_matrix(pose)
         self._lens = lens
         self._size = np.array([projector.width_px, projector.height_px])
         # The rays are those of a lens without distortion. A margin contains the pixels that
@@ -564,8 +564,7 @@ def true_sheet(
     """
     arms = scene.arms
     edges = [
-        world_from_flange
-        @ transform_from_rpy(spec.flange_from_edge.position_m, spec.flange_from_edge.rpy_rad)
+        world_from_flange @ pose_matrix(spec.flange_from_edge)
         for world_from_flange, spec in (
             (world_from_flange_left, arms.left),
             (world_from_flange_right, arms.right),
