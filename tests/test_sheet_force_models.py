@@ -15,7 +15,6 @@ from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
-    LinearSheetModel,
     MembraneSheetModel,
     ScaledSheetModel,
     SheetForceModel,
@@ -41,7 +40,7 @@ SHEET = SheetSpec(
     usable_half_height_m=0.09,
 )
 RADIUS = 0.007
-SIMPLE: tuple[SheetForceModel, ...] = (LinearSheetModel(RUBBER), ScaledSheetModel(RUBBER))
+SIMPLE: tuple[SheetForceModel, ...] = (ScaledSheetModel(RUBBER),)
 
 
 def force(
@@ -120,10 +119,9 @@ def test_the_scaled_law_reports_its_range(
 
 def test_a_sheet_of_another_form_is_outside() -> None:
     tall = Rubber(0.24, 0.36, 0.001, 1e6)
-    for law in (LinearSheetModel(tall), ScaledSheetModel(tall)):
-        assert "square" in law.invalid_reason(
-            1.05, 0.012, position_m=CENTRE, finger_radius_m=RADIUS
-        )
+    assert "square" in ScaledSheetModel(tall).invalid_reason(
+        1.05, 0.012, position_m=CENTRE, finger_radius_m=RADIUS
+    )
 
 
 def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
@@ -168,13 +166,10 @@ def test_modulus_and_thickness_scale_the_force_and_the_size_scales_out(
     factor: float, size: float, stretch: float
 ) -> None:
     other = Rubber(0.24 * size, 0.24 * size, 0.001 * factor, 2e6)
-    for one, two in (
-        (LinearSheetModel(RUBBER), LinearSheetModel(other)),
-        (ScaledSheetModel(RUBBER), ScaledSheetModel(other)),
-    ):
-        here = force(one, stretch, 0.01, (0.02, 0.03))
-        there = force(two, stretch, 0.01 * size, (0.02 * size, 0.03 * size), RADIUS * size)
-        assert there == pytest.approx(2.0 * factor * size * here, rel=1e-9)
+    here = force(ScaledSheetModel(RUBBER), stretch, 0.01, (0.02, 0.03))
+    place = (0.02 * size, 0.03 * size)
+    there = force(ScaledSheetModel(other), stretch, 0.01 * size, place, RADIUS * size)
+    assert there == pytest.approx(2.0 * factor * size * here, rel=1e-9)
 
 
 @given(places, st.floats(1.0, 1.13))
