@@ -77,7 +77,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
         "constant_acceleration": "adaptive",
         "exponential": "one_euro",
     },
-    ("Methods", "sheet_force"): {"cubic": "scaled"},
+    ("Methods", "sheet_force"): {"cubic": "scaled", "linear": "scaled"},
 }
 """Mapping from former to current literal values, by model and current field name."""
 
