@@ -270,7 +270,7 @@ def test_an_arm_moved_through_the_wrists_singularity_continues_and_the_check_fai
 def barred_scene() -> Scene:
     """Return a scene whose left base is so far away that many poses are not reachable."""
     left = SCENE.arms.left
-    position = np.asarray(left.world_from_base.position_m) + [-0.1, -0.05, 0.06]
+    position = np.add(left.world_from_base.position_m, [-0.1, -0.05, 0.06])
     base = left.world_from_base.model_copy(update={"position_m": position})
     moved = left.model_copy(update={"world_from_base": base})
     return SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update={"left": moved})})

@@ -132,9 +132,7 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return []
 
 
-STAGED = Tunable(
-    "made-up", "marker", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"}
-)
+STAGED = Tunable("marker", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"})
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ By increasing cost: `ScaledSheetModel`, `nodes.models.sheet.tabulated.TabulatedS
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
 from typing import Protocol
 
 import numpy as np
@@ -128,12 +127,6 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 CUBIC_FACTOR = 2.43
 """Factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm; E is
 Young's modulus, t the thickness, W the width and d the depth."""
-
-
-def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
-    """Return depth / width / sqrt(strain), on which the shape of the force curve depends."""
-    strain = strain_measure(stretch_ratio, rubber.mooney_ratio)
-    return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
 
 # Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1
