@@ -68,6 +68,7 @@ VALUES: Mapping[str, Mapping[str, str]] = {
         "exponential": "one_euro",
     },
     "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
+    "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
 """New value by former value of a key, for names of methods, patterns and modes."""
