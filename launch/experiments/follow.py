@@ -318,7 +318,6 @@ def bound_errors(
     progress: Progress = lambda text: None,
     *,
     apparatus: Apparatus | None = None,
-    step_s: float = STEP_S,
 ) -> dict[str, Any]:
     """Return the lower bound of the contact error for a finger path, in mm.
 
@@ -328,7 +327,7 @@ def bound_errors(
     Raises ExperimentError for a path without contact.
     """
     followed = FollowedContact(scene, apparatus)
-    grid = np.arange(times_s[0], times_s[-1], step_s)
+    grid = np.arange(times_s[0], times_s[-1], STEP_S)
     positions = np.column_stack([np.interp(grid, times_s, column) for column in positions_world.T])
     contact = followed.contact_heights_m(positions) <= MAX_CONTACT_HEIGHT_M
     if not contact.any():
@@ -359,7 +358,7 @@ def bound_errors(
         weights = contact[window].astype(np.float64)
         if not weights.any():
             continue
-        found = find_least_deviation(part, weights, step_s, max_deviation=MAX_DEVIATION_M)
+        found = find_least_deviation(part, weights, STEP_S, max_deviation=MAX_DEVIATION_M)
         if found is None:
             unsolved += 1
         else:

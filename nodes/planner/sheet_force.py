@@ -72,7 +72,6 @@ def compute_membrane_table(
     xs_m: Floats,
     ys_m: Floats,
     finger_radius_m: float,
-    depths_m: Floats = TABLE_DEPTHS_M,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
     """Compute the table by finite elements of the membrane: one push per stretch and position."""
@@ -90,7 +89,7 @@ def compute_membrane_table(
         ScaledSheetModel(rubber),
         measure,
         stretches=stretches,
-        depths_m=depths_m,
+        depths_m=TABLE_DEPTHS_M,
         xs_m=xs_m,
         ys_m=ys_m,
         finger_radius_m=finger_radius_m,

@@ -256,7 +256,6 @@ def seen(
     *,
     eye: Floats,
     metres_per_px: float = METRES_PER_PX,
-    half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
     """Render the image (rows, columns, 3) that the measuring camera at the eye takes of the sheet.
 
@@ -266,7 +265,7 @@ def seen(
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
-    size = round(2.0 * half_window_m / metres_per_px)
+    size = round(2.0 * HALF_WINDOW_M / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
     # Only the lit part is traced, since nothing else is visible.
     bright = np.argwhere(projected.any(axis=2))[:, ::-1].astype(np.float64)
@@ -318,7 +317,6 @@ def render_expected(
     eye: Floats,
     flat: bool,
     metres_per_px: float = METRES_PER_PX,
-    half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
     """Render the expected image (rows, columns, 3): the virtual object itself, on black.
 
@@ -327,7 +325,7 @@ def render_expected(
     if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
         raise ValueError("the virtual object reaches the eye or beyond; move the object or the eye")
     vertices, triangles = true_object.vertices, true_object.triangles
-    size = round(2.0 * half_window_m / metres_per_px)
+    size = round(2.0 * HALF_WINDOW_M / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
     # Only the object's own part of the image is traced, which allows fine sampling.
     box = _box(vertices, eye, metres_per_px, size)
