@@ -10,7 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, make_hull, rounded_box
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points, make_sheet_triangles
 from flexsheet.nodes.console.snapshot import (
@@ -18,7 +18,13 @@ from flexsheet.nodes.console.snapshot import (
     rays,
     select_ray_vertices,
 )
-from flexsheet.nodes.models.rigid import apply, pose_matrix, quaternion_from_rotation, transform
+from flexsheet.nodes.models.rigid import (
+    apply,
+    pose_matrix,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    transform,
+)
 
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
@@ -374,37 +380,18 @@ def make_line_segments(points: Floats) -> Floats:
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
     """Make a fingertip mesh: vertices (n, 3), with the tip at the origin, and triangles."""
-    rings, around = 8, 20
-    tilt = np.linspace(0.0, 0.5 * np.pi, rings)
-    radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])
-    heights = np.concatenate([radius_m * (1.0 - np.cos(tilt)), [FINGER_LENGTH_M]])
-    angle = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    vertices = np.concatenate(
-        [
-            np.column_stack([r * circle, np.full(around, h)])
-            for r, h in zip(radii, heights, strict=True)
-        ]
-        + [np.array([[0.0, 0.0, FINGER_LENGTH_M + 0.4 * radius_m]])]
-    )
+    tilt = np.linspace(0.0, 0.5 * np.pi, 8)
+    radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
+    ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]
+    heights = np.concatenate([radius_m * (1.0 - np.cos(tilt)), ends])
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(20)], axis=1)
+    points = (radii[:, None, None] * circle).reshape(-1, 3)
+    points[:, 2] = np.repeat(heights, 20)
     # Tilt the finger about the centre of its tip, because a real finger comes from below.
-    lean = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, np.cos(FINGER_TILT_RAD), -np.sin(FINGER_TILT_RAD)],
-            [0.0, np.sin(FINGER_TILT_RAD), np.cos(FINGER_TILT_RAD)],
-        ]
-    )
     centre = np.array([0.0, 0.0, radius_m])
-    vertices = (vertices - centre) @ lean.T + centre
-    triangles = []
-    for ring in range(rings):
-        for i in range(around):
-            a, b = ring * around + i, ring * around + (i + 1) % around
-            triangles += [(a, b, b + around), (a, b + around, a + around)]
-    last, cap = rings * around, len(vertices) - 1
-    triangles += [(last + i, last + (i + 1) % around, cap) for i in range(around)]
-    return vertices, np.array(triangles, dtype=np.int32)
+    lean = rotation_from_vector([FINGER_TILT_RAD, 0.0, 0.0])
+    return make_hull((points - centre) @ lean.T + centre)
 
 
 def _set_pose(handle: Any, pose: Floats) -> None:
