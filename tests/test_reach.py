@@ -20,6 +20,9 @@ from flexsheet.launch.health.layout import (
     check_layout,
     draw_layout,
     make_layout_result,
+    make_samples,
+    move_base,
+    sample_contacts,
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_cylinder
@@ -269,11 +272,7 @@ def test_an_arm_moved_through_the_wrists_singularity_continues_and_the_check_fai
 
 def barred_scene() -> Scene:
     """Return a scene whose left base is so far away that many poses are not reachable."""
-    left = SCENE.arms.left
-    position = np.add(left.world_from_base.position_m, [-0.1, -0.05, 0.06])
-    base = left.world_from_base.model_copy(update={"position_m": position})
-    moved = left.model_copy(update={"world_from_base": base})
-    return SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update={"left": moved})})
+    return move_base(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
 
 
 @pytest.fixture(scope="module")
@@ -312,12 +311,20 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
 
 
-def test_a_base_too_far_off_is_found_out_with_its_limits(barred: Layout) -> None:
+def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> None:
     assert not barred.reachable
     assert barred.right.reachable.all()
     assert not barred.left.reachable.all()
     binding = {one["limit"] for one in make_layout_result(barred)["arms"]["left"]["binding"]}
     assert {"reach", "J3 range"} <= binding
+    moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
+    assert len(moved) == 1
+    offset = np.array(moved[0].values["left_base_offset_m"])
+    again = move_base(barred_scene(), "left", offset)
+    reach = find_best_reach(
+        ArmGeometry(again, "left"), RIGHT, make_samples(again, sample_contacts(again)).poses
+    )
+    assert reach.reachable.all()
 
 
 def test_the_first_limiting_pose_is_the_nearest_to_the_front(barred: Layout) -> None:
@@ -329,7 +336,7 @@ def test_the_first_limiting_pose_is_the_nearest_to_the_front(barred: Layout) -> 
         )
 
 
-def test_a_remedy_is_a_tilt_or_depth_that_is_reachable() -> None:
+def test_less_tilt_helps_where_a_base_cannot() -> None:
     arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.03, 0.3])})
     found = check_layout(SCENE.model_copy(update={"arms": arms}))
     assert not found.reachable

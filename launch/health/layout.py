@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Arms, ArmSpec, Pose, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.reach import (
@@ -58,7 +58,13 @@ ROLL_STARTS = 24
 CLAMP_MARGIN_M = 0.03
 """Minimum distance between the finger and a clamped edge of the sheet."""
 
+OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
+"""Offsets along each world axis at which a base position is tried as a remedy."""
+
 REACHED_COLOR = "#dcefdc"
+
+THINNED_COUNT = 600
+"""Number of samples that are checked first; only a base that reaches them gets a complete check."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +298,7 @@ def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Lay
     found = replace(found, blocked_paths=tuple(_find_blocked_paths(found, left, right)))
     if found.reached.all():
         return found
-    return replace(found, remedies=tuple(_find_remedies(found)))
+    return replace(found, remedies=tuple(_find_remedies(found, progress)))
 
 
 def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
@@ -328,8 +334,26 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
             yield f"to {tilt_deg:.0f} degrees, {depth_mm:.0f} mm deep: {error}"
 
 
-def _find_remedies(layout: Layout) -> Iterator[LayoutRemedy]:
-    """Yield limits of tilt and push depth, each of which makes all remaining samples reachable."""
+def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
+    """Yield changes after which all samples are reachable: base positions, tilt or push depth."""
+    moved: dict[Side, Floats] = {}
+    for side, reach in layout.arms():
+        if not reach.reachable.all():
+            progress(f"searching positions of the {side} base")
+            offset = _find_base_offset(layout, side)
+            if offset is None:
+                moved.clear()
+                break
+            moved[side] = offset
+    if moved:
+        moves = " and ".join(
+            f"{side} base by ({', '.join(f'{1e3 * one:+.0f}' for one in offset)}) mm"
+            for side, offset in moved.items()
+        )
+        yield LayoutRemedy(
+            f"move the {moves} along the world's x, y, z",
+            {f"{side}_base_offset_m": offset.tolist() for side, offset in moved.items()},
+        )
     reached = layout.reached
     for name, values, unit, factor in (
         ("tilt", np.abs(layout.samples.tilt_rad), "degrees", 180.0 / np.pi),
@@ -343,6 +367,49 @@ def _find_remedies(layout: Layout) -> Iterator[LayoutRemedy]:
             yield LayoutRemedy(
                 f"working_range.{key}: at most {factor * largest:.1f} {unit}", {key: largest}
             )
+
+
+def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
+    """Return the scene with the base of one arm moved by an offset in the world frame."""
+    arms = scene.arms
+    arm: ArmSpec = getattr(arms, side)
+    base = Pose(
+        position_m=np.asarray(arm.world_from_base.position_m) + offset_m,
+        rpy_rad=arm.world_from_base.rpy_rad,
+    )
+    changed: Arms = arms.model_copy(update={side: arm.model_copy(update={"world_from_base": base})})
+    return scene.model_copy(update={"arms": changed})
+
+
+def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
+    """Return the smallest tried base offset with which the arm reaches all samples, or None."""
+    other: Side = "right" if side == "left" else "left"
+    reach = layout.left if side == "left" else layout.right
+    bad = np.flatnonzero(~reach.reachable)
+    good = np.flatnonzero(reach.reachable)
+    # The limits of the flange's pose do not depend on the position of the base.
+    independent_limits = {"workspace", "flange distance", "edge force"}
+    if any(LIMITS[number] in independent_limits for number in set(reach.binding[bad].tolist())):
+        return None
+    chosen = np.concatenate(
+        [
+            bad[:: max(1, 2 * len(bad) // THINNED_COUNT)],
+            good[:: max(1, 2 * len(good) // THINNED_COUNT)],
+        ]
+    )
+    thin = layout.samples.poses.some(chosen)
+    other_arm = ArmGeometry(layout.scene, other)
+    offsets = sorted(
+        (np.array(one) for one in product(OFFSETS_M, repeat=3)),
+        key=lambda one: (round(float(np.linalg.norm(one)), 6), *np.abs(one)),
+    )
+    for offset in offsets[1:]:
+        arm = ArmGeometry(move_base(layout.scene, side, offset), side)
+        if not find_best_reach(arm, other_arm, thin.without_twists()).reachable.all():
+            continue
+        if find_best_reach(arm, other_arm, layout.samples.poses.without_twists()).reachable.all():
+            return offset
+    return None
 
 
 def make_layout_result(layout: Layout) -> dict[str, Any]:
