@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from flexsheet.launch.health.doctor import OPENGL_PACKAGES, find_opengl_problem
+from flexsheet.launch.health.opengl import OPENGL_PACKAGES, find_opengl_problem
 
 SYSTEM_PATHS = ("/usr/sbin", "/sbin")
 """Folders that contain `ip` and may be missing in a user's PATH."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
+from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
@@ -25,10 +25,6 @@ DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
 FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
 MIN_FREE_DISK_BYTES = 2 << 30
-OPENGL_PACKAGES = ("libegl1", "libgl1-mesa-dri")
-"""Debian packages that provide headless OpenGL."""
-
-OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}"
 MIN_CORES = 2
 PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
 """Duration of the check of the load; cycle period and processor time per cycle of an arm bridge."""
@@ -127,22 +123,6 @@ def check_opencv() -> Finding:
     registry = cv2.videoio_registry
     names = dict.fromkeys(registry.getBackendName(one) for one in registry.getBackends())
     return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(names)}")
-
-
-def find_opengl_problem() -> str | None:
-    """Return why no headless OpenGL context can be created; None if one can.
-
-    This is tried in another process, because a driver that has failed once fails again in the same
-    process.
-    """
-    code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    if result.returncode == 0:
-        return None
-    lines = result.stderr.strip().splitlines()
-    return lines[-1] if lines else f"exit code {result.returncode}"
 
 
 def check_opengl() -> Finding:

@@ -16,12 +16,8 @@ from typing import Literal
 
 import psutil
 
-from flexsheet.launch.health.doctor import (
-    MIN_FREE_DISK_BYTES,
-    OPENGL_REMEDY,
-    check_libraries,
-    find_opengl_problem,
-)
+from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries
+from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
 from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
