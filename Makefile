@@ -17,7 +17,7 @@ SITE_STAMP := $(SITE_VENV)/.installed
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
-	@$(BIN)/python -m flexsheet.launch.health.system
+	@$(BIN)/python -m tests.system_packages
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -68,7 +68,7 @@ cached: $(DEV_STAMP)
 # other processes have the machine for themselves; the others share its cores.  Both parts run, even
 # if the first fails; the last lines say what was skipped in either, and why.
 test: $(DEV_STAMP)
-	@$(BIN)/python -m flexsheet.launch.health.system --tests
+	@$(BIN)/python -m tests.system_packages --tests
 	@mkdir -p build && : > $(SKIPPED)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint cached
 	@status=0; \

@@ -13,10 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 T = TypeVar("T", bound=str | float)
 
-MarkerMethod = Literal["moments", "weighted_centroid", "subpixel_fit"]
+MarkerMethod = Literal["moments", "subpixel_fit"]
 TriangulationMethod = Literal["dlt"]
 TrackingMethod = Literal["none", "one_euro", "adaptive"]
-SheetForceMethod = Literal["linear", "scaled", "table"]
+SheetForceMethod = Literal["scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]

@@ -68,6 +68,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Display", "pattern"): {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
     ("NodeProcess", "state"): {"away": "exited"},
     ("Methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
+    ("Methods", "marker"): {"weighted_centroid": "subpixel_fit"},
     ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
     ("Methods", "tracking"): {
         "hand": "adaptive",
@@ -76,7 +77,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
         "constant_acceleration": "adaptive",
         "exponential": "one_euro",
     },
-    ("Methods", "sheet_force"): {"cubic": "scaled"},
+    ("Methods", "sheet_force"): {"cubic": "scaled", "linear": "scaled"},
 }
 """Mapping from former to current literal values, by model and current field name."""
 

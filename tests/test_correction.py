@@ -12,15 +12,14 @@ from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
     MIN_PUSH_M,
     ScreenPlane,
-    correct,
     is_plane_usable,
     make_flat_screen,
     make_pushed_screen,
     on_imaginary_screen,
     pixel_from_screen,
     sector_normals,
-    select_triangles,
 )
+from tests.correction_reference import correct, select_triangles
 
 EYE = np.array([0.0, 0.0, 0.4])
 PROJECTOR = np.array([0.0, -0.25, -1.0])

@@ -70,7 +70,6 @@ def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: 
     image = disc((x, y), radius=radius)
     for name, limit_px in (
         ("moments", 0.35),
-        ("weighted_centroid", 0.06),
         ("subpixel_fit", 0.04),
     ):
         markers = markers_in(image, name)
@@ -285,7 +284,7 @@ def test_the_marker_family_distinguishes_the_methods(
     }
     # Ground that slopes under the mark shifts a centroid; the fit allows for it.
     assert worst["subpixel_fit"] < 0.5 * MARKER.tolerance(scene)
-    assert MARKER.tolerance(scene) < worst["weighted_centroid"] < worst["moments"]
+    assert MARKER.tolerance(scene) < worst["moments"]
     for point in points:
         assert point.error > 0.7 * float(point.params["bound_px"])
 

@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import re
 import struct
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from flexsheet.messages.clock import SystemClock
-from flexsheet.nodes.arm_bridge import kinematics
 from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
     ArmLinkError,
@@ -33,16 +31,14 @@ from flexsheet.nodes.arm_bridge.mxt import (
     PACKET,
     PACKET_BYTES,
     TYPE_JOINTS,
-    TYPE_POSE,
     MxtLink,
     decode_answer,
     encode,
     encode_joints,
-    encode_pose,
     has_advanced,
 )
-from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault, forward
-from flexsheet.nodes.twin.mxt_controller import MxtController, MxtServer, numbers_of, pose_from
+from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault
+from flexsheet.nodes.twin.mxt_controller import MxtController, MxtServer
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
@@ -155,31 +151,9 @@ def test_a_counter_wraps_around_and_never_decreases(count: int, steps: int) -> N
 
 
 @pytest.mark.parametrize("bad", [[0.0] * 5, [0.0] * 5 + [float("nan")], [0.0] * 5 + [np.inf]])
-@pytest.mark.parametrize("packet_of", [encode_joints, encode_pose])
-def test_what_is_not_six_angles_is_never_sent(
-    bad: list[float], packet_of: Callable[[Floats], bytes]
-) -> None:
+def test_what_is_not_six_angles_is_never_sent(bad: list[float]) -> None:
     with pytest.raises(ValueError, match="6 finite angles"):
-        packet_of(np.array(bad))
-
-
-inside = arrays(np.float64, 6, elements=st.floats(0.02, 0.98)).map(
-    lambda share: RANGE_RAD[:, 0] + share * (RANGE_RAD[:, 1] - RANGE_RAD[:, 0])
-)
-
-
-@settings(max_examples=100, deadline=None)
-@given(inside)
-def test_a_pose_packet_contains_the_flange_target(joints: Floats) -> None:
-    numbers = np.array(struct.unpack_from("<8f", encode_pose(joints), 8), dtype=np.float64)
-    assert pose_from(numbers) == pytest.approx(kinematics.forward(joints), abs=2e-6)
-
-
-def test_a_pose_straight_up_has_its_turns_too() -> None:
-    for b in (np.pi / 2, -np.pi / 2):
-        pose = pose_from(np.array([0.0, 0.0, 0.0, 0.3, b, 0.0]))
-        again = pose_from(np.array(numbers_of(pose)))
-        assert again[:3, 2] == pytest.approx(pose[:3, 2], abs=1e-9)
+        encode_joints(np.array(bad))
 
 
 # The simulated controller.
@@ -232,18 +206,6 @@ def test_it_follows_set_points_through_filter_and_servo() -> None:
     assert trailing_s == pytest.approx(np.full(6, 0.025), abs=0.002)
 
 
-def test_it_accepts_poses_as_well_as_joints() -> None:
-    one, other = controller(), controller()
-    for arm in (one, other):
-        ask(arm, encode(COMMAND_NONE))
-    for number in range(30):
-        wanted = JOINTS + 0.002 * number
-        ask(one, encode_joints(wanted))
-        ask(other, encode_pose(wanted))
-    assert (one.error, other.error) == ("", "")
-    assert other.wanted_rad == pytest.approx(one.wanted_rad, abs=1e-5)
-
-
 def near(change: Floats | float) -> Floats:
     return JOINTS + change
 
@@ -268,17 +230,7 @@ def near(change: Floats | float) -> Floats:
             [encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=[9.0] * 6)],
             "out of range",
         ),
-        (
-            [encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=TYPE_POSE, data=[9e3] * 3)],
-            "another branch",
-        ),
-        (
-            [
-                encode(COMMAND_NONE),
-                encode(COMMAND_MOVE, send_type=TYPE_POSE, data=[9e3] * 3, flags=6),
-            ],
-            "out of reach",
-        ),
+        ([encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=1, data=[9e3] * 3)], "type 1"),
         ([encode(COMMAND_NONE), *[b""] * 20], "no packet in time"),
     ],
 )
@@ -383,17 +335,6 @@ async def test_commands_are_answered_one_by_one_and_move_the_arm() -> None:
         assert counts == [counts[0] + number for number in range(9)]
         assert server.controller.error == ""
         assert server.controller.wanted_rad == pytest.approx(JOINTS + 0.007, abs=1e-6)
-
-
-async def test_a_pose_link_moves_the_arm_to_the_same_pose() -> None:
-    async with linked() as (_, server):
-        link = MxtLink("127.0.0.1", server.port, timeout_s=DEADLINE_S, poses=True)
-        await exchange(link, "idle")
-        for number in range(5):
-            await exchange(link, joints=JOINTS + 0.001 * number)
-        link.close()
-        pose = forward(server.controller.wanted_rad)
-        assert pose == pytest.approx(kinematics.forward(JOINTS + 0.004), abs=1e-6)
 
 
 async def test_closing_ends_external_control() -> None:

@@ -19,9 +19,8 @@ from tests.waiting import until
 pytestmark = pytest.mark.alone
 
 
-@pytest.mark.parametrize("driver", ["mxt", "mxt_pose"])
-async def test_a_stroke_is_presented_over_the_real_time_control(driver: str) -> None:
-    async with running_rig({"protocol": "mxt"}, driver=driver) as (rig, nodes):
+async def test_a_stroke_is_presented_over_the_real_time_control() -> None:
+    async with running_rig({"protocol": "mxt"}, driver="mxt") as (rig, nodes):
         planner = nodes["planner"]
         await both_follow(rig, planner, AT_FRONT)
         path = stroke_path(rig.scene.object.geometry.radius_m, 0.001, 2.0)

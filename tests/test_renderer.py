@@ -22,21 +22,21 @@ from flexsheet.messages.types import (
     SoftBody,
     StereoMode,
 )
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer import gl
 from flexsheet.nodes.renderer.correction import (
     ScreenPlane,
-    correct,
     make_flat_screen,
     make_pushed_screen,
 )
 from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.node import Renderer, RendererParameters
 from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
-from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
+from tests.correction_reference import correct
 from tests.fingertips import fingertip
 from tests.node_harness import NodeHarness
 from tests.packing import pack

@@ -17,12 +17,12 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Display, Frame, Shading, Skin, SoftBody, TwinArms, TwinEye
-from flexsheet.nodes.models.rigid import inverse
+from flexsheet.nodes.models.rigid import inverse, pose_matrix
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.node import Renderer, RendererParameters
 from flexsheet.nodes.renderer.object_surface import DeformationTransfer, VertexNormals
-from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.true_object import TrueBody
 from tests.fingertips import fingertip

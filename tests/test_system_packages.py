@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flexsheet.launch.health import system
+from tests import system_packages as system
 
 
 class Apt:

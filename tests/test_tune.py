@@ -132,9 +132,7 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return []
 
 
-STAGED = Tunable(
-    "made-up", "marker", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"}
-)
+STAGED = Tunable("marker", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"})
 
 
 @pytest.mark.parametrize(
@@ -444,7 +442,7 @@ async def test_a_node_follows_the_scene_if_set_to_auto() -> None:
         given = TriangulatorParameters(**parameters)
         return Triangulator(given, name="eye", clock=VirtualClock(), send=lambda *_: None)
 
-    follows, set_by_hand = node(), node(marker="weighted_centroid")
+    follows, set_by_hand = node(), node(tracking="none")
     for each in (follows, set_by_hand):
         await each.setup()
         await each.step("scene", SCENE, header_at(0))
@@ -453,7 +451,7 @@ async def test_a_node_follows_the_scene_if_set_to_auto() -> None:
         changed = with_methods(marker="moments", triangulation="dlt", tracking="one_euro")
         await each.step("scene", changed, header_at(1))
     assert follows.methods == "moments, dlt, one_euro"
-    assert set_by_hand.methods == "weighted_centroid, dlt, one_euro"
+    assert set_by_hand.methods == "moments, dlt, none"
 
 
 def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:
@@ -479,7 +477,7 @@ def test_a_missing_force_table_is_replaced_and_reported(tmp_path: Path) -> None:
     law, told = load_force_model(SCENE, "table", tmp_path)
     assert law.name == "scaled"
     assert "flexsheet precompute" in told
-    assert load_force_model(SCENE, "linear", tmp_path)[0].name == "linear"
+    assert load_force_model(SCENE, "scaled", tmp_path) == (law, "scaled")
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.2, False), (3.9, False), (4.1, True), (40.0, True)])

@@ -5,8 +5,16 @@ from __future__ import annotations
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,
+    Always,
+    Distribution,
+    HalfNormal,
+    LogNormal,
+    LogUniform,
+    Normal,
+    OneOf,
     Profile,
     Tolerance,
+    Uniform,
     expand_key,
 )
 
@@ -40,7 +48,28 @@ def _describe(row: Tolerance, profile: Profile, *, calibrated: bool) -> str:
     given = row.of(profile, calibrated=calibrated)
     each = given if isinstance(given, tuple) else (given,)
     scale = 1.0 if profile in row.frame_periods else row.scale
-    text = "; ".join(one.text(scale) for one in each)
+    text = "; ".join(_format(one, scale) for one in each)
     if row.pair is not None:
-        text += f"; each arm + {row.pair.text(row.scale)}"
+        text += f"; each arm + {_format(row.pair, row.scale)}"
     return text
+
+
+def _format(distribution: Distribution, scale: float) -> str:
+    """Format a distribution, with its numbers multiplied by `scale`."""
+    match distribution:
+        case Normal(mean, sigma):
+            return f"N({mean * scale:.4g}, {sigma * scale:.4g})"
+        case LogNormal(median, sigma_ln):
+            return f"lognormal, median {median * scale:.4g}, σ(ln) {sigma_ln:.4g}"
+        case HalfNormal(sigma):
+            return f"|N(0, {sigma * scale:.4g})|"
+        case Uniform(low, high):
+            return f"U({low * scale:.4g}, {high * scale:.4g})"
+        case LogUniform(low, high):
+            return f"log-U({low * scale:.4g}, {high * scale:.4g})"
+        case OneOf(values):
+            return " or ".join(f"{value * scale:.4g}" for value in values)
+        case Always(value):
+            return value if isinstance(value, str) else f"{value * scale:.4g}"
+        case _:
+            raise TypeError(f"unknown distribution {distribution!r}")

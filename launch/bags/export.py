@@ -46,7 +46,7 @@ from flexsheet.messages.types import (
     StereoPair,
     TwinEye,
 )
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 
 try:
     import foxglove
@@ -218,8 +218,7 @@ class ViewState:
         half_m = 0.5 * self.scene.sheet.height_m
         corners = []
         for side, spec in (("left", self.scene.arms.left), ("right", self.scene.arms.right)):
-            pose = spec.flange_from_edge
-            flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
+            flange_from_edge = pose_matrix(spec.flange_from_edge)
             world_from_edge = self.flanges[side] @ flange_from_edge
             corners += [(world_from_edge @ [0.0, y_m, 0.0, 1.0])[:3] for y_m in (-half_m, half_m)]
         triangles = np.array([[0, 2, 1], [1, 2, 3]])

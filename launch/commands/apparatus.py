@@ -13,6 +13,7 @@ from flexsheet.launch.commands.options import (
     JsonOption,
     ProfileOption,
     SceneOption,
+    make_app,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -22,11 +23,7 @@ from flexsheet.launch.commands.output import (
     words,
 )
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="Sample and show an apparatus: true parameters of the simulated hardware.",
-)
+app = make_app("Sample and show an apparatus: true parameters of the simulated hardware.")
 
 
 @app.command(

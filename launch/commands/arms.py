@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.options import JsonOption, RunOption
+from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -32,11 +32,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Subscriber
     from flexsheet.messages.types import ArmState, EStop
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="Show, enable, disable, stop and reset the arms of a running graph.",
-)
+app = make_app("Show, enable, disable, stop and reset the arms of a running graph.")
 
 SIDES = ("left", "right")
 TOPICS = ("arm_left", "arm_right")

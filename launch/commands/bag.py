@@ -19,6 +19,7 @@ from flexsheet.launch.commands.options import (
     RunOption,
     TopicsOption,
     find_launch_file,
+    make_app,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -43,11 +44,7 @@ if TYPE_CHECKING:
 PROGRESS_PERIOD_S = 0.2
 MAX_TOPICS_LISTED = 10
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="Record, play and analyse bags, which are MCAP files of recorded topics.",
-)
+app = make_app("Record, play and analyse bags, which are MCAP files of recorded topics.")
 
 FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", hidden=True)]
 

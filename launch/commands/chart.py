@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import CYLINDER, JsonOption, output_file
+from flexsheet.launch.commands.options import CYLINDER, JsonOption, make_app, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -24,7 +24,7 @@ from flexsheet.launch.commands.output import (
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.shipped import SCENES, find_file
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 SYSTEM = "system"
 

@@ -20,11 +20,12 @@ from flexsheet.launch.commands.options import (
     OtherSceneOption,
     ResultFolderOption,
     SettingsOption,
+    make_app,
     with_scene,
 )
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 
 @app.command(

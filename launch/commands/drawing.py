@@ -15,6 +15,7 @@ from flexsheet.launch.commands.options import (
     RunOption,
     SettingsOption,
     find_launch_file,
+    make_app,
     output_file,
     with_scene,
 )
@@ -27,7 +28,7 @@ from flexsheet.launch.commands.output import (
     words,
 )
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 
 @app.command(

@@ -18,6 +18,7 @@ from flexsheet.launch.commands.options import (
     SchedulerOption,
     SettingsOption,
     WorkersOption,
+    make_app,
     split_names,
     with_scene,
 )
@@ -38,11 +39,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.experiments.image import Series
     from flexsheet.launch.experiments.run import Procedure, Progress
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="Run the experiments of Furukawa et al. 2007, and further ones, on a graph.",
-)
+app = make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
 
 StrokeOption = Annotated[
     float,

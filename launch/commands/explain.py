@@ -16,11 +16,11 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption
+from flexsheet.launch.commands.options import JsonOption, make_app
 from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
 from flexsheet.messages.errors import FlexsheetError
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3

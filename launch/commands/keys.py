@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from flexsheet.launch.commands.options import JsonOption, LaunchArgument
+from flexsheet.launch.commands.options import JsonOption, LaunchArgument, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -20,11 +20,7 @@ from flexsheet.launch.commands.output import (
 
 KEY_LENGTH = 40
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="Manage the key pairs by which hosts authenticate each other.",
-)
+app = make_app("Manage the key pairs by which hosts authenticate each other.")
 
 
 class KeyCommand(TyperCommand):

@@ -19,6 +19,7 @@ from flexsheet.launch.commands.options import (
     LaunchArgument,
     OtherSceneOption,
     SettingsOption,
+    make_app,
     with_scene,
 )
 from flexsheet.launch.commands.output import (
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.supervisor import RunningGraph
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 

@@ -9,7 +9,7 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import NoGraphError, running_graph
-from flexsheet.launch.commands.options import JsonOption, RunOption
+from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -22,11 +22,7 @@ from flexsheet.launch.commands.output import (
 if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedNode
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="List nodes and node types, and describe their ports and parameters.",
-)
+app = make_app("List nodes and node types, and describe their ports and parameters.")
 
 
 @app.command("list", epilog=examples("flexsheet node list"))

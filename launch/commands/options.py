@@ -39,6 +39,11 @@ FORMER_NAMES = {
 """Current name of each renamed option and command; former names still work but are not shown."""
 
 
+def make_app(text: str | None = None) -> typer.Typer:
+    """Make the typer app of a command, or of a group of commands with the help `text`."""
+    return typer.Typer(add_completion=False, no_args_is_help=text is not None, help=text)
+
+
 def find_launch_file(given: Path | None) -> Path | None:
     """Return the path of a launch file, which is given as a path or as a shipped file's name."""
     return None if given is None else find_file(given, LAUNCH_FILES)

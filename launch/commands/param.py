@@ -10,7 +10,7 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import receive_until, run_interruptible, running_graph
-from flexsheet.launch.commands.options import JsonOption, RunOption
+from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -27,11 +27,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.messages.types import Status
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="List, get and set parameters of the running graph.",
-)
+app = make_app("List, get and set parameters of the running graph.")
 
 STATUS_TIMEOUT_S = 3.0
 """Maximum time to wait for statuses, which contain changed parameters and appear once a second."""

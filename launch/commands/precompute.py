@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, SchedulerOption
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, SchedulerOption, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -17,7 +17,7 @@ from flexsheet.launch.commands.output import (
     words,
 )
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 
 @app.command(

@@ -28,6 +28,7 @@ from flexsheet.launch.commands.options import (
     RunOption,
     SettingsOption,
     find_launch_file,
+    make_app,
     with_scene,
 )
 from flexsheet.launch.commands.output import (
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.messages.types import HostStatus, Status
 
-status_app, logs_app, stop_app, run_app = (typer.Typer(add_completion=False) for _ in range(4))
+status_app, logs_app, stop_app, run_app = (make_app() for _ in range(4))
 
 STATUS_TIMEOUT_S = 3.0
 """Maximum time to wait for the statuses of all nodes, which are published once a second."""

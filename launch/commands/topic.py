@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument
+from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Handler, Subscriber
     from flexsheet.messages.topics import Topic
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    help="List topics, and read or publish them in the running graph.",
-)
+app = make_app("List topics, and read or publish them in the running graph.")
 
 CountOption = Annotated[
     int | None,

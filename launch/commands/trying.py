@@ -18,6 +18,7 @@ from flexsheet.launch.commands.options import (
     LaunchOption,
     OtherSceneOption,
     SettingsOption,
+    make_app,
     with_scene,
 )
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
@@ -26,7 +27,7 @@ from flexsheet.nodes.signals import keyboard_interrupts
 if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 
 @app.command(

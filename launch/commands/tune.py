@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -28,7 +28,7 @@ NOT_MET = 3
 """Exit code if a method family has no method within the tolerance; the best one is chosen."""
 
 
-app = typer.Typer(add_completion=False)
+app = make_app()
 
 
 @app.command(

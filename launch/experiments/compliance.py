@@ -24,9 +24,9 @@ from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     TARGET_ERROR_RATIO,
@@ -233,8 +233,8 @@ class ForceReference:
         scene = apply_apparatus(recorded.scene, recorded.apparatus)
         self._recorded, self._radius_m = recorded, scene.finger.radius_m
         self._clamps = (
-            _make_transform(scene.arms.left.flange_from_edge),
-            _make_transform(scene.arms.right.flange_from_edge),
+            pose_matrix(scene.arms.left.flange_from_edge),
+            pose_matrix(scene.arms.right.flange_from_edge),
         )
         self._rubber = true_rubber(scene.sheet, recorded.apparatus)
         self._friction = true_friction(recorded.apparatus)
@@ -331,10 +331,6 @@ def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
     """Return the depth of the fingertip behind the plane of the unloaded sheet, m; at least 0."""
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
     return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
-
-
-def _make_transform(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:

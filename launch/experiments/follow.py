@@ -39,12 +39,18 @@ from flexsheet.launch.experiments.run import (
     run_experiment,
 )
 from flexsheet.launch.experiments.simulated_time import follow_in_simulated_time
-from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges, pose_matrix
+from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
-from flexsheet.nodes.models.rigid import apply, inverse, rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
+    pose_matrix,
+    rotation_from_vector,
+    transform,
+)
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.twin.arms import (
     ACCELERATION_RAD_PER_S2,
@@ -312,7 +318,6 @@ def bound_errors(
     progress: Progress = lambda text: None,
     *,
     apparatus: Apparatus | None = None,
-    step_s: float = STEP_S,
 ) -> dict[str, Any]:
     """Return the lower bound of the contact error for a finger path, in mm.
 
@@ -322,7 +327,7 @@ def bound_errors(
     Raises ExperimentError for a path without contact.
     """
     followed = FollowedContact(scene, apparatus)
-    grid = np.arange(times_s[0], times_s[-1], step_s)
+    grid = np.arange(times_s[0], times_s[-1], STEP_S)
     positions = np.column_stack([np.interp(grid, times_s, column) for column in positions_world.T])
     contact = followed.contact_heights_m(positions) <= MAX_CONTACT_HEIGHT_M
     if not contact.any():
@@ -353,7 +358,7 @@ def bound_errors(
         weights = contact[window].astype(np.float64)
         if not weights.any():
             continue
-        found = find_least_deviation(part, weights, step_s, max_deviation=MAX_DEVIATION_M)
+        found = find_least_deviation(part, weights, STEP_S, max_deviation=MAX_DEVIATION_M)
         if found is None:
             unsolved += 1
         else:

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.launch.experiments.stroke import project_presented_point
-from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges, pose_matrix
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.nodes import node_class
-from flexsheet.nodes.models.rigid import apply, inverse, transform
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber

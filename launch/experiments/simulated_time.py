@@ -29,7 +29,7 @@ from flexsheet.launch.experiments.stroke import (
     object_pose,
     sheet_errors,
 )
-from flexsheet.launch.experiments.true_geometry import ArmModel, pose_matrix
+from flexsheet.launch.experiments.true_geometry import ArmModel
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Side
@@ -38,7 +38,7 @@ from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
-from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.planner.compliance_controller import ComplianceController

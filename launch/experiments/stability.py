@@ -307,12 +307,10 @@ def stability_result(
     curve: Floats,
     settings: StabilitySettings,
     progress: Progress,
-    *,
-    cache_dir: Path | None = None,
 ) -> dict[str, Any]:
     """Run both simulations; return the result of `flexsheet experiment stability --json`."""
     boundary = measure_boundary(settings, progress)
-    rows = measure_map(scene, model, curve, settings, progress, cache_dir=cache_dir)
+    rows = measure_map(scene, model, curve, settings, progress)
     errors = np.abs([row["error_percent"] for row in boundary])
     return {
         "scene": scene.name,

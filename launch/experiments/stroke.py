@@ -36,7 +36,7 @@ from flexsheet.messages.types import (
     TwinArms,
     TwinFinger,
 )
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -163,8 +163,7 @@ def stroke_window_s(seconds: float) -> tuple[float, float]:
 
 def object_pose(scene: Scene) -> Floats:
     """Return the pose of a scene's object as the matrix world_from_object (4, 4)."""
-    pose = scene.object.world_from_object
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+    return pose_matrix(scene.object.world_from_object)
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,8 +343,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         raise ExperimentError(f"{bag}: contains no scene; record the topic scene")
 
     def make_edges(key: str, arm: ArmSpec) -> SampledMotion:
-        pose = arm.flange_from_edge
-        flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        flange_from_edge = pose_matrix(arm.flange_from_edge)
         rows = [(time, make_edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
         return make_motion(rows, f"arm {key}")
 

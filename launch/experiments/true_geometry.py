@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.scene import ArmSpec, Pose, Scene
-from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.arms import forward, solve_inverse_kinematics
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
@@ -21,11 +21,6 @@ from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
-
-
-def pose_matrix(pose: Pose) -> Floats:
-    """Return a pose as a homogeneous matrix (4, 4)."""
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from flexsheet.launch.health.system import OPENGL, find_opengl_problem
+from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
@@ -130,7 +130,7 @@ def check_opengl() -> Finding:
     problem = find_opengl_problem()
     if problem is None:
         return Finding("opengl", "ok", "a headless context can be created (EGL)")
-    return Finding("opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
+    return Finding("opengl", "failed", problem, OPENGL_REMEDY)
 
 
 def check_cores() -> Finding:

@@ -17,8 +17,8 @@ from typing import Literal
 import psutil
 
 from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries
+from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
 from flexsheet.launch.health.probe import HostProbe, Reachability
-from flexsheet.launch.health.system import OPENGL, find_opengl_problem
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
 from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT
@@ -416,7 +416,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
     NodeRole.CAMERA: ("camera", "check whether another program uses the camera: docs/camera.md"),
     NodeRole.RENDERER: (
         "image",
-        f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
+        f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
 """Name of the check and remedy for nodes that must publish, by role."""
@@ -595,7 +595,7 @@ def check_before_start(
         if problem is None:
             yield HostFinding(here, "opengl", "ok", "a headless context can be created (EGL)")
         else:
-            yield HostFinding(here, "opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
+            yield HostFinding(here, "opengl", "failed", problem, OPENGL_REMEDY)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
             yield _check_controller(here, node)

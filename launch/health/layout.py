@@ -32,7 +32,7 @@ from flexsheet.nodes.arm_bridge.reach import (
     plan_path,
 )
 from flexsheet.nodes.models.motion import SheetMotion
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 from flexsheet.nodes.planner.rolling import (
@@ -154,8 +154,7 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
-    pose = scene.object.world_from_object
-    world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    world_from_object = pose_matrix(scene.object.world_from_object)
     home = world_from_object[:3, :3].T
     most = np.array([0.5 * scene.sheet.width_m - CLAMP_MARGIN_M, scene.sheet.usable_half_height_m])
     found = _find_touchable_points(scene, world_from_object, shape.closest)

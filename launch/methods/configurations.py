@@ -21,7 +21,7 @@ from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
-from flexsheet.nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
 
@@ -50,7 +50,7 @@ PAPER = Methods(
     marker="moments",
     triangulation="dlt",
     tracking="none",
-    sheet_force="linear",
+    sheet_force="scaled",
     sheet_shape="four_triangles",
     correction="four_triangles",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
@@ -118,9 +118,6 @@ def choose_cheapest(scene: Scene) -> Methods:
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
     rubber = make_rubber(scene.sheet)
-    is_linear = not LinearSheetModel(rubber).invalid_reason(
-        stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
-    )
     is_scaled = not ScaledSheetModel(rubber).invalid_reason(
         stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
     )
@@ -133,7 +130,7 @@ def choose_cheapest(scene: Scene) -> Methods:
             "marker": "moments",
             "triangulation": "dlt",
             "tracking": "one_euro",
-            "sheet_force": "linear" if is_linear else "scaled" if is_scaled else "table",
+            "sheet_force": "scaled" if is_scaled else "table",
             "sheet_shape": "four_triangles" if is_flat else "reduced_order",
             "correction": correction,
             "soft_body": {"method": "linear", "skin_spacing_m": 0.006}

@@ -91,14 +91,13 @@ def plan_trials(
     blocks: int,
     seconds: float,
     apparatuses: int,
-    launch_file: Path = DEMO_FILE,
     configurations: Sequence[str] = (),
 ) -> SceneTrials:
     """Describe the trials of one scene in the order in which they run."""
     scene = load_scene(scene_file)
     chosen = select_configurations(scene, configurations)
     folder.mkdir(parents=True, exist_ok=True)
-    launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
+    launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
     settings = {one.name: one.settings(graph) for one in chosen}
     settings[CONTROL_AGAIN] = settings[CONTROL]
@@ -141,11 +140,10 @@ def plan_configuration(
     *,
     runs: int,
     seconds: float,
-    launch_file: Path = DEMO_FILE,
 ) -> SceneTrials:
     """Describe the trials of one configuration with the nominal apparatus."""
     folder.mkdir(parents=True, exist_ok=True)
-    launch = write_launch_file(launch_file, scene_file, folder / "launch.yaml").resolve()
+    launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
     trial = {
         "kind": "system",
@@ -188,7 +186,6 @@ def run_system_chart(
     blocks: int,
     seconds: float,
     apparatuses: int,
-    launch_file: Path = DEMO_FILE,
     configurations: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Measure the configurations for all scenes; return the result of `chart system --json`.
@@ -205,7 +202,6 @@ def run_system_chart(
             blocks=blocks,
             seconds=seconds,
             apparatuses=apparatuses,
-            launch_file=launch_file,
             configurations=configurations,
         )
 

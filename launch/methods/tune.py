@@ -64,16 +64,20 @@ class UnknownTunableError(FlexsheetError, KeyError):
 class Tunable:
     """Method family whose method can be chosen in a scene.
 
-    key: its key in the scene's `methods`. families: its parts as `module:NAME`, in the order of
+    families: its parts as `module:NAME`, in the order of
     measurement. Later parts take minutes to prepare and are measured only if no earlier method is
     sufficient. settings: value to write into the scene for each method, by the method's name in
     the family's chart.
     """
 
     name: str
-    key: str
     families: tuple[str, ...]
     settings: Mapping[str, Setting]
+
+    @property
+    def key(self) -> str:
+        """Return the family's key in the scene's `methods`."""
+        return self.name.replace("-", "_")
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
@@ -85,59 +89,35 @@ def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
     return {"method": method, "skin_spacing_m": skin_spacing_m}
 
 
+_BENCHMARKS, _TRIANGULATOR, _FEM_SOLVER = (
+    "flexsheet.launch.methods.benchmarks",
+    "flexsheet.nodes.triangulator.benchmarks",
+    "flexsheet.nodes.fem_solver.benchmarks",
+)
 TUNABLES = (
+    Tunable("marker", (f"{_TRIANGULATOR}:MARKER",), _make_settings(MarkerMethod)),
     Tunable(
-        "marker",
-        "marker",
-        ("flexsheet.nodes.triangulator.benchmarks:MARKER",),
-        _make_settings(MarkerMethod),
+        "triangulation", (f"{_TRIANGULATOR}:TRIANGULATION",), _make_settings(TriangulationMethod)
     ),
-    Tunable(
-        "triangulation",
-        "triangulation",
-        ("flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",),
-        _make_settings(TriangulationMethod),
-    ),
-    Tunable(
-        "tracking",
-        "tracking",
-        ("flexsheet.launch.methods.benchmarks:TRACKING",),
-        _make_settings(TrackingMethod),
-    ),
+    Tunable("tracking", (f"{_BENCHMARKS}:TRACKING",), _make_settings(TrackingMethod)),
     Tunable(
         "sheet-force",
-        "sheet_force",
-        (
-            "flexsheet.launch.methods.benchmarks:SHEET_LAWS",
-            "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
-        ),
+        (f"{_BENCHMARKS}:SHEET_LAWS", f"{_BENCHMARKS}:SHEET_FORCE"),
         _make_settings(SheetForceMethod),
     ),
     Tunable(
         "sheet-shape",
-        "sheet_shape",
-        (
-            "flexsheet.launch.methods.benchmarks:QUICK_SHAPE",
-            "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
-        ),
+        (f"{_BENCHMARKS}:QUICK_SHAPE", f"{_BENCHMARKS}:SHEET_SHAPE"),
         _make_settings(SheetShapeMethod),
     ),
     Tunable(
         "correction",
-        "correction",
-        (
-            "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION",
-            "flexsheet.launch.methods.benchmarks:CORRECTION",
-        ),
+        (f"{_BENCHMARKS}:QUICK_CORRECTION", f"{_BENCHMARKS}:CORRECTION"),
         _make_settings(Correction),
     ),
     Tunable(
         "soft-body",
-        "soft_body",
-        (
-            "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY_LINEAR",
-            "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
-        ),
+        (f"{_FEM_SOLVER}:SOFT_BODY_LINEAR", f"{_FEM_SOLVER}:SOFT_BODY_TABLES"),
         {
             "linear, coarse": _make_soft_body("linear", 0.006),
             "linear, medium": _make_soft_body("linear", 0.0045),

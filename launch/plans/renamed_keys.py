@@ -58,7 +58,8 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
     "compliance_mode": {"curve": "force_curve", "stretch": "stiffness"},
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
-    "sheet_force": {"cubic": "scaled"},
+    "sheet_force": {"cubic": "scaled", "linear": "scaled"},
+    "marker": {"weighted_centroid": "subpixel_fit"},
     "tracking": {
         "hand": "adaptive",
         "singer_tremor": "adaptive",
@@ -67,6 +68,7 @@ VALUES: Mapping[str, Mapping[str, str]] = {
         "exponential": "one_euro",
     },
     "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
+    "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
 """New value by former value of a key, for names of methods, patterns and modes."""

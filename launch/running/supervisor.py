@@ -23,7 +23,6 @@ from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from flexsheet.launch.plans.documents import BadInputError, Problem
@@ -322,12 +321,7 @@ class RunningGraph:
             raise
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.stop()
 
     async def wait_ready(self, timeout_s: float | None = None) -> None:

@@ -8,7 +8,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
@@ -19,7 +19,7 @@ from flexsheet.nodes.arm_bridge.kinematics import (
 )
 from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.sheet import flange_pose, sheet_from_edges
 
 Floats = NDArray[np.float64]
@@ -38,10 +38,6 @@ def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
     return pose
 
 
-def _transform(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
-
-
 class ArmGeometry:
     """Geometry of one arm: poses of its base and of the edge that it holds, and its limits."""
 
@@ -51,10 +47,10 @@ class ArmGeometry:
         arm, other = scene.arms.left, scene.arms.right
         if not self.left:
             arm, other = other, arm
-        self.world_from_base = _transform(arm.world_from_base)
+        self.world_from_base = pose_matrix(arm.world_from_base)
         self.base_from_world = inverse(self.world_from_base)
-        self.flange_from_edge = _transform(arm.flange_from_edge)
-        self.other_flange_from_edge = _transform(other.flange_from_edge)
+        self.flange_from_edge = pose_matrix(arm.flange_from_edge)
+        self.other_flange_from_edge = pose_matrix(other.flange_from_edge)
         self._joint_offsets_rad = np.array(arm.joint_offsets_rad)
         self._compliance_m_per_n = arm.flange_compliance_m_per_n
         self._other_compliance_m_per_n = other.flange_compliance_m_per_n

@@ -8,7 +8,7 @@ from flexsheet.nodes.arm_bridge.link import ArmLink
 from flexsheet.nodes.arm_bridge.modbus import ModbusLink
 from flexsheet.nodes.arm_bridge.mxt import MxtLink
 
-Driver = Literal["modbus", "mxt", "mxt_pose"]
+Driver = Literal["modbus", "mxt"]
 
 
 def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
@@ -16,4 +16,4 @@ def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> 
     options = {} if timeout_s is None else {"timeout_s": timeout_s}
     if driver == "modbus":
         return ModbusLink(host, port, **options)
-    return MxtLink(host, port, poses=driver == "mxt_pose", **options)
+    return MxtLink(host, port, **options)

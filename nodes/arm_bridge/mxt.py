@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.arm_bridge.kinematics import FLANGE_M, forward
 from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
     ArmAnswerError,
@@ -38,10 +37,7 @@ CONTROLLER_CYCLE_S = 0.0071
 PACKET_BYTES = 196
 
 COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
-TYPE_NONE, TYPE_POSE, TYPE_JOINTS, TYPE_PULSES = 0, 1, 2, 3
-TYPE_JOINTS_MEASURED = 8
-
-FLAG_RIGHT, FLAG_ABOVE, FLAG_NONFLIP = 4, 2, 1
+TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED = 0, 2, 8
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
 """Maximum plausible angle of a joint; an answer with a larger angle is invalid."""
@@ -58,13 +54,8 @@ PACKET = (
         "receive_type", "H", 1, "requested type of the answer's `data`: 0 to 11; 8 measured joints"
     ),
     BlockField("reserved", "x", 2, "0"),
-    BlockField("data", "f", 8, "joints in rad, or x y z in mm and a b c in rad; the rest 0"),
-    BlockField(
-        "flags",
-        "I",
-        2,
-        "structure of a pose (4 right, 2 above, 1 nonflip), and number of revolutions",
-    ),
+    BlockField("data", "f", 8, "joints in rad; the rest 0"),
+    BlockField("flags", "I", 2, "structure and revolutions of a pose; 0"),
     BlockField("send_io_type", "H", 1, "0: no signals"),
     BlockField("receive_io_type", "H", 1, "0: no signals"),
     BlockField("bit_top", "H", 1, "0"),
@@ -94,48 +85,15 @@ class MxtStatus(ArmStatus):
     timeouts: int
 
 
-def encode(
-    command: int, *, send_type: int = 0, data: Sequence[float] = (), flags: int = 0
-) -> bytes:
+def encode(command: int, *, send_type: int = 0, data: Sequence[float] = ()) -> bytes:
     """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers."""
     padded = (*data, *([0.0] * (8 - len(data))))
-    return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, flags, *([0] * 8))
+    return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, *([0] * 9))
 
 
 def encode_joints(joints_rad: Floats) -> bytes:
     """Encode a motion to joints (6,) rad; raises ValueError unless there are six finite ones."""
     return encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=validate_joints(joints_rad))
-
-
-def encode_pose(joints_rad: Floats) -> bytes:
-    """Encode a motion of the flange to its pose at joints (6,) rad, with their structure flags."""
-    pose = forward(validate_joints(joints_rad))
-    rotation = pose[:3, :3]
-    # a, b, c: rotations about the fixed axes x, y, z in this order; at b = +-90 degrees only the
-    # difference of a and c matters.
-    level = math.hypot(rotation[0, 0], rotation[1, 0])
-    b = math.atan2(-rotation[2, 0], level)
-    if level > 1e-9:
-        a, c = (
-            math.atan2(rotation[2, 1], rotation[2, 2]),
-            math.atan2(rotation[1, 0], rotation[0, 0]),
-        )
-    else:
-        a, c = math.atan2(-rotation[1, 2], rotation[1, 1]), 0.0
-    return encode(
-        COMMAND_MOVE,
-        send_type=TYPE_POSE,
-        data=(*(pose[:3, 3] * 1e3).tolist(), a, b, c),
-        flags=find_branch_flags(joints_rad, pose),
-    )
-
-
-def find_branch_flags(joints_rad: Floats, base_from_flange: Floats) -> int:
-    """Return the structure flags of joints: right, above (always, by the range of J3), nonflip."""
-    wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]
-    ahead = wrist[0] * math.cos(joints_rad[0]) + wrist[1] * math.sin(joints_rad[0])
-    shoulder = FLAG_RIGHT if ahead >= 0.0 else 0
-    return shoulder | FLAG_ABOVE | (FLAG_NONFLIP if joints_rad[4] >= 0.0 else 0)
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
@@ -174,17 +132,11 @@ class MxtLink:
     """
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        timeout_s: float = 2.0 * CONTROLLER_CYCLE_S,
-        poses: bool = False,
+        self, host: str, port: int, *, timeout_s: float = 2.0 * CONTROLLER_CYCLE_S
     ) -> None:
         self.host, self.port = host, port
         self.stale = 0
         self._timeout_s = timeout_s
-        self._move_packet = encode_pose if poses else encode_joints
         self._socket: socket.socket | None = None
         self._count: int | None = None
         self._counters = CounterMonitor()
@@ -203,7 +155,7 @@ class MxtLink:
             self._count, self._unanswered = None, 0
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        packet = self._move_packet(joints_rad) if mode == "move" else encode(COMMAND_NONE)
+        packet = encode_joints(joints_rad) if mode == "move" else encode(COMMAND_NONE)
         try:
             link = await self._open()
             self._drop_late_answers(link)

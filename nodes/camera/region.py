@@ -83,8 +83,7 @@ def find_finger_regions(scene: Scene) -> Regions:
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
     high = np.asarray(finger.volume_max_m) + finger.radius_m
-    pose = rig.world_from_left
-    left_from_world = rigid.inverse(rigid.transform_from_rpy(pose.position_m, pose.rpy_rad))
+    left_from_world = rigid.inverse(rigid.pose_matrix(rig.world_from_left))
     in_left = rigid.apply(left_from_world, volume_points(low, high))
     in_right = rigid.apply(np.asarray(rig.right_from_left), in_left)
     found = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
@@ -51,7 +52,7 @@ PIECES = (
 )
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""Corners of a box, (8, 3); in the index, bit 4 is the sign of x, bit 2 of y, bit 1 of z."""
+"""Corners of a box, (8, 3)."""
 
 BRACKET_WIDTH_M = 0.012
 """Width of the bar between a flange and its clamp."""
@@ -78,15 +79,15 @@ def rounded_box(
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
-    # Each corner has three vertices, one for each face; the index is 8 * axis + corner.
+    # Each corner has three vertices, one for each face.
     vertices = np.concatenate(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
-    return vertices + np.array(centre_m), _orient_outwards(vertices, _box_triangles())
+    return make_hull(vertices + np.array(centre_m))
 
 
 def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Make the mesh of the bar from the flange to its clamp: vertices (24, 3), triangles (44, 3).
+    """Make the mesh of the bar from the flange to its clamp: vertices (n, 3), triangles (m, 3).
 
     flange_from_clamp_m: centre of the clamp (3,) in the flange frame. The bar reaches into the
     flange and the clamp, so that no gap is visible.
@@ -98,29 +99,7 @@ def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDAr
     return vertices.astype(np.float32), triangles
 
 
-def _box_triangles() -> NDArray[np.int32]:
-    """Return the vertex indices (44, 3) of the triangles of corners, edge strips and faces."""
-    corner = np.arange(8)
-    triangles = [np.stack([corner, 8 + corner, 16 + corner], axis=1)]
-    for axis in range(3):
-        bit = 4 >> axis
-        low = corner[corner & bit == 0]
-        # Edges along this axis join the faces of the other two axes.
-        first, second = (8 * other for other in range(3) if other != axis)
-        near, far = low, low | bit
-        triangles += [
-            np.stack([first + near, first + far, second + far], axis=1),
-            np.stack([first + near, second + far, second + near], axis=1),
-        ]
-        for side in (0, bit):
-            a, b, c, d = 8 * axis + (low | side)
-            triangles.append(np.array([(a, b, d), (a, d, c)]))
-    return np.concatenate(triangles).astype(np.int32)
-
-
-def _orient_outwards(vertices: Floats, triangles: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Orient the triangles of a convex body about the origin counter-clockwise from outside."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0.0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return triangles
+def make_hull(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
+    """Return vertices and counter-clockwise triangles of the convex hull of points (n, 3)."""
+    hull = trimesh.convex.convex_hull(points)
+    return np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int32)

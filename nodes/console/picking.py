@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
@@ -25,8 +25,7 @@ class SurfacePicker:
     """Picker of points on a scene's object; building one for a mesh takes a second."""
 
     def __init__(self, scene: Scene) -> None:
-        pose = scene.object.world_from_object
-        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._object_from_world = inverse(self._world_from_object)
         self._shape: Shape = make_shape(dict(scene.object.geometry))
         self._low, self._high = scene.finger.volume_min_m, scene.finger.volume_max_m

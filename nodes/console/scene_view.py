@@ -10,16 +10,27 @@ import viser
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import ArmSpec, Scene
-from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, make_bracket, rounded_box
+from flexsheet.nodes.console.arms import (
+    CLAMP_SIZE_M,
+    PIECES,
+    make_bracket,
+    make_hull,
+    rounded_box,
+)
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points, make_sheet_triangles
 from flexsheet.nodes.console.snapshot import (
     SceneSnapshot,
     rays,
     select_ray_vertices,
-    transform_from_pose,
 )
-from flexsheet.nodes.models.rigid import apply, quaternion_from_rotation, transform
+from flexsheet.nodes.models.rigid import (
+    apply,
+    pose_matrix,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    transform,
+)
 
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
@@ -272,7 +283,7 @@ class SceneView:
     def _add_devices(self, scene: Scene) -> None:
         """Add the stereo camera, the projector and the user's eyes, with their lenses."""
         camera = scene.camera
-        left = transform_from_pose(camera.world_from_left)
+        left = pose_matrix(camera.world_from_left)
         baseline_m = -float(camera.right_from_left[0, 3])
         self._add_device(
             "/devices/camera",
@@ -284,7 +295,7 @@ class SceneView:
         if scene.projector is not None:
             self._add_device(
                 "/devices/projector",
-                transform_from_pose(scene.projector.world_from_projector),
+                pose_matrix(scene.projector.world_from_projector),
                 ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
                 [(0.0, 0.0, -0.005)],
                 0.02,
@@ -306,9 +317,7 @@ class SceneView:
         """Add name labels above the devices; those of finger and sheet move with them."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
-        centre = apply(
-            transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
-        )
+        centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
         named: dict[str, tuple[str, Any]] = {
             "/names/camera": ("stereo camera", centre + NAME_ABOVE_M),
             "/names/eyes": ("user's eyes", scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M),
@@ -393,37 +402,18 @@ def make_line_segments(points: Floats) -> Floats:
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
     """Make a fingertip mesh: vertices (n, 3), with the tip at the origin, and triangles."""
-    rings, around = 8, 20
-    tilt = np.linspace(0.0, 0.5 * np.pi, rings)
-    radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])
-    heights = np.concatenate([radius_m * (1.0 - np.cos(tilt)), [FINGER_LENGTH_M]])
-    angle = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    vertices = np.concatenate(
-        [
-            np.column_stack([r * circle, np.full(around, h)])
-            for r, h in zip(radii, heights, strict=True)
-        ]
-        + [np.array([[0.0, 0.0, FINGER_LENGTH_M + 0.4 * radius_m]])]
-    )
+    tilt = np.linspace(0.0, 0.5 * np.pi, 8)
+    radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
+    ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]
+    heights = np.concatenate([radius_m * (1.0 - np.cos(tilt)), ends])
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(20)], axis=1)
+    points = (radii[:, None, None] * circle).reshape(-1, 3)
+    points[:, 2] = np.repeat(heights, 20)
     # Tilt the finger about the centre of its tip, because a real finger comes from below.
-    lean = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, np.cos(FINGER_TILT_RAD), -np.sin(FINGER_TILT_RAD)],
-            [0.0, np.sin(FINGER_TILT_RAD), np.cos(FINGER_TILT_RAD)],
-        ]
-    )
     centre = np.array([0.0, 0.0, radius_m])
-    vertices = (vertices - centre) @ lean.T + centre
-    triangles = []
-    for ring in range(rings):
-        for i in range(around):
-            a, b = ring * around + i, ring * around + (i + 1) % around
-            triangles += [(a, b, b + around), (a, b + around, a + around)]
-    last, cap = rings * around, len(vertices) - 1
-    triangles += [(last + i, last + (i + 1) % around, cap) for i in range(around)]
-    return vertices, np.array(triangles, dtype=np.int32)
+    lean = rotation_from_vector([FINGER_TILT_RAD, 0.0, 0.0])
+    return make_hull((points - centre) @ lean.T + centre)
 
 
 def _set_pose(handle: Any, pose: Floats) -> None:

@@ -11,21 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
 from flexsheet.nodes.console.arms import compute_link_poses
 from flexsheet.nodes.console.latest_messages import MessageSource
 from flexsheet.nodes.console.sheet import compute_sheet_points, intersect_sheet
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 
 Floats = NDArray[np.float64]
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
 """Positions of the drawn light rays, as fractions of half the object's width and height."""
-
-
-def transform_from_pose(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +47,8 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         state = source.latest(f"arm_{side}", ArmState)
         if state is not None:
-            links[side] = compute_link_poses(
-                transform_from_pose(arm.world_from_base), state[0].joints_rad
-            )
-            edges[side] = state[0].world_from_flange @ transform_from_pose(arm.flange_from_edge)
+            links[side] = compute_link_poses(pose_matrix(arm.world_from_base), state[0].joints_rad)
+            edges[side] = state[0].world_from_flange @ pose_matrix(arm.flange_from_edge)
     finger = _message(source.latest("fingertip", Fingertip))
     tip = None if finger is None else finger.position_world_m
     sheet = None
@@ -117,7 +111,7 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))
     eye = scene.eyes.centre_world_m
-    projector = transform_from_pose(scene.projector.world_from_projector)[:3, 3]
+    projector = pose_matrix(scene.projector.world_from_projector)[:3, 3]
     hits = intersect_sheet(sheet, eye, points)
     hits = hits[np.isfinite(hits).all(axis=1)]
     to_eye = np.stack([np.broadcast_to(eye, hits.shape), hits], axis=1)

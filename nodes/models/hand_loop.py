@@ -14,7 +14,6 @@ The change of the state over one period is an exact linear map, whose eigenvalue
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -226,9 +225,7 @@ class OffsetBoundsTable:
         return OffsetBounds(*axes, self.max_advances[row], self.max_retreats[row])
 
 
-def compute_offset_bounds(
-    period_s: float, *, advance_limit: float, hands: Sequence[Hand] = LIMITING_HANDS
-) -> OffsetBoundsTable:
+def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
     """Compute the maximum slopes at which every hand is stable with margins of gain and delay.
 
     For an advance, the gain margin divides the critical slope.  For a retreat, it multiplies the
@@ -249,7 +246,7 @@ def compute_offset_bounds(
                 max_slope=GAIN_MARGIN * advance_limit,
             )
             / GAIN_MARGIN
-            for hand in hands
+            for hand in LIMITING_HANDS
         )
         retreats[at] = min(
             compute_critical_slope(
@@ -259,7 +256,7 @@ def compute_offset_bounds(
                 towards_finger=False,
                 max_slope=1.0,
             )
-            for hand in hands
+            for hand in LIMITING_HANDS
         )
     return OffsetBoundsTable(
         np.array(DELAYS_S),

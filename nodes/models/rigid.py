@@ -7,6 +7,7 @@ Twists are 6-vectors, linear part first (m/s), then angular (rad/s), both in the
 from __future__ import annotations
 
 from math import atan2, cos, hypot, inf, isfinite, nan, sin, sqrt
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,6 +117,21 @@ def transform(rotation: Floats, position: ArrayLike) -> Floats:
 def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
     """Return the transform of a position (m) and roll, pitch, yaw (rad), as in scene files."""
     return transform(rotation_from_rpy(rpy_rad), position_m)
+
+
+class Pose(Protocol):
+    """Interface of the poses in scenes: position (m) and roll, pitch, yaw (rad)."""
+
+    @property
+    def position_m(self) -> ArrayLike: ...
+
+    @property
+    def rpy_rad(self) -> ArrayLike: ...
+
+
+def pose_matrix(pose: Pose) -> Floats:
+    """Return a pose as a homogeneous matrix (4, 4)."""
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def inverse(a_from_b: Floats) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,9 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import Specification, cached, load_cached
 from flexsheet.nodes.methods import Progress
 from flexsheet.nodes.models.sheet.force_models import (
-    LinearSheetModel,
     ScaledSheetModel,
     SheetForceModel,
 )
-from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
@@ -31,11 +28,6 @@ FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
 """Positions x and y in the table, as fractions of the sheet's width and height."""
-
-FORCE_MODELS: dict[str, Callable[[Rubber], SheetForceModel]] = {
-    "linear": LinearSheetModel,
-    "scaled": ScaledSheetModel,
-}
 
 
 def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
@@ -91,7 +83,7 @@ def load_force_model(
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":
-        return FORCE_MODELS[method](rubber), method
+        return ScaledSheetModel(rubber), method
     table = load_cached(make_table_cache(scene), cache_dir)
     if table is None:
         note = "scaled; the table of the sheet's force is not computed: run flexsheet precompute"

@@ -13,7 +13,6 @@ from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
 from flexsheet.nodes.methods import Family, Trial, clip_range
 from flexsheet.nodes.models.sheet.force_models import (
-    LinearSheetModel,
     MembraneSheetModel,
     ScaledSheetModel,
     SheetForce,
@@ -73,7 +72,6 @@ def compute_membrane_table(
     xs_m: Floats,
     ys_m: Floats,
     finger_radius_m: float,
-    depths_m: Floats = TABLE_DEPTHS_M,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
     """Compute the table by finite elements of the membrane: one push per stretch and position."""
@@ -91,7 +89,7 @@ def compute_membrane_table(
         ScaledSheetModel(rubber),
         measure,
         stretches=stretches,
-        depths_m=depths_m,
+        depths_m=TABLE_DEPTHS_M,
         xs_m=xs_m,
         ys_m=ys_m,
         finger_radius_m=finger_radius_m,
@@ -123,7 +121,7 @@ def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) 
         name="sheet-force",
         unit="%",
         reference="the twin's membrane",
-        methods=("linear", "scaled", "table", "membrane"),
+        methods=("scaled", "table", "membrane"),
         trials=partial(_trials, reference, make_table),
         tolerance=lambda scene: 100.0 * scene.tolerances.force_ratio,
     )
@@ -135,7 +133,7 @@ def _trials(
     sheet, radius = scene.sheet, scene.finger.radius_m
     rubber = make_rubber(sheet)
     middle = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio)
-    models: list[SheetForceModel] = [LinearSheetModel(rubber), ScaledSheetModel(rubber)]
+    models: list[SheetForceModel] = [ScaledSheetModel(rubber)]
     if make_table is not None:
         models += [make_table(scene), MembraneSheetModel(rubber)]
     stretches = (1.0, middle, sheet.max_stretch_ratio)

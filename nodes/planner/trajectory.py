@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Phase, SheetReason, SheetTrajectory
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, measure_length
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
@@ -94,7 +94,7 @@ class SheetTrajectoryPlanner:
         Raises UnpresentableError if the surface normal there exceeds the maximum tilt.
         """
         pose, sheet = scene.object.world_from_object, scene.sheet
-        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_object = pose_matrix(pose)
         self._object_from_world = inverse(self._world_from_object)
         self._rotate_twist = np.kron(np.eye(2), self._world_from_object[:3, :3])
         self._settings = settings

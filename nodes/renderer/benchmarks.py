@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Cylinder, Scene, require_cylinder, require_projector
 from flexsheet.messages.types import Correction, Display, Pattern
 from flexsheet.nodes.methods import Case, Family, Trial
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.gl import DrawStyle, Image, headless_context
 from flexsheet.nodes.renderer.object_surface import make_surface
-from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 

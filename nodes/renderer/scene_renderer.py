@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.methods import SheetShapeMethod
-from flexsheet.messages.scene import Mesh, Pose, Scene, require_projector
+from flexsheet.messages.scene import Mesh, Scene, require_projector
 from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
-from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
 from flexsheet.nodes.models.sheet.indentation import IndentationBasis
@@ -67,10 +67,6 @@ NO_SHAPES_NOTE = (
 )
 
 GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)
-
-
-def pose_matrix(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def projector_homography(scene: Scene) -> Floats:

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
 from flexsheet.nodes.models.interpolation import interpolate_path
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
-from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]

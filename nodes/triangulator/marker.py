@@ -304,7 +304,6 @@ class SystematicError:
 
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
-BY_WEIGHTED_CENTROID = SystematicError(still_px=0.03, moving=0.012)
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
 """Systematic errors of the methods.  They were chosen such that errors in simulation, divided by
 their predicted standard deviations, have unit variance (`tests/test_marker.py`)."""
@@ -319,72 +318,26 @@ def moments(
         level = 0.5 * (blob.surround + blob.peak)
         bright = cv2.threshold(image[blob.window], level, 1, cv2.THRESH_BINARY)[1]
         found = cv2.moments(bright, binaryImage=True)
-        markers.append(_marker_from_moments(blob, found, np.zeros((2, 2)), blob_filter, BY_MOMENTS))
-    return markers
-
-
-def weighted_centroid(
-    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
-) -> list[Marker]:
-    """Refine blobs to the centroid of the marker's light.
-
-    A pixel on the edge is weighted by its lit fraction, which removes most of the error that the
-    pixel grid causes.  The weight is continuous at the noise threshold (skirt).  The covariance
-    follows from pixel noise: a pixel changes the centre by its noise, times its distance from the
-    centre, divided by the total light.
-    """
-    markers = []
-    for image, blob in zip(images, blobs, strict=True):
-        cut = image[blob.window]
-        found = _light_moments(cut, blob.surround, blob.peak)
-        skirt = blob.surround + SKIRT_FRACTION * (blob.peak - blob.surround)
-        variance = np.where(
-            cut > skirt, noise.read_levels**2 + cut / noise.photons_per_level, 0.0
-        ) / (found["m00"] ** 2)
-        x = np.arange(cut.shape[1]) - found["m10"] / found["m00"]
-        y = np.arange(cut.shape[0]) - found["m01"] / found["m00"]
-        across = float(y @ variance @ x)
-        covariance = np.array(
-            [
-                [variance.sum(axis=0) @ (x * x), across],
-                [across, variance.sum(axis=1) @ (y * y)],
-            ]
-        )
+        rejection_reason: MarkerRejection | None = None
+        if blob.spread > MAX_SPREAD:
+            rejection_reason = "blurred"
+        if math.hypot(*blob.motion) > blob_filter.max_motion_px:
+            rejection_reason = "merged"
+        rows, columns = blob.window
+        x, y = found["m10"] / found["m00"], found["m01"] / found["m00"]
         markers.append(
-            _marker_from_moments(blob, found, covariance, blob_filter, BY_WEIGHTED_CENTROID)
+            Marker(
+                centre=np.array([columns.start + x, rows.start + y]),
+                covariance=BY_MOMENTS.covariance(blob.motion),
+                radius=blob.radius,
+                radius_deviation=0.1,
+                blur=blob.blur,
+                motion=blob.motion,
+                height=blob.height,
+                rejection_reason=rejection_reason,
+            )
         )
     return markers
-
-
-def _marker_from_moments(
-    blob: Blob,
-    found: dict[str, float],
-    covariance: Floats,
-    blob_filter: BlobFilter,
-    systematic: SystematicError,
-) -> Marker:
-    """Make a marker from the moments of its window; reject it if spread or motion is too large.
-
-    covariance: (2, 2) px^2 of the centre due to pixel noise.
-    """
-    rows, columns = blob.window
-    rejection_reason: MarkerRejection | None = None
-    if blob.spread > MAX_SPREAD:
-        rejection_reason = "blurred"
-    if math.hypot(*blob.motion) > blob_filter.max_motion_px:
-        rejection_reason = "merged"
-    return Marker(
-        centre=np.array(
-            [columns.start + found["m10"] / found["m00"], rows.start + found["m01"] / found["m00"]]
-        ),
-        covariance=covariance + systematic.covariance(blob.motion),
-        radius=blob.radius,
-        radius_deviation=0.1,
-        blur=blob.blur,
-        motion=blob.motion,
-        height=blob.height,
-        rejection_reason=rejection_reason,
-    )
 
 
 def subpixel_fit(
@@ -465,7 +418,6 @@ def _fit_starts(blobs: Sequence[Blob]) -> list[DiscStart]:
 
 MARKER_METHODS: dict[str, Refine] = {
     "moments": moments,
-    "weighted_centroid": weighted_centroid,
     "subpixel_fit": subpixel_fit,
 }
 

@@ -17,7 +17,7 @@ from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
-from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
@@ -132,8 +132,8 @@ class TwinArmsNode(Node):
         arms = {"left": scene.arms.left, "right": scene.arms.right}
         for side, spec in arms.items():
             base, clamp = spec.world_from_base, spec.flange_from_edge
-            self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
-            self._flange_from_edge[side] = transform_from_rpy(clamp.position_m, clamp.rpy_rad)
+            self._world_from_base[side] = pose_matrix(base)
+            self._flange_from_edge[side] = pose_matrix(clamp)
         self._pull = SheetPull.of(scene.sheet, truth)
         if len(self.servers) == len(arms):
             return
@@ -203,8 +203,7 @@ class TwinArmsNode(Node):
         """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
-        clamp = spec.flange_from_edge
-        flange = edge @ inverse(transform_from_rpy(clamp.position_m, clamp.rpy_rad))
+        flange = edge @ inverse(pose_matrix(spec.flange_from_edge))
         joints_rad = solve_inverse_kinematics(
             inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD
         )

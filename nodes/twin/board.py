@@ -71,12 +71,10 @@ class TwinBoard:
     camera: true lenses and poses. seed: determines noise, illumination and poses.
     """
 
-    def __init__(
-        self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None
-    ) -> None:
+    def __init__(self, camera: StereoCamera, board: Board, *, seed: int) -> None:
         self.camera = camera
         self.board = board
-        self.sensor = Sensor() if sensor is None else sensor
+        self.sensor = Sensor()
         self._random = np.random.default_rng(seed)
         self._markers = _markers(board) if board.kind == "charuco" else None
         self._rays = tuple(self._cast(lens) for lens in (camera.left, camera.right))

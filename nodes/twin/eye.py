@@ -24,7 +24,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.rig import slopes_of
@@ -150,7 +150,7 @@ class TrueProjector:
         vertices: (vertices, 3) of the sheet in the world frame. triangles: (triangles, 3) indices.
         """
         pose, lens = projector.world_from_projector, projector.lens
-        self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_projector = pose_matrix(pose)
         self._lens = lens
         self._size = np.array([projector.width_px, projector.height_px])
         # The rays are those of a lens without distortion. A margin contains the pixels that
@@ -256,7 +256,6 @@ def seen(
     *,
     eye: Floats,
     metres_per_px: float = METRES_PER_PX,
-    half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
     """Render the image (rows, columns, 3) that the measuring camera at the eye takes of the sheet.
 
@@ -266,7 +265,7 @@ def seen(
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
-    size = round(2.0 * half_window_m / metres_per_px)
+    size = round(2.0 * HALF_WINDOW_M / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
     # Only the lit part is traced, since nothing else is visible.
     bright = np.argwhere(projected.any(axis=2))[:, ::-1].astype(np.float64)
@@ -318,7 +317,6 @@ def render_expected(
     eye: Floats,
     flat: bool,
     metres_per_px: float = METRES_PER_PX,
-    half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
     """Render the expected image (rows, columns, 3): the virtual object itself, on black.
 
@@ -327,7 +325,7 @@ def render_expected(
     if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
         raise ValueError("the virtual object reaches the eye or beyond; move the object or the eye")
     vertices, triangles = true_object.vertices, true_object.triangles
-    size = round(2.0 * half_window_m / metres_per_px)
+    size = round(2.0 * HALF_WINDOW_M / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
     # Only the object's own part of the image is traced, which allows fine sampling.
     box = _box(vertices, eye, metres_per_px, size)
@@ -564,8 +562,7 @@ def true_sheet(
     """
     arms = scene.arms
     edges = [
-        world_from_flange
-        @ transform_from_rpy(spec.flange_from_edge.position_m, spec.flange_from_edge.rpy_rad)
+        world_from_flange @ pose_matrix(spec.flange_from_edge)
         for world_from_flange, spec in (
             (world_from_flange_left, arms.left),
             (world_from_flange_right, arms.right),

@@ -16,7 +16,6 @@ from collections.abc import Callable
 import numpy as np
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     JITTER_STREAM,
@@ -26,8 +25,6 @@ from flexsheet.nodes.twin.arms import (
     Fault,
     Floats,
     Servo,
-    forward,
-    solve_inverse_kinematics,
 )
 
 Address = tuple[str, int]
@@ -36,9 +33,8 @@ _HEAD = struct.Struct("<HHHxx8f2I5HHI")
 _MONITOR = struct.Struct("<Hxx8f2I")
 _BYTES = 196
 _NONE, _MOVE, _END = 0, 1, 255
-_POSES, _JOINTS, _PULSES = (1, 4, 7), (2, 5, 8), 3
+_JOINTS, _PULSES = (2, 5, 8), 3
 _MORE_AT = (64, 108, 152)
-_RIGHT, _ABOVE, _NONFLIP = 4, 2, 1
 
 FILTER_S = 0.01
 """Time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
@@ -62,7 +58,7 @@ class MxtController:
 
     An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
     Errors are: a move before a packet that only requests the state; an unknown command or data
-    type; values that are not a reachable pose; a first set-point away from the arm; a jump; and no
+    type; joints out of range; a first set-point away from the arm; a jump; and no
     packet for `timeout_s`.
 
     servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
@@ -188,7 +184,7 @@ class MxtController:
             self._stay(sender)
         elif command == _MOVE:
             try:
-                self._move(send_type, np.array(data[:8]), data[8])
+                self._move(send_type, np.array(data[:8]))
             except MxtError as error:
                 self._fail(str(error))
                 return
@@ -214,12 +210,12 @@ class MxtController:
             self.wanted_rad = self._filtered_rad = self.servo.joints_rad.copy()
             self._moved = False
 
-    def _move(self, send_type: int, data: Floats, flags: int) -> None:
+    def _move(self, send_type: int, data: Floats) -> None:
         """Check and store a set-point; raise MxtError if it is invalid, which ends the program."""
         if self._master is None:
             raise MxtError("a move ahead of the first packet")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
-        joints = _set_point(send_type, data, flags, before)
+        joints = _set_point(send_type, data)
         step = np.abs(joints - before)
         if not self._moved and step.max() > FIRST_STEP_RAD:
             raise MxtError("a first set-point away from the arm")
@@ -249,9 +245,6 @@ class MxtController:
         if wanted_type in _JOINTS:
             joints = self._seen(_JOINTS.index(wanted_type))
             return (wanted_type, *joints, 0.0, 0.0, 0, 0)
-        if wanted_type in _POSES:
-            joints = self._seen(_POSES.index(wanted_type))
-            return (wanted_type, *numbers_of(forward(joints)), 0.0, 0.0, structure_flags(joints), 0)
         return (0, *([0.0] * 8), 0, 0)
 
     def _seen(self, what: int) -> Floats:
@@ -260,49 +253,16 @@ class MxtController:
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
 
 
-def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> Floats:
-    """Decode the joints (6,) of a packet; `before_rad` are the previous ones.
-
-    Raises MxtError if the packet contains no reachable set-point.
-    """
-    if send_type not in (_POSES[0], _JOINTS[0]):
+def _set_point(send_type: int, data: Floats) -> Floats:
+    """Decode the joints (6,) of a packet; raise MxtError if it contains no valid set-point."""
+    if send_type != _JOINTS[0]:
         raise MxtError(f"a set-point of type {send_type}")
     if not np.isfinite(data).all():
         raise MxtError("a set-point that is not finite")
     joints = data[:6]
-    if send_type == _POSES[0]:
-        if flags != structure_flags(before_rad):
-            raise MxtError("a pose on another branch")
-        try:
-            joints = solve_inverse_kinematics(pose_from(data), before_rad)
-        except (ValueError, np.linalg.LinAlgError) as error:
-            raise MxtError("a pose out of reach") from error
     if (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
         raise MxtError("joints out of range")
     return joints
-
-
-def pose_from(numbers: Floats) -> Floats:
-    """Return base_from_flange (4, 4) for x, y, z (mm) and angles about fixed x, y, z axes (rad)."""
-    return transform_from_rpy(numbers[:3] * 1e-3, numbers[3:6])
-
-
-def numbers_of(pose: Floats) -> tuple[float, ...]:
-    """Convert a pose (4, 4) to the six numbers of the protocol; the inverse of `pose_from`."""
-    turn = pose[:3, :3]
-    b = math.atan2(-turn[2, 0], math.hypot(turn[0, 0], turn[1, 0]))
-    a, c = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
-    return (*(pose[:3, 3] * 1e3).tolist(), a, b, c)
-
-
-def structure_flags(joints_rad: Floats) -> int:
-    """Return the protocol's flags of the branch of the inverse kinematics to which joints belong.
-
-    It is the sum of 4 (wrist in front of the shoulder), 2 (elbow up) and 1 (J5 not negative).
-    """
-    q2, q3 = float(joints_rad[1]), float(joints_rad[2])
-    ahead = 0.25 * math.sin(q2) - 0.09 * math.cos(q2 + q3) + 0.16 * math.sin(q2 + q3)
-    return (_RIGHT if ahead >= 0 else 0) | _ABOVE | (_NONFLIP if joints_rad[4] >= 0 else 0)
 
 
 class MxtServer:

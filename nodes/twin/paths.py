@@ -19,7 +19,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
-from flexsheet.nodes.models.rigid import apply, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape
 from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 
@@ -72,8 +72,7 @@ class Ground:
 
     def __init__(self, scene: Scene) -> None:
         """Compute the grid; raises FingerPathError if no side of the object faces the user."""
-        pose = scene.object.world_from_object
-        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._shape = make_shape(dict(scene.object.geometry))
         towards_user = self._world_from_object[:3, :3].T[:, 2]
         front = _front(self._shape, towards_user)

@@ -23,7 +23,7 @@ from scipy.special import chndtr
 
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import Side
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     FINGER_LENGTH_M,
@@ -204,9 +204,7 @@ class TwinCamera:
         self._random = np.random.default_rng(seed)
         self._grain = self._random.standard_normal(GRAIN, dtype=np.float32)
         sheet = None if self.clutter.sheet is None else self._grained(self.clutter.sheet)
-        left_from_world = inverse(
-            transform_from_rpy(camera.world_from_left.position_m, camera.world_from_left.rpy_rad)
-        )
+        left_from_world = inverse(pose_matrix(camera.world_from_left))
         right_from_world = camera.right_from_left @ left_from_world
         self.eyes = (
             self._eye("left", camera.left, left_from_world, sheet),

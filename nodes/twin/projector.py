@@ -16,6 +16,7 @@ from flexsheet.messages.scene import Lens, Pose, Projector, Scene, StereoCamera
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_vector,
     transform,
     transform_from_rpy,
@@ -128,8 +129,7 @@ class LitSheet:
         self, patterns: Sequence[Image], world_from_sheet: Floats
     ) -> tuple[list[Image], list[Image]]:
         """Render the left and right images of patterns projected on the sheet at a pose (4, 4)."""
-        pose = self._camera.world_from_left
-        world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        world_from_left = pose_matrix(self._camera.world_from_left)
         views = (world_from_left, world_from_left @ inverse(self._camera.right_from_left))
         left, right = (
             self._pictures(patterns, rays, world_from_eye, world_from_sheet)
@@ -186,8 +186,7 @@ def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats,
 
 def pixels_lighting(projector: Projector, points: Floats) -> Floats:
     """Return the projector pixels (..., 2) that light world points (..., 3) in front of it."""
-    pose = projector.world_from_projector
-    from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
+    from_world = inverse(pose_matrix(projector.world_from_projector))
     local = points @ from_world[:3, :3].T + from_world[:3, 3]
     return pixels_of(projector.lens, local[..., :2] / local[..., 2:])
 
@@ -203,8 +202,7 @@ def errors_at_eye(
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)
-    pose = true.world_from_projector
-    world_from_true = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    world_from_true = pose_matrix(true.world_from_projector)
     errors = []
     for plane in planes:
         meant = apply(plane, flat)

@@ -49,10 +49,6 @@ class Distribution(Protocol):
         """Return the value whose cumulative probability is that of a normal deviate of `sigmas`."""
         ...
 
-    def text(self, scale: float) -> str:
-        """Format the distribution for a table, with its numbers multiplied by `scale`."""
-        ...
-
 
 @dataclass(frozen=True, slots=True)
 class Normal:
@@ -70,9 +66,6 @@ class Normal:
         limited = min(max(sigmas, -MAX_DEVIATION_SIGMAS), MAX_DEVIATION_SIGMAS)
         return min(max(self.mean + self.sigma * limited, self.low), self.high)
 
-    def text(self, scale: float) -> str:
-        return f"N({self.mean * scale:.4g}, {self.sigma * scale:.4g})"
-
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
@@ -88,9 +81,6 @@ class LogNormal:
         limited = min(max(sigmas, -MAX_DEVIATION_SIGMAS), MAX_DEVIATION_SIGMAS)
         return self.median * math.exp(self.sigma_ln * limited)
 
-    def text(self, scale: float) -> str:
-        return f"lognormal, median {self.median * scale:.4g}, σ(ln) {self.sigma_ln:.4g}"
-
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
@@ -103,9 +93,6 @@ class HalfNormal:
 
     def at(self, sigmas: float) -> float:
         return self.sigma * min(max(sigmas, 0.0), MAX_DEVIATION_SIGMAS)
-
-    def text(self, scale: float) -> str:
-        return f"|N(0, {self.sigma * scale:.4g})|"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +109,6 @@ class Uniform:
         share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
         return self.low + (self.high - self.low) * share
 
-    def text(self, scale: float) -> str:
-        return f"U({self.low * scale:.4g}, {self.high * scale:.4g})"
-
 
 @dataclass(frozen=True, slots=True)
 class LogUniform:
@@ -140,9 +124,6 @@ class LogUniform:
         share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
         return float(self.low * (self.high / self.low) ** share)
 
-    def text(self, scale: float) -> str:
-        return f"log-U({self.low * scale:.4g}, {self.high * scale:.4g})"
-
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
@@ -157,9 +138,6 @@ class OneOf:
         share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
         return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
 
-    def text(self, scale: float) -> str:
-        return " or ".join(f"{value * scale:.4g}" for value in self.values)
-
 
 @dataclass(frozen=True, slots=True)
 class Always:
@@ -172,9 +150,6 @@ class Always:
 
     def at(self, sigmas: float) -> float | str:
         return self.value
-
-    def text(self, scale: float) -> str:
-        return self.value if isinstance(self.value, str) else f"{self.value * scale:.4g}"
 
 
 @dataclass(frozen=True, slots=True)

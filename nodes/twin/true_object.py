@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Ellipsoid, Geometry, Mesh, Plane, Scene, Sphere
-from flexsheet.nodes.models.rigid import apply, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
@@ -53,7 +53,7 @@ class TrueBody:
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
-        world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        world_from_object = pose_matrix(pose)
         shape = make_shape(dict(geometry))
         match geometry:
             case Cylinder(radius_m=radius, length_m=length):

@@ -31,7 +31,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Shape, make_shape
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -299,5 +299,4 @@ def read_followed(bag: Path) -> list[dict[str, Any]]:
 
 
 def _edge(arm: ArmSpec) -> Floats:
-    pose = arm.flange_from_edge
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+    return pose_matrix(arm.flange_from_edge)

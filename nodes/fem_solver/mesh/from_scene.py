@@ -150,8 +150,7 @@ def world_from_mesh(scene: Scene) -> Floats:
 
 
 def _world_from_object(scene: Scene) -> Floats:
-    pose = scene.object.world_from_object
-    return rigid.transform_from_rpy(pose.position_m, pose.rpy_rad)
+    return rigid.pose_matrix(scene.object.world_from_object)
 
 
 def _cylinder_rotation_rad(scene: Scene) -> float:

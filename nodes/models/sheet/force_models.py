@@ -4,14 +4,13 @@ Inputs of a model are the stretch ratio, depths of a fingertip below the flat sh
 the stretched sheet (x, y from its centre, m) and the fingertip's radius. Outputs are the normal
 force, its derivative with respect to the depth, and the force on each clamp.
 
-By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
-`nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.
+By increasing cost: `ScaledSheetModel`, `nodes.models.sheet.tabulated.TabulatedSheetModel`,
+`MembraneSheetModel`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
-from flexsheet.nodes.models.sheet.tension import PUSH_FACTOR, edge_force_n, strain_measure
+from flexsheet.nodes.models.sheet.tension import edge_force_n, strain_measure
 
 Floats = NDArray[np.float64]
 SheetPosition = tuple[float, float]
@@ -113,55 +112,6 @@ MAX_RELATIVE_X = 0.98
 """Upper limit of the relative x in closed-form models, whose force is infinite at the clamp."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinearSheetModel:
-    """Model of a force proportional to tension and depth: F = 0.95 T0/W d / (1 - x^2).
-
-    T0 is the force on each clamp, W the slack width, d the depth and x the relative x. The factor
-    is valid for a disc of 10 mm. The contact area of a fingertip grows with the depth, so the true
-    curve is flatter at small depths and steeper at large ones.
-    """
-
-    rubber: Rubber
-    name: str = "linear"
-
-    def evaluate(
-        self,
-        stretch_ratio: float,
-        depths_m: Floats,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> SheetForce:
-        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
-        edge = flat_edge_force_n(self.rubber, stretch_ratio)
-        x, _ = relative_position(self.rubber, stretch_ratio, position_m)
-        slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, MAX_RELATIVE_X) ** 2)
-        return SheetForce(slope * depths, np.full(depths.shape, slope), np.full(depths.shape, edge))
-
-    def invalid_reason(
-        self,
-        stretch_ratio: float,
-        depth_m: float,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> str:
-        scaled = scaled_depth(self.rubber, stretch_ratio, depth_m)
-        if stretch_ratio < 1.01:
-            return "a slack sheet is nonlinear"
-        if not LINEAR_FROM <= scaled <= LINEAR_TO:
-            return "the linear model is accurate at medium depths only"
-        x, y = relative_position(self.rubber, stretch_ratio, position_m)
-        if max(x, y) > 0.34:
-            return "the position is too close to an edge"
-        if stretch_ratio > MAX_STRETCH_RATIO:
-            return f"stretch {stretch_ratio:.3f} is more than {MAX_STRETCH_RATIO:g}"
-        return _invalid_sizes(self.rubber, finger_radius_m)
-
-
-LINEAR_FROM, LINEAR_TO = 0.15, 0.33
-"""Range of scaled depths in which the linear model differs by at most 25 % from the membrane."""
 MAX_STRETCH_RATIO = 1.13
 """Maximum stretch ratio at which the closed-form models are valid."""
 
@@ -177,12 +127,6 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 CUBIC_FACTOR = 2.43
 """Factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm; E is
 Young's modulus, t the thickness, W the width and d the depth."""
-
-
-def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
-    """Return depth / width / sqrt(strain), on which the shape of the force curve depends."""
-    strain = strain_measure(stretch_ratio, rubber.mooney_ratio)
-    return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
 
 # Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1

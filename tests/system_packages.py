@@ -1,6 +1,6 @@
 """Check for the required system packages, and install missing ones if possible.
 
-`python -m flexsheet.launch.health.system` checks what the nodes need; `--tests` adds what the tests
+`python -m tests.system_packages` checks what the nodes need; `--tests` adds what the tests
 need.  Missing packages are installed if the process runs as root on Debian or a derivative.
 Otherwise the command that installs them is printed.
 """
@@ -15,6 +15,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from flexsheet.launch.health.opengl import OPENGL_PACKAGES, find_opengl_problem
 
 SYSTEM_PATHS = ("/usr/sbin", "/sbin")
 """Folders that contain `ip` and may be missing in a user's PATH."""
@@ -34,27 +36,6 @@ class SystemPackages:
     problem: Callable[[], str | None]
     tests_only: bool = True
 
-    @property
-    def manual(self) -> str:
-        """Return the command that installs the packages."""
-        return f"sudo apt-get install -y {' '.join(self.packages)}"
-
-
-def find_opengl_problem() -> str | None:
-    """Return why no headless OpenGL context can be created; None if one can.
-
-    This is tried in another process, because a driver that has failed once fails again in the same
-    process.
-    """
-    code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    if result.returncode == 0:
-        return None
-    lines = result.stderr.strip().splitlines()
-    return lines[-1] if lines else f"exit code {result.returncode}"
-
 
 def find_missing_files(
     *, programs: Sequence[str] = (), libraries: Sequence[str] = ()
@@ -70,9 +51,7 @@ def find_missing_files(
     return f"no {', no '.join(missing)}" if missing else None
 
 
-OPENGL = SystemPackages(
-    "headless OpenGL", ("libegl1", "libgl1-mesa-dri"), find_opengl_problem, tests_only=False
-)
+OPENGL = SystemPackages("headless OpenGL", OPENGL_PACKAGES, find_opengl_problem, tests_only=False)
 
 TABLE = (
     OPENGL,

@@ -1,0 +1,30 @@
+"""Check whether OpenGL works without a display.
+
+This module imports only the standard library, because the set-up of a computer uses it first.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+OPENGL_PACKAGES = ("libegl1", "libgl1-mesa-dri")
+"""Debian packages that provide headless OpenGL."""
+
+OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}"
+
+
+def find_opengl_problem() -> str | None:
+    """Return why no headless OpenGL context can be created; None if one can.
+
+    This is tried in another process, because a driver that has failed once fails again in the same
+    process.
+    """
+    code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    if result.returncode == 0:
+        return None
+    lines = result.stderr.strip().splitlines()
+    return lines[-1] if lines else f"exit code {result.returncode}"
