@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,7 +60,12 @@ def _parse(path: Path) -> Any:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
         raise YAMLError(f"the file has more than {MAX_CALIBRATION_BYTES} bytes")
-    text = data.decode()
+    return _parse_text(data.decode())
+
+
+@lru_cache(maxsize=8)
+def _parse_text(text: str) -> Any:
+    """Parse YAML text.  The values are shared by all calls: they must not be changed."""
     depth = 0
     for event in YAML(typ="safe").parse(text):
         # A few aliases could expand to any number of values.

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import structlog
 from hypothesis import settings
 
 from tests.shared import FOLDER_VARIABLE
@@ -24,6 +25,17 @@ settings.register_profile("fixed", deadline=None, derandomize=True, database=Non
 settings.register_profile("random", deadline=None, print_blob=True)
 settings.register_profile("long", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("fixed")
+
+# By default structlog prints the variables of each frame of an error's traceback, with all numbers
+# of their arrays: seconds of processor time for each error.  Processes of nodes print no variables.
+structlog.configure(
+    processors=[
+        *structlog.get_config()["processors"][:-1],
+        structlog.dev.ConsoleRenderer(
+            colors=False, exception_formatter=structlog.dev.plain_traceback
+        ),
+    ]
+)
 
 LONGEST = (
     "test_three_hosts",

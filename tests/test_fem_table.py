@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import itertools
 import os
+import pickle
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -59,6 +63,18 @@ def coarse() -> Iterator[None]:
         yield
 
 
+class CachingExecutor(InlineExecutor):
+    """Executor that computes equal tasks once, since several tests make the same table."""
+
+    results: ClassVar[dict[bytes, Future[Any]]] = {}
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        key = sha256(pickle.dumps((fn, args, kwargs))).digest()
+        if key not in self.results:
+            self.results[key] = super().submit(fn, *args, **kwargs)
+        return self.results[key]
+
+
 @pytest.fixture(scope="module")
 def model() -> SoftBodyModel:
     return compute(SPEC.body, lambda done, total, need: None)
@@ -67,7 +83,7 @@ def model() -> SoftBodyModel:
 @pytest.fixture(scope="module")
 def table(model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory) -> Table:
     folder = tmp_path_factory.mktemp("table")
-    made = compute_table(SPEC, model, folder, InlineExecutor(), lambda done, total, need: None)
+    made = compute_table(SPEC, model, folder, CachingExecutor(), lambda done, total, need: None)
     assert [path.name for path in folder.iterdir()] == [make_table_cache(SPEC).path(folder).name]
     return made
 
@@ -100,9 +116,10 @@ def largest_move(a: Response, b: Response) -> float:
 
 
 def test_away_from_the_finger_it_is_what_newton_finds(
-    body: TableSoftBody, model: SoftBodyModel
+    body: TableSoftBody, model: SoftBodyModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The test position is not a sample of the table."""
+    monkeypatch.setattr(snapshots, "DEPTHS_M", DEPTHS[:2])
     there = push(0.005, 0.2, 0.003)
     mesh = build_mesh(SPEC.body.mesh)
     sample = SamplePoint(there.surface, there.normal)
@@ -266,12 +283,12 @@ def test_an_interrupted_table_resumes(model: SoftBodyModel, table: Table, tmp_pa
             raise Interrupted
 
     with pytest.raises(Interrupted):
-        compute_table(SPEC, model, tmp_path, InlineExecutor(), stop)
+        compute_table(SPEC, model, tmp_path, CachingExecutor(), stop)
     assert load_cached(make_table_cache(SPEC), tmp_path) is None
     kept = len(list(make_table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
     assert kept >= 2
     seen: list[int] = []
-    compute_table(SPEC, model, tmp_path, InlineExecutor(), lambda done, *_: seen.append(done))
+    compute_table(SPEC, model, tmp_path, CachingExecutor(), lambda done, *_: seen.append(done))
     assert seen[1] == precompute_table.SNAPSHOT_STEPS * kept
     again = load_cached(make_table_cache(SPEC), tmp_path)
     assert again is not None
@@ -289,7 +306,10 @@ def test_too_little_memory_is_reported_before_allocation(
         compute_table(SPEC, model, tmp_path, InlineExecutor(), lambda *_: None)
 
 
-def test_pushes_are_solved_in_other_processes(tmp_path: Path) -> None:
+def test_pushes_are_solved_in_other_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(snapshots, "DEPTHS_M", DEPTHS[:1])
     mesh = build_mesh(SPEC.body.mesh)
     sample = snapshots.choose_sample_points(
         SPEC.body.mesh, mesh, snapshots.find_mirror_planes(mesh), FINGER
@@ -302,7 +322,7 @@ def test_pushes_are_solved_in_other_processes(tmp_path: Path) -> None:
         (there,) = solve_all([job], executor, parts, lambda count: None)
     here = solve_snapshot(job)
     assert np.array_equal(there.moved, here.moved)
-    assert there.reached == here.reached == len(DEPTHS)
+    assert there.reached == here.reached == 1
 
 
 def test_a_push_that_is_asked_to_stop_does() -> None:

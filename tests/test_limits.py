@@ -63,11 +63,11 @@ PARAMETERS: dict[str, type[NodeParameters]] = {
 PARAMETER_NUMBERS = [
     (name, field)
     for name, model in PARAMETERS.items()
-    for field, one in model.model_fields.items()
-    if {int, float} & {one.annotation, *get_args(one.annotation)}
-    or any("number" in str(part) or "integer" in str(part) for part in [
-        model.model_json_schema()["properties"][field].get("anyOf", [])])
-]  # fmt: skip
+    for field, schema in model.model_json_schema()["properties"].items()
+    if {int, float}
+    & {model.model_fields[field].annotation, *get_args(model.model_fields[field].annotation)}
+    or any(word in str(schema.get("anyOf", [])) for word in ("number", "integer"))
+]
 
 ABSURD = st.one_of(
     st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 1e308, 2e16, -2e19, 2**64]),

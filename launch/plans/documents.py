@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
@@ -214,8 +215,12 @@ def parse_value(text: str) -> Any:
     return plain(_parse_tree(text))
 
 
+@lru_cache(maxsize=32)
 def _parse_tree(text: str) -> Any:
-    """Parse text into a YAML tree that includes comments.  All errors are raised as YAMLError."""
+    """Parse text into a YAML tree that includes comments.  All errors are raised as YAMLError.
+
+    The tree is shared by all calls with the same text: it must not be changed.
+    """
     try:
         _check_size(text)
         return YAML(typ="rt", pure=True).load(text)
