@@ -23,7 +23,6 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, get_codec
 
-
 _SCALARS = frozenset((bool, int, float, str, type(None)))
 
 
