@@ -12,7 +12,8 @@ SKIPPED := $(CURDIR)/build/skipped.txt
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits pages charts \
+.PHONY: setup demo try test test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
+	pages charts \
 	docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
@@ -144,6 +145,22 @@ pages: setup
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup
 	$(BIN)/flexsheet chart --output docs/charts
+
+# Tunes all shipped scenes, best on an idle machine; hours.  Scenes and strokes that are finished in
+# runs/tune are not repeated, so an interrupted command continues.
+tune-scenes: setup
+	@mkdir -p runs/tune; status=0; \
+	for scene in launch/scenes/*.yaml; do \
+		folder=runs/tune/$$(basename $$scene .yaml); \
+		[ ! -f $$folder.json ] || continue; \
+		OPENBLAS_NUM_THREADS=1 $(BIN)/flexsheet tune $$scene --runs-folder $$folder --json \
+			> $$folder.part; code=$$?; \
+		case $$code in 0|3) mv $$folder.part $$folder.json ;; *) status=1 ;; esac; \
+	done; exit $$status
+
+# Errors, latency and safety against load; an interrupted command continues (network: root).
+load: setup $(DEV_STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.load --output runs/load
 
 # The site, with the generated reference tables and charts: open site/index.html.  Its generator is no part of the program, so it has an environment
 # of its own.

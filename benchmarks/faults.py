@@ -45,6 +45,9 @@ class Span:
 Work = Callable[[Span], Awaitable[Any]]
 
 SIDES = ("left", "right")
+RECORDERS = ("record_left", "record_right")
+"""Nodes that are never killed, because the evaluation reads the arms' records."""
+
 MAX_LENGTH_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
@@ -176,9 +179,9 @@ async def matrix(lab: Lab, only: str) -> list[Result]:
         await case(f"cable of {host} cut for 2 s", partial(cable, 2.0, (host,), cut=True))
     await case("cable of left cut for 12 s", partial(cable, 12.0, ("left",), cut=True))
     for host in HOSTS:
-        for node in lab.plan().nodes_on(host):
-            if node.name not in ("record_left", "record_right"):
-                await case(f"{node.name} killed", partial(kill, lab, host, node.name))
+        for process in lab.plan().processes_on(host, without=RECORDERS):
+            names = [node.name for node in process.nodes]
+            await case(f"{' and '.join(names)} killed", partial(kill, lab, host, names[0]))
     for host in HOSTS:
         await case(f"the launcher of {host} killed", partial(kill_launcher, lab, host))
     return results

@@ -26,12 +26,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import psutil
 from rich.console import Console
 from rich.table import Table
 from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.experiments.system_run import read_cpu_s
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.supervisor import RunningGraph
@@ -115,11 +115,6 @@ def launch_file(folder: Path, case: Case) -> Path:
     return path
 
 
-def cpu_s(pids: dict[str, int]) -> dict[str, float]:
-    times = {name: psutil.Process(pid).cpu_times() for name, pid in pids.items()}
-    return {name: time.user + time.system for name, time in times.items()}
-
-
 async def measure(case: str, seconds: float) -> dict[str, Any]:
     """Return the CPU time over wall time, per process and in total without the simulators."""
     with tempfile.TemporaryDirectory() as folder:
@@ -129,10 +124,10 @@ async def measure(case: str, seconds: float) -> dict[str, Any]:
             await asyncio.sleep(SETTLING_S)
             pids = {**graph.pids, LAUNCHER: os.getpid()}
             loop = asyncio.get_running_loop()
-            begun_s, before = loop.time(), cpu_s(pids)
+            begun_s, before = loop.time(), read_cpu_s(pids)
             await asyncio.sleep(seconds)
-            wall_s, after = loop.time() - begun_s, cpu_s(pids)
-    percent = {name: 100.0 * (after[name] - before[name]) / wall_s for name in pids}
+            wall_s, after = loop.time() - begun_s, read_cpu_s(pids)
+    percent = {name: 100.0 * (after[name] - before[name]) / wall_s for name in after}
     return {
         "case": case,
         "percent": percent,

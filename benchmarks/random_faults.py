@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.faults import MAX_LENGTH_M, Result, Span, kill, kill_launcher, run_fault
+from benchmarks.faults import MAX_LENGTH_M, RECORDERS, Result, Span, kill, kill_launcher, run_fault
 from flexsheet.launch.running.runs import MAX_FINISHED_RUNS, RUN_VARIABLE
 from flexsheet.launch.running.tools import READER_RECONNECT_S
 from flexsheet.messages.bag import FLUSH_PERIOD_S
@@ -91,7 +91,7 @@ class Fault:
 def draw_fault(
     rng: random.Random, nodes: dict[str, list[str]], kinds: Sequence[FaultKind] = tuple(FaultKind)
 ) -> Fault:
-    """Draw a fault; nodes: names by host."""
+    """Draw a fault; nodes: name of one node per process, by host."""
     kind = rng.choice(kinds)
     host = "main" if kind is FaultKind.DISK_FULL else rng.choice(HOSTS)
     of_a_node = kind in (FaultKind.NODE_KILLED, FaultKind.NODE_SUSPENDED)
@@ -287,10 +287,8 @@ async def run_random(given: argparse.Namespace) -> int:
     counts: dict[str, int] = defaultdict(int)
     async with Lab(without=LIGHT) as lab:
         watch = ProcessMonitor(lab)
-        # The evaluation reads the arms' records.
-        spared = {f"record_{side}" for side in ("left", "right")}
         nodes = {
-            host: [one.name for one in lab.plan().nodes_on(host) if one.name not in spared]
+            host: [one.nodes[0].name for one in lab.plan().processes_on(host, without=RECORDERS)]
             for host in HOSTS
         }
         await lab.start_all()

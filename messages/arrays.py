@@ -75,7 +75,7 @@ class ArraySpec:
             if (
                 type(value) is array_type
                 and value.dtype is expected
-                and has_shape(value.shape, shape)
+                and (value.shape == shape or has_shape(value.shape, shape))
                 and value.flags.c_contiguous
                 and (not check_finite or all_finite(value))
             ):

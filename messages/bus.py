@@ -226,13 +226,18 @@ class Publisher:
         """
         if self._channel is not None:
             self._channel.send(self.topic, message, header)
-            if not (self._latched or self._find_remote_readers()):
+            # Without remote readers the socket is not used, so its descriptor's event is not lost.
+            if not (self._latched or self._has_remote_readers):
                 return
         frames = encode(message, header, max_bytes=self.topic.max_bytes)
         self._send(frames)
         if self._latched:
             self._last = frames
             self._serve_late_subscribers()
+        elif self._channel is not None:
+            events: Any = self._socket.getsockopt(EVENTS)
+            if events & POLLIN:
+                self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
         # If a subscriber's queue is full, ZeroMQ drops the message for it; it counts a gap.
@@ -243,13 +248,6 @@ class Publisher:
             for frame in frames[:-1]:
                 send(frame, NOBLOCK_MORE, copy=False)
             send(frames[-1], NOBLOCK, copy=False)
-
-    def _find_remote_readers(self) -> bool:
-        """Return whether another process has subscribed."""
-        events: Any = self._socket.getsockopt(EVENTS)
-        if events & POLLIN:
-            self._serve_late_subscribers()
-        return self._has_remote_readers
 
     def _serve_late_subscribers(self) -> None:
         """Read a batch of subscriptions; resend the last message if one of them is new.

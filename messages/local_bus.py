@@ -23,54 +23,58 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, get_codec
 
+_SCALARS = frozenset((bool, int, float, str, type(None)))
+
 
 class LocalEnvelope(Envelope):
-    """Message for the readers in the sender's process; it is copied and validated at most once."""
+    """Message for the readers in the sender's process; it is copied and validated at most once.
 
-    __slots__ = ("_error", "_message")
+    array_bytes: size of the message's arrays.
+    """
+
+    __slots__ = ("_error", "_message", "array_bytes")
 
     def __init__(self, codec: Codec, header: Header, original: Message) -> None:
-        super().__init__(codec, header, {})
+        self.codec, self.header = codec, header
         self._message: Message | None = None
         self._error: WireError | None = None
-        self.fields = {name: _share(value) for name, value in original.__dict__.items()}
+        self.array_bytes = 0
+        self.fields = self._share_fields(original.__dict__)
 
     def open(self) -> Message:
         """Return the validated message, the same object for every reader; raises WireError."""
+        if self._message is not None:
+            return self._message
         if self._error is not None:
             raise self._error
-        if self._message is None:
-            try:
-                self._message = super().open()
-            except WireError as error:
-                self._error = error
-                raise
+        try:
+            self._message = super().open()
+        except WireError as error:
+            self._error = error
+            raise
         return self._message
 
+    def _share_fields(self, fields: dict[Any, Any]) -> dict[Any, Any]:
+        shared = fields.copy()
+        for name, value in fields.items():
+            if type(value) not in _SCALARS:
+                shared[name] = self._share(value)
+        return shared
 
-def _share(value: Any) -> Any:
-    """Return a field's value with read-only arrays, and with message parts as dictionaries."""
-    if isinstance(value, np.ndarray):
-        array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
-        array.flags.writeable = False
-        return array
-    if isinstance(value, BaseModel):
-        return {name: _share(part) for name, part in value.__dict__.items()}
-    if isinstance(value, tuple | list):
-        return tuple(map(_share, value))
-    if isinstance(value, dict):
-        return {key: _share(part) for key, part in value.items()}
-    return value
-
-
-def _count_array_bytes(value: Any) -> int:
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    if isinstance(value, dict):
-        return sum(map(_count_array_bytes, value.values()))
-    if isinstance(value, tuple):
-        return sum(map(_count_array_bytes, value))
-    return 0
+    def _share(self, value: Any) -> Any:
+        """Return a value with read-only arrays, and with message parts as dictionaries."""
+        if isinstance(value, np.ndarray):
+            self.array_bytes += value.nbytes
+            array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
+            array.setflags(write=False)
+            return array
+        if isinstance(value, BaseModel):
+            return self._share_fields(value.__dict__)
+        if isinstance(value, tuple | list):
+            return tuple(map(self._share, value))
+        if isinstance(value, dict):
+            return self._share_fields(value)
+        return value
 
 
 class LocalReceiver(Protocol):
@@ -99,12 +103,11 @@ class LocalChannel:
         if not (self._readers or latched):
             return
         envelope = LocalEnvelope(get_codec(type(message)), header, message)
-        size = _count_array_bytes(envelope.fields)
-        if size > topic.max_bytes:
+        if envelope.array_bytes > topic.max_bytes:
             raise WireError(
                 "size",
-                f"{envelope.codec.name}: the arrays have {size} bytes, at most {topic.max_bytes} "
-                "are allowed",
+                f"{envelope.codec.name}: the arrays have {envelope.array_bytes} bytes, "
+                f"at most {topic.max_bytes} are allowed",
             )
         if latched:
             self._last = envelope
@@ -187,10 +190,16 @@ class LocalConnection:
     def _read(self) -> None:
         """Deliver the messages that were queued when the callback began."""
         self._scheduled = False
+        waiting, accept = self._waiting, self._receiver.accept_header
+        if len(waiting) == 1:
+            envelope = waiting.popleft()
+            if accept(envelope.header, self._writers):
+                self._receiver.deliver(envelope)
+            return
         accepted: list[LocalEnvelope] = []
-        while self._waiting:
-            envelope = self._waiting.popleft()
-            if not self._receiver.accept_header(envelope.header, self._writers):
+        while waiting:
+            envelope = waiting.popleft()
+            if not accept(envelope.header, self._writers):
                 continue
             if self._latest_only:
                 writer = envelope.header.writer

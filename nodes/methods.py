@@ -13,11 +13,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
 """Time after which a trial is not repeated further, and minimum number of repetitions."""
+
+NORMAL_95 = 1.96
+"""Half-width of the 95 % confidence interval of a normal distribution, in standard deviations."""
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
@@ -25,10 +29,43 @@ Case = dict[str, float | int | str]
 
 
 @dataclass(frozen=True, slots=True)
+class Interval:
+    """Estimated value with the limits of its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def as_dict(self) -> dict[str, float]:
+        return {"value": self.value, "low": self.low, "high": self.high}
+
+
+def estimate_rms(errors: NDArray[np.float64]) -> Interval:
+    """Estimate the root mean square of independent errors (n,) from the spread of their squares."""
+    squares = np.square(errors)
+    mean = float(squares.mean())
+    spread = NORMAL_95 * float(squares.std()) / np.sqrt(len(squares))
+    low, high = np.sqrt([max(0.0, mean - spread), mean + spread])
+    return Interval(float(np.sqrt(mean)), float(low), float(high))
+
+
+def estimate_median(values: Sequence[float]) -> Interval:
+    """Estimate the median of values by order statistics; of fewer than six values, by their range.
+
+    Source: Conover, Practical Nonparametric Statistics, 1999, section 3.2.
+    """
+    ordered, half = np.sort(values), 0.5 * len(values)
+    margin = 0.5 * NORMAL_95 * np.sqrt(len(values))
+    low, high = max(0, int(half - margin)), min(len(values) - 1, int(np.ceil(half + margin)))
+    return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[high]))
+
+
+@dataclass(frozen=True, slots=True)
 class Trial:
     """Measurement of one method at one case: `run` is timed, `error` evaluates its result.
 
-    error: function from the result of `run` to the error in the family's unit.
+    error: function from the result of `run` to the error in the family's unit, with an interval if
+    the error is estimated from random samples.
     in_range: whether the method's valid range includes the case.
     in_scene: whether the scene's working range includes the case.
     size: size of the solved problem ({"skin_nodes": 1210}), reported with the case.
@@ -39,7 +76,7 @@ class Trial:
     method: str
     case: Case
     run: Callable[[], Any]
-    error: Callable[[Any], float]
+    error: Callable[[Any], float | Interval]
     in_range: bool
     in_scene: bool = True
     size: Case = field(default_factory=dict)
@@ -76,7 +113,8 @@ class Family:
 class Point:
     """Measured time and error of one method at one case; see `Trial`.
 
-    params: the case and the size of the solved problem.
+    params: the case and the size of the solved problem. median_range_s, error_range: limits of the
+    95 % confidence intervals; None: the value is exact, or its spread was not measured.
     """
 
     method: str
@@ -89,6 +127,15 @@ class Point:
     in_scene: bool = True
     extra_metrics: Mapping[str, float] = field(default_factory=dict)
     reference_uncertainty: Mapping[str, float] = field(default_factory=dict)
+    median_range_s: tuple[float, float] | None = None
+    error_range: tuple[float, float] | None = None
+
+    def costs(self) -> tuple[Interval, Interval]:
+        """Return the median time and the error with their intervals."""
+        return (
+            Interval(self.median_s, *(self.median_range_s or (self.median_s, self.median_s))),
+            Interval(self.error, *(self.error_range or (self.error, self.error))),
+        )
 
 
 def measure(trial: Trial, *, repeats: int) -> Point:
@@ -104,17 +151,20 @@ def measure(trial: Trial, *, repeats: int) -> Point:
         durations.append(time.perf_counter() - start)
         if len(durations) >= MIN_REPEATS and sum(durations) > MAX_TRIAL_S:
             break
+    median, error = estimate_median(durations), trial.error(result)
     return Point(
         method=trial.method,
         case=trial.case,
         params={**trial.case, **trial.size},
-        median_s=float(np.median(durations)),
+        median_s=median.value,
         p99_s=float(np.quantile(durations, 0.99)),
-        error=float(trial.error(result)),
+        error=error.value if isinstance(error, Interval) else float(error),
         in_range=bool(trial.in_range),
         in_scene=bool(trial.in_scene),
         extra_metrics=dict(trial.extra_metrics(result)),
         reference_uncertainty=dict(trial.reference_uncertainty),
+        median_range_s=(median.low, median.high),
+        error_range=(error.low, error.high) if isinstance(error, Interval) else None,
     )
 
 
@@ -132,15 +182,18 @@ def pareto_front(points: Sequence[Point]) -> list[str]:
     front = {
         point.method: max(one.median_s for one in usable if one.method == point.method)
         for point in usable
-        if not any(dominates(other, point) for other in usable if other.case == point.case)
+        if not any(
+            dominates(other.costs(), point.costs()) for other in usable if other.case == point.case
+        )
     }
     return sorted(front, key=lambda method: front[method])
 
 
-def dominates(one: Point, other: Point) -> bool:
-    """Return whether `one` is at least as fast and accurate as `other`, and not equal to it."""
-    return (
-        one.median_s <= other.median_s
-        and one.error <= other.error
-        and (one.median_s, one.error) != (other.median_s, other.error)
-    )
+def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
+    """Return whether one of the costs of `one` is lower than that of `other` and none is higher.
+
+    Costs with overlapping intervals count as equal.
+    """
+    pairs = list(zip(one, other, strict=True))
+    better = any(mine.high < theirs.low for mine, theirs in pairs)
+    return better and not any(theirs.high < mine.low for mine, theirs in pairs)

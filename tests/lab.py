@@ -362,10 +362,10 @@ class Lab:
         return found if isinstance(found, HostStatus) else None
 
     def pid_of(self, host: str, node: str) -> int:
-        """Return the process ID of a node, by its configuration's path in the command line."""
+        """Return the ID of a node's process, by its configuration's path in the command line."""
         directory = self.run_directory(host)
         assert directory is not None
-        wanted = str(directory / f"{node}.json").encode()
+        wanted = str(directory / f"{self.plan().nodes[node].process}.json").encode()
         for entry in Path("/proc").glob("[0-9]*/cmdline"):
             try:
                 if wanted in entry.read_bytes().split(b"\0"):

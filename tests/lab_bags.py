@@ -131,13 +131,21 @@ def _all(folder: Path, host: str, *topics: str) -> Iterator[tuple[str, Message, 
             yield topic, message, header
 
 
-def read_arm(folder: Path, side: str, scene: Scene) -> Arm:
-    """Read the records of an arm from a lab's bags."""
+def read_arm(
+    folder: Path, side: str, scene: Scene, *, host: str | None = None, truth: str | None = None
+) -> Arm:
+    """Read the records of an arm from a lab's bags.
+
+    host: host of the bags; None: the arm's own. truth: topic of the true joints; None: that of the
+    arm's own simulator.
+    """
     mount = (scene.arms.left if side == "left" else scene.arms.right).flange_from_edge
     flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
-    truth: list[tuple[int, Floats, Floats, int]] = []
+    true: list[tuple[int, Floats, Floats, int]] = []
     said: list[tuple[int, str, int, Floats]] = []
-    for _, message, header in _all(folder, side, f"arm_{side}", f"twin/arms_{side}"):
+    for _, message, header in _all(
+        folder, host or side, f"arm_{side}", truth or f"twin/arms_{side}"
+    ):
         match message:
             case TwinArms():
                 joints, flange = (
@@ -146,15 +154,15 @@ def read_arm(folder: Path, side: str, scene: Scene) -> Arm:
                     else (message.joints_right_rad, message.world_from_flange_right)
                 )
                 edge = (flange @ flange_from_edge)[:3, 3]
-                truth.append((header.source_ns, joints, edge, header.epoch))
+                true.append((header.source_ns, joints, edge, header.epoch))
             case ArmState():
                 one = (message.mode, message.command_sent_ns, message.joints_commanded_rad)
                 said.append((header.publish_ns, *one))
     return Arm(
-        np.array([row[0] for row in truth], dtype=np.int64),
-        np.array([row[1] for row in truth]).reshape(-1, 6),
-        np.array([row[2] for row in truth]).reshape(-1, 3),
-        np.array([row[3] for row in truth], dtype=np.int64),
+        np.array([row[0] for row in true], dtype=np.int64),
+        np.array([row[1] for row in true]).reshape(-1, 6),
+        np.array([row[2] for row in true]).reshape(-1, 3),
+        np.array([row[3] for row in true], dtype=np.int64),
         np.array([row[0] for row in said], dtype=np.int64),
         np.array([row[1] for row in said], dtype=np.str_),
         np.array([row[2] for row in said], dtype=np.int64),

@@ -253,27 +253,28 @@ def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path
         bridge.communicate()
 
 
-def test_without_an_answer_the_senders_of_targets_are_killed(runs_root: Path) -> None:
-    port = {"topic": "sheet_target"}
-    plan = {"nodes": {"planner": {"outputs": [port]}, "camera": {"outputs": []}}}
+@pytest.mark.parametrize("process", ["planner", "tracking"])
+def test_without_an_answer_the_senders_of_targets_are_killed(runs_root: Path, process: str) -> None:
+    planner = {"outputs": [{"topic": "sheet_target"}], "process": process}
+    plan = {"nodes": {"planner": planner, "camera": {"outputs": []}}}
     (runs_root / "plan.json").write_text(json.dumps(plan))
     started = {
         name: subprocess.Popen(
             [sys.executable, "-c", "import time; time.sleep(1000)", str(runs_root / f"{name}.json")]
         )
-        for name in ("planner", "camera")
+        for name in (process, "camera")
     }
     try:
         attempts = stop_arms([runs_root], REASON)
         assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
             (StopPath.SIGNAL, "planner", StopOutcome.KILLED)
         ]
-        assert started["planner"].wait(DEADLINE_S) == -signal.SIGKILL
+        assert started[process].wait(DEADLINE_S) == -signal.SIGKILL
         assert started["camera"].poll() is None
     finally:
-        for process in started.values():
-            process.kill()
-            process.wait()
+        for one in started.values():
+            one.kill()
+            one.wait()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -224,3 +225,47 @@ def test_the_largest_95_percent_value_of_all_runs_counts(
     scene_file = SCENES / "light-touch.yaml"
     found = tune_system.run_proposal(scene_file, configuration, tmp_path, silent, runs=3)
     assert found == pytest.approx({SHEET: 0.5, TO_ARM: 5.0})
+
+
+def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tune light-touch.yaml with simulated strokes; one fails, and the next command repeats it."""
+    from flexsheet.launch.experiments import sweep
+    from flexsheet.launch.experiments.sweep import TrialError
+    from flexsheet.launch.methods.configurations import Configuration
+    from flexsheet.launch.methods.tune import TUNABLES
+
+    scene_file = SCENES / "light-touch.yaml"
+    scene = load_scene(scene_file)
+    leads = [{"lead_ms": 0}, {"lead_ms": 50}]
+    choices = []
+    for one in TUNABLES:
+        setting = getattr(scene.methods, one.key)
+        cases = {"cases": leads} if one.name == "tracking" else {}
+        evaluations = [
+            *evaluate(str(setting), 0.1, 1e-5, **cases),
+            *evaluate("another", 0.01, 1e-3, **cases),
+        ]
+        evaluations[0] = replace(evaluations[0], setting=setting)
+        choices.append(Choice(one.name, one.key, "mm", 1.0, evaluations[0], tuple(evaluations)))
+    limits = tune_system.list_tolerances(scene)
+    ran: list[Mapping[str, Any]] = []
+
+    def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        ran.append(trial)
+        if len(ran) == 2:
+            raise TrialError("interrupted")
+        return {one.value: {"p95": 0.5 * limit} for one, limit in limits.items()}
+
+    monkeypatch.setattr(sweep, "execute_trial", execute)
+    monkeypatch.setattr(Configuration, "prepare", lambda *_: None)
+    for runs_so_far in (3, 4, 4):
+        composition, chosen = tune_system.tune_system(
+            scene_file, choices, tmp_path, lambda text: None, margin=0.2, runs=3,
+            measure=lambda *_: choices[2].evaluations,
+        )  # fmt: skip
+        assert len(ran) == runs_so_far
+        assert composition.accepted
+        for one in chosen:
+            assert one.chosen.setting == getattr(scene.methods, one.key)

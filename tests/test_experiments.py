@@ -37,7 +37,15 @@ from flexsheet.messages.methods import (
     TriangulationMethod,
 )
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.methods import Family, Point, Trial, measure, pareto_front
+from flexsheet.nodes.methods import (
+    Family,
+    Point,
+    Trial,
+    estimate_median,
+    estimate_rms,
+    measure,
+    pareto_front,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs" / "charts"
@@ -254,7 +262,7 @@ def test_charts_are_collected_on_a_page_and_drawn_again(
     result = make_chart_result(family, SCENE, points)
     result["family"] = "made-up"
     older = {name: value for name, value in result.items() if name not in ("sweep_key", "code")}
-    newer = ("extra_metrics", "reference_uncertainty")
+    newer = ("extra_metrics", "reference_uncertainty", "median_range_s", "error_range")
     older["points"] = [
         {k: v for k, v in point.items() if k not in newer} for point in result["points"]
     ]
@@ -263,7 +271,7 @@ def test_charts_are_collected_on_a_page_and_drawn_again(
     assert outcome.exit_code == 0, outcome.output
     page = (tmp_path / "README.md").read_text()
     assert "## made-up" in page
-    assert "| 0 | 1 of 2 | yes |" in page
+    assert "| 0 | 2 | 1 of 2 | yes |" in page
     assert (tmp_path / "made-up.svg").exists()
     nothing = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path / "none")])
     assert nothing.exit_code != 0
@@ -290,6 +298,27 @@ def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -
         point("dear", 9.0, 0.0, depth_mm=0),
     ]
     assert pareto_front(points) == ["shallow", "cheap", "dear"]
+
+
+def test_a_difference_within_the_spread_does_not_dominate() -> None:
+    def point(method: str, time_s: float, error: float, spread: float) -> Point:
+        limits = {
+            "median_range_s": (time_s * (1 - spread), time_s * (1 + spread)),
+            "error_range": (error * (1 - spread), error * (1 + spread)),
+        }
+        return Point(method, {}, {}, time_s, time_s, error, True, **limits)
+
+    assert pareto_front([point("one", 1.0, 1.0, 0.01), point("other", 1.1, 1.1, 0.01)]) == ["one"]
+    both = [point("one", 1.0, 1.0, 0.1), point("other", 1.1, 1.1, 0.1)]
+    assert pareto_front(both) == ["one", "other"]
+
+
+def test_intervals_contain_the_truth_as_often_as_stated() -> None:
+    random = np.random.default_rng(4)
+    rms = [estimate_rms(random.standard_normal(200)) for _ in range(200)]
+    medians = [estimate_median(random.standard_normal(30).tolist()) for _ in range(200)]
+    assert 0.9 < np.mean([one.low <= 1.0 <= one.high for one in rms]) < 0.99
+    assert 0.9 < np.mean([one.low <= 0.0 <= one.high for one in medians]) < 0.995
 
 
 def test_json_never_holds_nan() -> None:

@@ -18,7 +18,6 @@ from flexsheet.launch.experiments.sweep import TrialError
 from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.methods import system_chart
 from flexsheet.launch.methods.blocks import (
-    Interval,
     attribute_error,
     bootstrap_median,
     compare_paired,
@@ -35,6 +34,7 @@ from flexsheet.launch.methods.configurations import (
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.scene import Methods, Scene
+from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from tests.waiting import wait_until

@@ -183,13 +183,15 @@ def _print_methods(result: dict[str, Any]) -> None:
         (
             one["method"],
             format_duration(one["median_s"]),
-            "-" if one["error"] is None else f"{one['error']:.3g}",
+            format_duration(one["p99_s"]),
+            *("-" if one[key] is None else f"{one[key]:.3g}" for key in ("error", "error_outside")),
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
         for one in summarize_methods(result["points"])
     ]
-    print_table(("method", "median", f"error, {result['unit']}", "cases in range", ""), rows)
+    error = f"error, {result['unit']}"
+    print_table(("method", "median", "p99", error, "outside", "cases in range", ""), rows)
 
 
 def _print_points(result: dict[str, Any]) -> None:

@@ -46,6 +46,9 @@ STROKED_RATIO = 0.9
 """Fraction of the touchable arc length of the object that is stroked."""
 
 SAMPLE_S = 0.05
+MAX_STEP_RAD = 0.1
+"""Maximum phase of the stroke between two points of its path."""
+
 APPROACH_S = 1.0
 HOVER_M = 0.03
 TILTED, PUSHED = "system tilt", "system push"
@@ -103,8 +106,9 @@ def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
 def make_stroke(scene: Scene, seconds: float) -> FingerPath:
     """Make a finger path that strokes back and forth around the object, up to the scene's speed."""
     half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
-    times = np.arange(0.0, seconds, SAMPLE_S)
-    arcs = half_m * np.sin(scene.working_range.speed_m_per_s / half_m * times)
+    frequency_rad_per_s = scene.working_range.speed_m_per_s / half_m
+    times = np.arange(0.0, seconds, min(SAMPLE_S, MAX_STEP_RAD / frequency_rad_per_s))
+    arcs = half_m * np.sin(frequency_rad_per_s * times)
     places = np.column_stack([np.zeros_like(arcs), arcs, np.full_like(arcs, -TOUCH_M)])
     first, last = ([*place[:2], HOVER_M] for place in (places[0], places[-1]))
     return FingerPath(

@@ -9,10 +9,11 @@ intervals are found by bootstrap over whole blocks (Kalibera and Jones, ISMM 201
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flexsheet.nodes.methods import Interval, dominates
 
 Floats = NDArray[np.float64]
 
@@ -20,18 +21,6 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 20261123
 """Fixed random seed of the bootstrap, so that equal data give equal intervals."""
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Estimated value with the limits of its 95 % confidence interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def as_dict(self) -> dict[str, float]:
-        return {"value": self.value, "low": self.low, "high": self.high}
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
@@ -95,10 +84,3 @@ def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
         for name, costs in points.items()
         if not any(dominates(other, costs) for key, other in points.items() if key != name)
     ]
-
-
-def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
-    """Return whether a point dominates another; see `find_front`."""
-    pairs = list(zip(one, other, strict=True))
-    better = any(mine.high < theirs.low for mine, theirs in pairs)
-    return better and not any(theirs.high < mine.low for mine, theirs in pairs)

@@ -164,7 +164,8 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     """Draw error over time, with the tolerance as a dashed line.
 
-    Errors below 1e-4 of the tolerance are rounding errors; they are drawn at that value.
+    Bars extend to the 99 % quantile of the time, and over the error's confidence interval. Errors
+    below 1e-4 of the tolerance are rounding errors; they are drawn at that value.
     """
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     min_error = 1e-4 * result["tolerance"]
@@ -176,10 +177,25 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
             ]
             if shown:
                 front = "" if method not in result["front"] else ", on the front"
-                axes.plot(
+                errors = [max(point["error"], min_error) for point in shown]
+                ranges = [point.get("error_range") or (point["error"],) * 2 for point in shown]
+                lower, upper = (
+                    [
+                        max(0.0, sign * (error - max(limits[end], min_error)))
+                        for error, limits in zip(errors, ranges, strict=True)
+                    ]
+                    for end, sign in ((0, 1.0), (1, -1.0))
+                )
+                axes.errorbar(
                     [point["median_s"] * 1e6 for point in shown],
-                    [max(point["error"], min_error) for point in shown],
-                    marker,
+                    errors,
+                    xerr=[
+                        [0.0] * len(shown),
+                        [1e6 * max(0.0, point["p99_s"] - point["median_s"]) for point in shown],
+                    ],
+                    yerr=[lower, upper],
+                    fmt=marker,
+                    elinewidth=0.6,
                     color=COLOURS[index % len(COLOURS)],
                     alpha=0.7,
                     label=f"{method}{front if in_range else ' (out of range)'}",
@@ -304,7 +320,14 @@ def read_charts(folder: Path) -> list[dict[str, Any]]:
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
     """Add the keys that results of earlier versions do not contain."""
     points = [
-        {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
+        {
+            "extra_metrics": {},
+            "reference_uncertainty": {},
+            "median_range_s": None,
+            "error_range": None,
+            **point,
+        }
+        for point in result["points"]
     ]
     return {"sweep_key": None, "code": None, **result, "points": points}
 
@@ -335,14 +358,20 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
             f"[Numbers]({link_prefix}{name}.json).\n"
         )
         yield f"![{name}: time against error of each method]({link_prefix}{name}.svg)\n"
-        yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
-        yield "|---|---|---|---|---|"
+        yield (
+            f"| method | time, median | 99 % | largest error in range, {unit} | outside "
+            "| cases in range | front |"
+        )
+        yield "|---|---|---|---|---|---|---|"
         yield from map(_overview_row, summarize_methods(result["points"]))
         yield ""
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each method's largest median time, its largest error and number of cases in range."""
+    """Return for each method the largest times and errors, and the number of cases in range.
+
+    The times are medians and 99 % quantiles. Errors outside of the method's range are separate.
+    """
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):
@@ -352,7 +381,16 @@ def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             {
                 "method": method,
                 "median_s": max(point["median_s"] for point in inside or own),
+                "p99_s": max(point["p99_s"] for point in inside or own),
                 "error": max((point["error"] for point in inside), default=None),
+                "error_outside": max(
+                    (
+                        point["error"]
+                        for point in own
+                        if not point["in_range"] and _has_reference(point)
+                    ),
+                    default=None,
+                ),
                 "cases": len(own),
                 "inside": len(inside),
                 "front": method in front,
@@ -362,10 +400,13 @@ def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _overview_row(row: dict[str, Any]) -> str:
-    error = "–" if row["error"] is None else f"{row['error']:.3g}"
+    inside, outside = (
+        "–" if row[key] is None else f"{row[key]:.3g}" for key in ("error", "error_outside")
+    )
     cases = f"{row['inside']} of {row['cases']}"
     front = "yes" if row["front"] else ""
-    return f"| {row['method']} | {format_duration(row['median_s'])} | {error} | {cases} | {front} |"
+    times = f"{format_duration(row['median_s'])} | {format_duration(row['p99_s'])}"
+    return f"| {row['method']} | {times} | {inside} | {outside} | {cases} | {front} |"
 
 
 def format_duration(seconds: float) -> str:

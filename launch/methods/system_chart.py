@@ -23,7 +23,6 @@ from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.experiments.sweep import Row, describe_graph, run_sweep
 from flexsheet.launch.methods.blocks import (
     CONFIDENCE,
-    Interval,
     bootstrap_median,
     compare_paired,
     find_front,
@@ -41,6 +40,7 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
+from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.twin.tolerance_table import Profile
 
 Floats = NDArray[np.float64]

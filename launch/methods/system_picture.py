@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flexsheet.launch.methods.blocks import Interval
 from flexsheet.launch.methods.configurations import CONTROL_AGAIN
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
 from flexsheet.launch.methods.system_chart import ERRORS, worst_ratio
+from flexsheet.nodes.methods import Interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -38,8 +38,8 @@ from flexsheet.nodes.fem_solver.benchmarks import FORCE
 from flexsheet.nodes.methods import Point, Trial
 from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 
-RENDERED_HZ = 15.0
-"""Frame rate of the renderer in `launch/demo.yaml`."""
+RENDERED_HZ = 30.0
+"""Maximum frame rate of the renderer in `launch/demo.yaml`."""
 
 IMAGES = 2
 """Number of images per exposure in which the marker is searched."""

@@ -197,7 +197,7 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
         except (OSError, ValueError, KeyError):
             continue
         senders = {
-            os.fsencode(directory / f"{name}.json"): name
+            os.fsencode(directory / f"{node.get('process') or name}.json"): name
             for name, node in nodes.items()
             if any(port["topic"] == TARGET_TOPIC for port in node["outputs"])
         }

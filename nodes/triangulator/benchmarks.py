@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.methods import Case, Family, Interval, Trial, estimate_rms
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
@@ -92,13 +92,13 @@ def _triangulation_trial(
 ) -> Trial:
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
-    def error_mm(_: Floats) -> float:
+    def error_mm(_: Floats) -> Interval:
         """Return the root mean square error, mm; the error of a lost point is set to its depth."""
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
         away = np.linalg.norm(points - truth, axis=1)
         depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
         lost = ~np.isfinite(away) | (away > depth)
-        return 1e3 * float(np.sqrt(np.mean(np.square(np.where(lost, depth, away)))))
+        return estimate_rms(1e3 * np.where(lost, depth, away))
 
     return Trial(
         method=name,
@@ -279,7 +279,7 @@ def _marker_trial(
         blobs = detect_blobs(image, appearance)
         return refine([image] * len(blobs), blobs, appearance, sensor)
 
-    def error_px(_: list[Marker]) -> float:
+    def error_px(_: list[Marker]) -> Interval:
         """Return the rms error per axis, px.
 
         An image in which not exactly one marker is found counts with the size of the image.
@@ -289,7 +289,7 @@ def _marker_trial(
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))
             for markers, centre in zip(found, centres, strict=True)
         ]
-        return float(np.sqrt(np.mean(np.square(off))))
+        return estimate_rms(np.ravel(off))
 
     return Trial(
         method=name,
