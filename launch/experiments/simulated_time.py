@@ -347,18 +347,17 @@ def follow_in_simulated_time(
 class TouchRecording:
     """Run of a coupled finger, sampled at the exposures.
 
-    times_s (n,). positions_m (n, 3): true fingertip. deviations_m (n, 3): from the voluntary path.
+    times_s (n,). positions_m (n, 3): true fingertip.
     phases (n,): contact phase of the planner. delay_s: time from an exposure to the sheet's motion.
     steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
-    watchdog_triggers: number of oscillations that the planner stopped.
+    watchdog_triggers: number of oscillations that the planner stopped; None: unknown.
     """
 
     times_s: Floats
     positions_m: Floats
-    deviations_m: Floats
     phases: list[Phase]
     steps: Floats
-    watchdog_triggers: int
+    watchdog_triggers: int | None
     delay_s: float
 
 
@@ -388,7 +387,7 @@ def touch_in_simulated_time(
     loop = SimulatedLoop(scene, truth, given, compliance)
     finger = make_finger(lambda at_s: voluntary.at(at_s - SETTLING_S))
     finger.log, edges = [], EdgeTrack()
-    times_s, positions, deviations, phases = list[float](), list[Floats](), list[Floats](), []
+    times_s, positions, phases = list[float](), list[Floats](), list[Phase]()
 
     def move(now_s: float, left: Floats, right: Floats) -> None:
         edges.add(now_s, left, right)
@@ -404,12 +403,10 @@ def touch_in_simulated_time(
         planned = loop.step(exposed_s, position)
         times_s.append(exposed_s)
         positions.append(position)
-        deviations.append(seen.deviation_m)
         phases.append(planned.command.phase)
     return TouchRecording(
         np.array(times_s),
         np.array(positions),
-        np.array(deviations),
         phases,
         np.array(finger.log),
         loop.planner.watchdog_triggers,
