@@ -252,6 +252,23 @@ def test_a_person_who_pushes_rhythmically_does_not_trigger_the_watchdog() -> Non
     assert watchdog.triggers == 0
 
 
+@pytest.mark.parametrize("end_m", [0.0005, 0.006])
+def test_a_person_who_holds_and_withdraws_slowly_does_not_trigger_the_watchdog(
+    end_m: float,
+) -> None:
+    watchdog, rng = OscillationWatchdog(), np.random.default_rng(2)
+    filtered, offsets = 0.0, [0.0] * 3
+    for n in range(300):
+        s = min(max((n * PERIOD_S - 3.0) / 0.8, 0.0), 1.0)
+        depth = 0.012 + (end_m - 0.012) * s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+        measured = depth + rng.normal(0.0, 1e-4)
+        # The sheet retreats by a fraction of the filtered depth, three periods late.
+        filtered += 0.25 * (measured - filtered)
+        offsets.append(0.3 * filtered)
+        watchdog.update(measured, offsets[-4], PERIOD_S)
+    assert watchdog.triggers == 0
+
+
 def test_the_watchdog_is_ready_again_after_the_contact() -> None:
     controller, *_ = run_coupled(
         -1.2, hand=HANDS["wrist of low damping"], filter_s=0.0, seconds=6.0
