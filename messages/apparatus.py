@@ -200,9 +200,12 @@ class FingerTruth(Part):
     )
     hand_mass_kg: Positive | None = Field(
         default=None,
-        description="mass of the hand; null: contact forces do not move the finger off its path",
+        description="mass of the hand at the fingertip, for the finger simulator's parameter "
+        "`hand: coupled`; null: an average hand",
     )
-    hand_damping_ns_per_m: NonNegative | None = None
+    hand_damping_ratio: NonNegative | None = Field(
+        default=None, description="damping of the hand over its critical damping"
+    )
     hand_stiffness_n_per_m: NonNegative | None = None
 
 

@@ -112,7 +112,10 @@ TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
 }
 """Functions that convert a former text to the current literal, by model and current field name."""
 
-REMOVED_FIELDS: dict[str, frozenset[str]] = {"Methods": frozenset({"kinematics"})}
+REMOVED_FIELDS: dict[str, frozenset[str]] = {
+    "FingerTruth": frozenset({"hand_damping_ns_per_m"}),
+    "Methods": frozenset({"kinematics"}),
+}
 """Names of removed fields, by model."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")

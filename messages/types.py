@@ -654,6 +654,11 @@ class TwinFinger(Message):
     path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
+    force_world_n: Vector3 = Field(
+        default_factory=lambda: np.zeros(3),
+        description="force of the sheet on a coupled finger; 0 if the finger follows its path "
+        "regardless of forces",
+    )
 
 
 class TwinArms(Message):

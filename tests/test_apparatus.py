@@ -87,7 +87,7 @@ def test_each_field_has_one_row_of_the_table(scene: Scene) -> None:
 def test_fields_that_are_not_simulated_are_listed(scene: Scene) -> None:
     assert set(NOT_SIMULATED) == {
         "finger.hand_mass_kg",
-        "finger.hand_damping_ns_per_m",
+        "finger.hand_damping_ratio",
         "finger.hand_stiffness_n_per_m",
     }
     assert set(NOT_SIMULATED) <= all_paths(scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +17,17 @@ from typer.testing import CliRunner
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
-from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.health import compliance as compliance_check
+from flexsheet.launch.health.compliance import (
+    FINGERTIP_AGE_S,
+    LoopFinding,
+    LoopRisk,
+    check_graph,
+    find_loop_risk,
+)
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.models.hand_loop import compute_offset_bounds
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner import sheet_force
@@ -39,6 +49,7 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 
 Floats = NDArray[np.float64]
 
+DEMO = Path(__file__).parent.parent / "launch" / "demo.yaml"
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)
 SHEET = SCENE.sheet
@@ -291,6 +302,48 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == code
     assert "stretch" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("scale", "delay_s", "risk"),
+    [
+        (0.8, 0.05, None),
+        (0.8, 0.2, LoopRisk.OSCILLATION),
+        (5.0, 0.05, LoopRisk.SHEET),
+    ],
+)
+def test_the_risk_of_the_loop_follows_from_object_and_delay(
+    scale: float, delay_s: float, risk: LoopRisk | None
+) -> None:
+    table = compute_offset_bounds(1.0 / 60.0, advance_limit=0.5)
+    finding = find_loop_risk(
+        SCENE, make_force_model(SCENE.sheet), soft_curve(scale), table, delay_s
+    )
+    assert (None if finding is None else finding.risk) == risk
+    if finding is not None:
+        assert finding.delay_s == delay_s
+        assert "use a" in finding.describe()
+
+
+def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
+    curve = soft_curve(0.8)
+    rows = np.column_stack([curve.depths_m, curve.forces_n])
+    body = SimpleNamespace(at_rest=lambda: SimpleNamespace(force_curve=rows))
+    table = compute_offset_bounds(1.0 / 60.0, advance_limit=0.5)
+    monkeypatch.setattr(compliance_check, "load_cached", lambda *_: table)
+    cached = {"bodies": lambda *_: [body], "is_cached": lambda *_: True}
+    for name, function in cached.items():
+        monkeypatch.setattr(compliance_check.SoftBodyFactory, name, function)
+    late = ["planner.actuation_delay_s=0.2"]
+    found = check_graph(load_graph(DEMO, settings=late))
+    assert found is not None
+    assert found == LoopFinding(LoopRisk.OSCILLATION, FINGERTIP_AGE_S + 0.2, found.error_ratio)
+    assert check_graph(load_graph(DEMO)) is None
+    assert check_graph(load_graph(DEMO, settings=[*late, "scene=scenes/rigid-plane.yaml"])) is None
+    shown = CliRunner().invoke(app, ["launch", str(DEMO), "--dry-run", "--set", *late])
+    assert "can oscillate at a delay of 212 ms" in " ".join(shown.stderr.split())
+    monkeypatch.setattr(compliance_check.SoftBodyFactory, "is_cached", lambda *_: False)
+    assert check_graph(load_graph(DEMO, settings=late)) is None
 
 
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:

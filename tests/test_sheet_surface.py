@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from flexsheet.launch.experiments import stroke
-from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
@@ -18,6 +17,7 @@ from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from tests.scenes import make_weightless
 
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

@@ -9,7 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexsheet.launch.experiments.hand_simulation import simulate_release
+from flexsheet.launch.experiments.hand_simulation import (
+    CAMERA_RESOLUTION_M,
+    HeldOffset,
+    simulate_release,
+)
 from flexsheet.launch.experiments.stability import (
     StabilitySettings,
     Trial,
@@ -156,6 +160,28 @@ def test_a_passive_sheet_lets_every_hand_come_to_rest_without_energy() -> None:
     assert motion.energy_ratio.max() < 1e-3
 
 
+def test_jitter_delays_measurements_and_drops_those_that_are_overtaken() -> None:
+    delay_s, jitter_s, steps = 0.02, 0.05, 64
+    step_s = PERIOD_S / steps
+    loop = SampledLoop(PERIOD_S, delay_s)
+    cases = make_cases([Trial(WRIST, loop, 0.0, jitter_s)], np.ones(1))
+    held = HeldOffset(cases, lambda depths_m: depths_m, PERIOD_S, step_s)
+    lags = []
+    for step in range(200 * steps):
+        if step % steps == 0:
+            held.sample(step, np.array([0.001 * step / steps]))
+        lags.append(step * step_s - PERIOD_S * float(held.advance(step)[0]) / 0.001)
+    # The depth rises at a constant rate, so that the lag is the delay of the newest measurement.
+    settled = np.array(lags[10 * steps :])
+    resolution_s = PERIOD_S * CAMERA_RESOLUTION_M / 0.001
+    assert settled.min() >= delay_s - step_s - resolution_s
+    assert settled.max() <= delay_s + jitter_s + step_s + resolution_s
+    changes = np.flatnonzero(np.abs(np.diff(settled)) > resolution_s + step_s) + 1
+    measured = np.round((changes * step_s - settled[changes]) / PERIOD_S)
+    assert (np.diff(measured) > 0).all()
+    assert len(changes) < 185
+
+
 def run_coupled(
     slope: float, *, hand: Hand, filter_s: float, seconds: float, delay_s: float = 0.05
 ) -> tuple[StabilizedOffset, list[float], list[float]]:
@@ -226,6 +252,23 @@ def test_a_person_who_pushes_rhythmically_does_not_trigger_the_watchdog() -> Non
     assert watchdog.triggers == 0
 
 
+@pytest.mark.parametrize("end_m", [0.0005, 0.006])
+def test_a_person_who_holds_and_withdraws_slowly_does_not_trigger_the_watchdog(
+    end_m: float,
+) -> None:
+    watchdog, rng = OscillationWatchdog(), np.random.default_rng(2)
+    filtered, offsets = 0.0, [0.0] * 3
+    for n in range(300):
+        s = min(max((n * PERIOD_S - 3.0) / 0.8, 0.0), 1.0)
+        depth = 0.012 + (end_m - 0.012) * s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+        measured = depth + rng.normal(0.0, 1e-4)
+        # The sheet retreats by a fraction of the filtered depth, three periods late.
+        filtered += 0.25 * (measured - filtered)
+        offsets.append(0.3 * filtered)
+        watchdog.update(measured, offsets[-4], PERIOD_S)
+    assert watchdog.triggers == 0
+
+
 def test_the_watchdog_is_ready_again_after_the_contact() -> None:
     controller, *_ = run_coupled(
         -1.2, hand=HANDS["wrist of low damping"], filter_s=0.0, seconds=6.0
@@ -256,5 +299,6 @@ def test_the_planners_bounds_keep_drawn_hands_stable(tmp_path: Path) -> None:
         cache_dir=tmp_path,
     )
     bounded = [row for row in rows if row["kind"] == "bounded"]
+    assert {row["jitter_ms"] for row in bounded} == {0.0, 30.0}
     assert all(row["stable"] for row in bounded)
     assert any(not row["stable"] for row in rows if row["kind"] == "predicted")

@@ -34,8 +34,9 @@ from flexsheet.launch.commands.output import (
 from flexsheet.launch.plans.features import Feature
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
     from flexsheet.launch.experiments.run import Procedure, Progress
 
@@ -527,6 +528,7 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
     epilog=examples(
         "flexsheet experiment stability",
         "flexsheet experiment stability --hands 12 --json",
+        "flexsheet experiment stability --gestures --hands 1",
     )
 )
 def stability(
@@ -538,31 +540,62 @@ def stability(
         int, typer.Option(metavar="N", min=1, max=100, help="Number of random hands per kind.")
     ] = 4,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the hands.")] = 100,
+    gestures: Annotated[
+        bool,
+        typer.Option(
+            "--gestures",
+            help="Instead, measure the force that the hands feel when they tap, hold, stroke, let "
+            "go and slip off the object.",
+        ),
+    ] = False,
+    graph: Annotated[
+        bool,
+        typer.Option(
+            "--graph",
+            help="With --gestures: run the graph, with the hand of the apparatus. Without it, the "
+            "gestures run in simulated time.",
+        ),
+    ] = False,
+    apparatus: ApparatusOption = None,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate whether a hand in contact with the sheet starts to oscillate; starts no graph.
+    """Simulate whether a hand in contact with the sheet starts to oscillate.
 
-    The stiffness of the object, the impedance of the hand and the delay are varied, with and
-    without the planner's bounds. The simulated critical gain is compared with the predicted one.
+    The stiffness of the object, the impedance of the hand, the delay and its jitter are varied,
+    with and without the planner's bounds. The simulated critical gain is compared with the
+    predicted one.
     """
     import json
 
     from flexsheet.launch.experiments import stability as experiment
+    from flexsheet.launch.experiments.hand_gestures import hand_gestures_result, run_gestures
     from flexsheet.launch.experiments.pictures import draw_stability
     from flexsheet.launch.experiments.run import require_scene
     from flexsheet.launch.health.compliance import compute_front_curve
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
-    loaded = require_scene(load_graph(launch_file, settings=with_scene(settings, scene)))
+    if (graph or apparatus is not None) and not (gestures and graph):
+        raise CommandError("--graph requires --gestures, and --apparatus requires both", BAD_INPUT)
+    given = with_scene(settings, scene)
+    loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
         progress("computing the object's force curve")
+        curve = compute_front_curve(loaded)
+        if gestures:
+            touched, forces = (
+                run_gestures(launch_file, given, folder, curve, progress, apparatus=apparatus)
+                if graph
+                else hand_gestures_result(loaded, curve, progress, hands=hands, seed=seed)
+            )
+            _report_gestures(touched, forces, folder, as_json=as_json)
+            return
         result = experiment.stability_result(
             loaded,
             make_force_model(loaded.sheet),
-            compute_front_curve(loaded),
+            curve,
             experiment.StabilitySettings(hands=hands, seed=seed),
             progress,
         )
@@ -574,15 +607,59 @@ def stability(
         return
     rows = [*result["rows"], *result["without_bounds"]]
     cells = []
-    for kind in dict.fromkeys(row["kind"] for row in rows):
-        chosen = [row for row in rows if row["kind"] == kind]
+    for kind, jitter_ms in dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows):
+        chosen = [row for row in rows if (row["kind"], row["jitter_ms"]) == (kind, jitter_ms)]
         unstable = [row for row in chosen if not row["stable"]]
-        cells.append([kind, len(chosen), len(unstable), f"{min(r['margin'] for r in chosen):.2f}"])
-    print_table(["loop", "cases", "not stable", "smallest gain margin"], cells)
+        margin = min(row["margin"] for row in chosen)
+        cells.append([kind, f"{jitter_ms:.0f}", len(chosen), len(unstable), f"{margin:.2f}"])
+    columns = ["loop", "jitter, ms", "cases", "not stable", "smallest gain margin"]
+    print_table(columns, cells)
     error, median = result["boundary_error_percent"], result["boundary_median_percent"]
     if error is not None:
         words.print(
             f"error of the predicted critical gain: {median:.0f} % median, "
             f"{error:.0f} % at the 95 % quantile, in {len(result['boundary'])} simulated cases"
         )
+    words.print(f"image: {image}")
+
+
+def _report_gestures(
+    result: dict[str, Any],
+    forces: Mapping[tuple[str, str], FeltForce],
+    folder: Path,
+    *,
+    as_json: bool,
+) -> None:
+    """Write the result and the picture of `experiment stability --gestures`, and print them."""
+    import json
+
+    from flexsheet.launch.experiments.pictures import draw_hand_gestures
+
+    (folder / "gestures.json").write_text(json.dumps(result, indent=1) + "\n")
+    image = folder / "gestures.png"
+    draw_hand_gestures(forces, image)
+    if as_json:
+        print_json({**result, "picture": str(image)})
+        return
+    columns = ["gesture", "mass, g", "stiffness, N/m", "peak force, N", "error, N: peak", "mean"]
+    columns += ["median, %", "transient, N", "touches", "chatter", "watchdog"]
+    print_table(
+        columns,
+        [
+            [
+                row["gesture"],
+                f"{1e3 * row['mass_kg']:.0f}",
+                f"{row['stiffness_n_per_m']:.0f}",
+                f"{row['peak_force_n']:.2f}",
+                f"{row['peak_error_n']:.2f}",
+                f"{row['mean_error_n']:.3f}",
+                f"{row['median_error_percent']:.0f}",
+                f"{row['transient_n']:.2f}",
+                row["touches"],
+                row["chatter"],
+                row["watchdog_triggers"],
+            ]
+            for row in result["gestures"]
+        ],
+    )
     words.print(f"image: {image}")

@@ -109,6 +109,7 @@ def launch(
         console=console,
         apparatus=apparatus,
     )
+    warn_of_loop_risk(plan)
     if dry_run:
         if as_json:
             print_json(plan.model_dump(mode="json"))
@@ -129,6 +130,15 @@ def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, A
     nodes = [node.name for node in plan.nodes_on(host)]
     omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
+
+
+def warn_of_loop_risk(plan: ResolvedGraph) -> None:
+    """Print a warning if the scene asks the loop of sheet and hand for more than is stable."""
+    from flexsheet.launch.health.compliance import check_graph
+
+    finding = check_graph(plan)
+    if finding is not None:
+        words.print(f"warning: {finding.describe()}", style="yellow", markup=False)
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:

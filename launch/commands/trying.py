@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.launching import describe_run, run_graph
+from flexsheet.launch.commands.launching import describe_run, run_graph, warn_of_loop_risk
 from flexsheet.launch.commands.options import (
     DEMO,
     ApparatusOption,
@@ -66,6 +66,7 @@ def try_it(
     )
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
+    warn_of_loop_risk(plan)
     console = plan.nodes["console"].parameters
     url = f"http://{console['address']}:{console['page_port']}/"
 

@@ -21,6 +21,7 @@ STEPS_PER_PERIOD = 64
 PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
 """Stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
 
+JITTER_SEED = 0
 CAMERA_RESOLUTION_M = 2e-5
 RELEASE_M = 2e-3
 """Distance from the equilibrium at which the finger is released."""
@@ -39,15 +40,18 @@ ENERGY_FRACTION = 0.05
 class Cases:
     """Hands and control loops that are simulated together; each field has shape (n,).
 
-    delay_s: time from exposure to the sheet's motion. depth_m: finger depth at equilibrium. gain:
-    factor of the sheet's motion relative to its position at equilibrium. filter_s, lead_s: time
-    constants of the low-pass filter and of the lead (prediction) applied to the measured depth.
+    delay_s: time from exposure to the sheet's motion. jitter_s: maximum additional delay of a
+    measurement, uniformly distributed; a measurement that a newer one overtakes is lost.
+    depth_m: finger depth at equilibrium. gain: factor of the sheet's motion relative to its
+    position at equilibrium. filter_s, lead_s: time constants of the low-pass filter and of the lead
+    (prediction) applied to the measured depth.
     """
 
     mass_kg: Floats
     damping_ns_per_m: Floats
     stiffness_n_per_m: Floats
     delay_s: Floats
+    jitter_s: Floats
     depth_m: Floats
     gain: Floats
     filter_s: Floats
@@ -98,10 +102,14 @@ class HeldOffset:
         )
         self._filtered = cases.depth_m.copy()
         self._rest_m = offset(cases.depth_m)
-        delays = np.round(cases.delay_s / step_s).astype(int)
-        self._delays, self._ring = delays, int(delays.max()) + 1
+        self._random = np.random.default_rng(JITTER_SEED)
+        self._delays = np.round(cases.delay_s / step_s).astype(int)
+        self._jitters = np.round(cases.jitter_s / step_s).astype(int)
+        self._ring = int((self._delays + self._jitters).max()) + 1
         # Ring buffer of queued offsets by the step at which they take effect, for each case.
         self._due = np.zeros((self._ring, len(cases)), dtype=bool)
+        self._sampled = np.zeros((self._ring, len(cases)), dtype=int)
+        self._newest = np.full(len(cases), -1)
         self._queued = np.zeros((self._ring, 2, len(cases)))
         self._last = self._rest_m.copy()
         self._held, self._rate = self._rest_m.copy(), np.zeros(len(cases))
@@ -117,7 +125,9 @@ class HeldOffset:
         wanted = self._scale(self._offset(np.maximum(self._filtered + lead, 0.0)))
         rate = (present - self._last) / self._period_s
         self._last = present
-        rows = (step + self._delays) % self._ring
+        late = self._random.integers(0, self._jitters, endpoint=True)
+        rows = (step + self._delays + late) % self._ring
+        self._sampled[rows, self._columns] = step
         self._due[rows, self._columns] = True
         self._queued[rows, 0, self._columns] = wanted
         self._queued[rows, 1, self._columns] = rate
@@ -128,7 +138,8 @@ class HeldOffset:
     def advance(self, step: int) -> Floats:
         """Return the sheet's offset (n,), m, at a time step; call it for each step in order."""
         row = step % self._ring
-        due = self._due[row]
+        due = self._due[row] & (self._sampled[row] > self._newest)
+        self._newest = np.where(due, self._sampled[row], self._newest)
         self._held = np.where(due, self._queued[row, 0], self._held + self._step_s * self._rate)
         self._rate = np.where(due, self._queued[row, 1], self._rate)
         self._due[row] = False

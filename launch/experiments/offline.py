@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -47,6 +46,7 @@ from flexsheet.nodes.twin.membrane import NotConvergedError, solve
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from flexsheet.launch.experiments.hand_gestures import FeltForce
 from flexsheet.launch.experiments.image import EyeImage
 from flexsheet.launch.experiments.stroke import (
     PAPER_TABLE_1,
@@ -172,7 +173,7 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 def draw_stability(result: dict[str, Any], path: Path) -> None:
     """Draw the fraction of stable hands over object stiffness and delay, one panel per loop."""
     rows = [*result["rows"], *result["without_bounds"]]
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})
     delays = sorted({row["delay_ms"] for row in rows})
     figure = Figure(figsize=(4.0 * len(kinds) + 4.2, 4.0), layout="constrained")
@@ -184,7 +185,7 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
                     [
                         row["stable"]
                         for row in rows
-                        if (row["kind"], row["object_pa"], row["delay_ms"])
+                        if ((row["kind"], row["jitter_ms"]), row["object_pa"], row["delay_ms"])
                         == (kind, object_pa, delay_ms)
                     ]
                 )
@@ -196,7 +197,7 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
         panel.set_xticks(range(len(objects)), [f"{1e-3 * one:.3g}" for one in objects])
         panel.set_yticks(range(len(delays)), [f"{one:.0f}" for one in delays])
         panel.set_xlabel("Young's modulus of the object, kPa")
-        panel.set_title(f"loop: {kind}")
+        panel.set_title(f"loop: {kind[0]}, jitter {kind[1]:.0f} ms")
     panels[0].set_ylabel("delay, ms")
     figure.colorbar(shown, ax=panels, label="fraction of hands that are stable")
     for towards, colour in ((True, "C3"), (False, "C0")):
@@ -214,6 +215,27 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
     compared.set_xlabel("simulated critical slope")
     compared.set_ylabel("predicted critical slope")
     compared.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
+    """Draw felt and wanted force over time, one row per hand and one column per gesture.
+
+    forces: by the hand and the gesture.
+    """
+    hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
+    figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")
+    panels = figure.subplots(len(hands), len(names), squeeze=False, sharex="col")
+    for (hand, name), force in forces.items():
+        panel = panels[hands.index(hand)][names.index(name)]
+        panel.plot(force.times_s, force.wanted_n, color="0.5", label="object")
+        panel.plot(force.times_s, force.felt_n, color="C0", linewidth=0.8, label="felt")
+        panel.set_title(f"{name}, hand of {hand}", fontsize=9)
+    for row in panels:
+        row[0].set_ylabel("force, N")
+    for panel in panels[-1]:
+        panel.set_xlabel("time, s")
+    panels[0][0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
 
 

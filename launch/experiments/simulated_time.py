@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
-from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     make_edge_row,
@@ -32,10 +31,11 @@ from flexsheet.launch.experiments.stroke import (
 from flexsheet.launch.experiments.true_geometry import ArmModel
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, nominal_apparatus
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, Side
+from flexsheet.messages.types import FingerPath, Phase, Side, SoftBody
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
+from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
@@ -45,7 +45,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import update_horizon_s
-from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
+from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
@@ -53,7 +53,9 @@ from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import Servo, forward
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.finger import validate_path
+from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.sheet_pull import SheetPull
+from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
@@ -83,12 +85,14 @@ class LoopSettings:
 
     tracking: method. planner: parameters of the planner by name. lag_known: whether the bridges
     know the true servo lag of the arms, as a reference for runs in which they measure it.
+    computing_s: time from the end of the read-out to the published target.
     """
 
     tracking: str = "adaptive"
     seed: int = 0
     planner: Mapping[str, Any] = field(default_factory=dict)
     lag_known: bool = False
+    computing_s: float = COMPUTING_S
 
 
 class MeasuredFinger:
@@ -215,6 +219,7 @@ class SimulatedSheet:
         self._models = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
         self.rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
+        self.on_edges: Callable[[float, Floats, Floats], None] | None = None
 
     def record(self, now_s: float) -> None:
         """Advance the servos to a time, and record the true edges of the sheet."""
@@ -227,6 +232,72 @@ class SimulatedSheet:
             flanges = list(self._pull.displace(*flanges, *clamps, time_s=now_s))
         for rows, flange, clamp in zip(self.rows, flanges, clamps, strict=True):
             rows.append((round(1e9 * now_s), make_edge_row(flange, clamp)))
+        if self.on_edges is not None:
+            left, right = (flange @ clamp for flange, clamp in zip(flanges, clamps, strict=True))
+            self.on_edges(now_s, left, right)
+
+
+class SimulatedLoop:
+    """Camera, tracking, planner, arms and sheet in simulated time; a coupled finger if wanted."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        apparatus: Apparatus,
+        settings: LoopSettings,
+        compliance: ComplianceController,
+    ) -> None:
+        self._truth, self._compliance = apparatus, compliance
+        parameters = PlannerParameters.model_validate(dict(settings.planner))
+        self.planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
+        self.sheet = SimulatedSheet(
+            scene, apparatus, self.planner.motion, lag_known=settings.lag_known
+        )
+        self._tracked = MeasuredFinger(scene, settings)
+        self.period_s = 1.0 / (apparatus.camera.rate_hz or scene.camera.rate_hz)
+        read_out_s = apparatus.camera.read_out_s
+        read_out_s = READ_OUT_S if read_out_s is None else read_out_s
+        self._age_s = 0.5 * scene.camera.exposure_s + read_out_s + settings.computing_s
+        self._horizon_s = self._age_s + SENDING_S + SERVO_LAG_S
+        self._target, self._valid_at_s, self._commanded_s = self.planner.motion, 0.0, 0.0
+
+    @property
+    def delay_s(self) -> float:
+        """Return the time from an exposure until the sheet has moved, as the planner uses it, s."""
+        return self._horizon_s
+
+    def run_cycles(self, until_s: float) -> None:
+        """Run the cycles of the arms up to a time."""
+        while self._commanded_s + CYCLE_S < until_s:
+            self._commanded_s += CYCLE_S
+            self._run_cycle(self._commanded_s, CYCLE_S)
+
+    def step(self, exposed_s: float, position: Floats) -> PlannedStep:
+        """Measure the finger at its true position (3,) at an exposure, plan and move the arms."""
+        predicted = self._tracked.predict_path(round(1e9 * exposed_s), position)
+        arms = self.sheet.arms
+        needed_s = self._age_s + SENDING_S + 0.5 * (arms[0].lag_s + arms[1].lag_s)
+        before_s = self._horizon_s
+        self._horizon_s = update_horizon_s(before_s, needed_s, PREDICTION_S)
+        arrives_s = exposed_s + self._age_s + SENDING_S
+        self.run_cycles(arrives_s)
+        planner = self.planner
+        self._compliance.set_delay(self._horizon_s, in_contact=planner.in_contact)
+        planned = planner.follow_finger(
+            *interpolate_path(predicted, PREDICTION_STEP_S, self._horizon_s),
+            self._compliance,
+            self.period_s + self._horizon_s - before_s,
+            predicted[0],
+        )
+        self._target, self._valid_at_s = planned.motion, exposed_s + self._horizon_s
+        self._run_cycle(arrives_s, arrives_s - self._commanded_s)
+        self._commanded_s = arrives_s
+        return planned
+
+    def _run_cycle(self, now_s: float, step_s: float) -> None:
+        self.sheet.record(now_s)
+        for arm in self.sheet.arms:
+            arm.command(self._target, self._valid_at_s, now_s, step_s)
 
 
 def follow_in_simulated_time(
@@ -241,44 +312,21 @@ def follow_in_simulated_time(
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
-    parameters = PlannerParameters.model_validate(dict(given.planner))
-    planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
     compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
-    sheet = SimulatedSheet(scene, truth, planner.motion, lag_known=given.lag_known)
-    tracked = MeasuredFinger(scene, given)
-
-    period_s = 1.0 / (truth.camera.rate_hz or scene.camera.rate_hz)
-    read_out_s = READ_OUT_S if truth.camera.read_out_s is None else truth.camera.read_out_s
-    age_s = 0.5 * scene.camera.exposure_s + read_out_s + COMPUTING_S
-    horizon_s = age_s + SENDING_S + SERVO_LAG_S
-    target, valid_at_s, commanded_s = planner.motion, 0.0, 0.0
+    loop = SimulatedLoop(scene, truth, given, compliance)
     times_ns: list[int] = []
     positions: list[Floats] = []
     following: list[bool] = []
-    for number in range(1, int((finger.duration_s + SETTLING_S) / period_s)):
-        exposed_s = number * period_s
+    for number in range(1, int((finger.duration_s + SETTLING_S) / loop.period_s)):
+        exposed_s = number * loop.period_s
         position = finger.at(max(exposed_s - SETTLING_S, 0.0))[0]
-        predicted = tracked.predict_path(round(1e9 * exposed_s), position)
-        needed_s = age_s + SENDING_S + 0.5 * (sheet.arms[0].lag_s + sheet.arms[1].lag_s)
-        before_s, horizon_s = horizon_s, update_horizon_s(horizon_s, needed_s, PREDICTION_S)
-        arrives_s = exposed_s + age_s + SENDING_S
-        while commanded_s + CYCLE_S < arrives_s:
-            commanded_s += CYCLE_S
-            _run_cycle(sheet, target, valid_at_s, commanded_s, CYCLE_S)
-        step = planner.follow_finger(
-            *interpolate_path(predicted, PREDICTION_STEP_S, horizon_s),
-            compliance,
-            period_s + horizon_s - before_s,
-        )
-        target, valid_at_s = step.motion, exposed_s + horizon_s
-        _run_cycle(sheet, target, valid_at_s, arrives_s, arrives_s - commanded_s)
-        commanded_s = arrives_s
+        step = loop.step(exposed_s, position)
         if exposed_s >= SETTLING_S:
             times_ns.append(round(1e9 * exposed_s))
             positions.append(position)
             following.append(step.command.phase not in ("hold", "wait"))
     points = np.array(positions)
-    left, right = (make_motion(rows, "edge") for rows in sheet.rows)
+    left, right = (make_motion(rows, "edge") for rows in loop.sheet.rows)
     times = np.array(times_ns, dtype=np.int64)
     shape = make_shape(dict(scene.object.geometry))
     errors = sheet_errors(
@@ -292,12 +340,89 @@ def follow_in_simulated_time(
     heights_m = shape.closest(apply(inverse(object_pose(scene)), points)).height_m
     found = FollowedFinger()
     found.add(*errors, heights_m, np.array(following))
-    return {**found.figures(), "servo_lag_ms": [1e3 * arm.lag_s for arm in sheet.arms]}
+    return {**found.figures(), "servo_lag_ms": [1e3 * arm.lag_s for arm in loop.sheet.arms]}
 
 
-def _run_cycle(
-    sheet: SimulatedSheet, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float
-) -> None:
-    sheet.record(now_s)
-    for arm in sheet.arms:
-        arm.command(target, valid_at_s, now_s, step_s)
+@dataclass(frozen=True, slots=True)
+class TouchRecording:
+    """Run of a coupled finger, sampled at the exposures.
+
+    times_s (n,). positions_m (n, 3): true fingertip.
+    phases (n,): contact phase of the planner. delay_s: time from an exposure to the sheet's motion.
+    steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
+    watchdog_triggers: number of oscillations that the planner stopped; None: unknown.
+    """
+
+    times_s: Floats
+    positions_m: Floats
+    phases: list[Phase]
+    steps: Floats
+    watchdog_triggers: int | None
+    delay_s: float
+
+
+def touch_in_simulated_time(
+    scene: Scene,
+    path: FingerPath,
+    curve: Floats,
+    make_finger: Callable[[VoluntaryPath], CoupledFinger],
+    *,
+    bounds: OffsetBoundsTable | None,
+    apparatus: Apparatus | None = None,
+    settings: LoopSettings | None = None,
+) -> TouchRecording:
+    """Simulate a hand that touches the sheet and is pushed by it, along a voluntary path.
+
+    curve: force of the object over depth, (m, 2) in m and N. bounds: the planner's bounds on the
+    sheet's offset; None to remove them.
+    """
+    truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
+    voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    compliance = ComplianceController(
+        scene, make_force_model(scene.sheet), "force_curve", bounds=bounds
+    )
+    compliance.update(make_soft_body(curve), in_contact=False)
+    if bounds is None:
+        compliance.filter_s = 0.0
+    loop = SimulatedLoop(scene, truth, given, compliance)
+    finger = make_finger(lambda at_s: voluntary.at(at_s - SETTLING_S))
+    finger.log, edges = [], EdgeTrack()
+    times_s, positions, phases = list[float](), list[Floats](), list[Phase]()
+
+    def move(now_s: float, left: Floats, right: Floats) -> None:
+        edges.add(now_s, left, right)
+        if edges:
+            finger.advance(now_s, edges)
+
+    loop.sheet.on_edges = move
+    for number in range(1, int((voluntary.duration_s + SETTLING_S + 0.5) / loop.period_s)):
+        exposed_s = number * loop.period_s
+        loop.run_cycles(exposed_s)
+        seen = finger if not edges else finger.predict(exposed_s, edges)
+        position, _ = seen.position()
+        planned = loop.step(exposed_s, position)
+        times_s.append(exposed_s)
+        positions.append(position)
+        phases.append(planned.command.phase)
+    return TouchRecording(
+        np.array(times_s),
+        np.array(positions),
+        phases,
+        np.array(finger.log),
+        loop.planner.watchdog_triggers,
+        loop.delay_s,
+    )
+
+
+def make_soft_body(curve: Floats) -> SoftBody:
+    """Return a soft body at rest with this force curve (m, 2)."""
+    return SoftBody(
+        mesh_id="",
+        method="curve",
+        in_range=True,
+        push_depth_m=0.0,
+        force_world_n=np.zeros(3),
+        stiffness_n_per_m=0.0,
+        force_curve=curve,
+        displacement_world_m=np.zeros((0, 3), dtype=np.float32),
+    )

@@ -6,7 +6,7 @@ Two simulations run in the time domain, without running nodes:
 - boundary: the critical slope, above which a random hand is not stable, compared with the
   prediction by the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
 - map: the offset that the planner uses for objects of several stiffnesses, with each random hand at
-  several delays and depths, with and without the planner's stability bounds.
+  several delays, packet jitters and depths, with and without the planner's stability bounds.
 
 The random hands are sampled from the ranges in the literature with a separate seed. So the bounds
 are tested with other hands than those from which they were derived.
@@ -52,6 +52,9 @@ HAND_RANGES = {
 """Ranges of mass (kg), stiffness (N/m) and damping ratio. Sources: see `nodes.models.hand_loop`."""
 
 DELAYS_S = (0.01, 0.03, 0.05, 0.07, 0.1)
+JITTERS_S = (0.0, 0.03)
+"""Ranges of the packet jitter: uniformly distributed additional delays up to this value."""
+
 RATES_HZ = (30.0, 60.0, 120.0)
 OBJECT_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 DEPTH_FRACTIONS = (0.25, 0.6, 0.95)
@@ -80,6 +83,7 @@ class StabilitySettings:
     delays_s: Sequence[float] = DELAYS_S
     rates_hz: Sequence[float] = RATES_HZ
     object_ratios: Sequence[float] = OBJECT_RATIOS
+    jitters_s: Sequence[float] = JITTERS_S
 
 
 def draw_hands(count: int, seed: int) -> list[Hand]:
@@ -102,6 +106,7 @@ class Trial:
     hand: Hand
     loop: SampledLoop
     depth_m: float
+    jitter_s: float = 0.0
 
 
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
@@ -115,6 +120,7 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
         damping_ns_per_m=repeat(one.hand.damping_ns_per_m for one in trials),
         stiffness_n_per_m=repeat(one.hand.stiffness_n_per_m for one in trials),
         delay_s=repeat(one.loop.delay_s for one in trials),
+        jitter_s=repeat(one.jitter_s for one in trials),
         depth_m=repeat(one.depth_m for one in trials),
         gain=np.tile(gains, len(trials)),
         filter_s=repeat(one.loop.filter_s for one in trials),
@@ -201,7 +207,9 @@ def measure_map(
     *,
     cache_dir: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a row for each object, hand, delay and kind of control loop.
+    """Return a row for each object, hand, delay, jitter and kind of control loop.
+
+    The planner knows the mean delay, to which the jitter adds half of its range.
 
     Kinds: "bounded" is the planner's loop; "unbounded" has no stability bounds and no depth filter;
     "predicted" is like "unbounded", but predicts the depth over the delay.
@@ -220,21 +228,21 @@ def measure_map(
         scaled = ObjectCurve.from_rows(curve * np.array([1.0, ratio]))
         object_pa = ratio * material.young_modulus_pa
         progress(f"object with Young's modulus {object_pa:.3g} Pa")
-        for delay_s in settings.delays_s:
-            fitted = _fit(scene, model, scaled, table.at_delay(delay_s))
+        for delay_s, jitter_s in product(settings.delays_s, settings.jitters_s):
+            fitted = _fit(scene, model, scaled, table.at_delay(delay_s + 0.5 * jitter_s))
             filter_s, suffices = fitted.choose_filter_s()
             loops = [SampledLoop(period_s, delay_s, filter_s)]
-            for row in _simulate_pushes(fitted, hands, loops):
+            for row in _simulate_pushes(fitted, hands, loops, jitter_s):
                 rows.append(
                     {"object_pa": object_pa, "kind": "bounded", "warned": not suffices} | row
                 )
         fitted = _fit(scene, model, scaled, None)
-        for kind in ("unbounded", "predicted"):
+        for kind, jitter_s in product(("unbounded", "predicted"), settings.jitters_s):
             loops = [
                 SampledLoop(period_s, delay_s, lead_s=delay_s if kind == "predicted" else 0.0)
                 for delay_s in settings.delays_s
             ]
-            for row in _simulate_pushes(fitted, hands, loops):
+            for row in _simulate_pushes(fitted, hands, loops, jitter_s):
                 rows.append({"object_pa": object_pa, "kind": kind, "warned": False} | row)
     return rows
 
@@ -254,7 +262,7 @@ def _fit(
 
 
 def _simulate_pushes(
-    fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop]
+    fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop], jitter_s: float
 ) -> list[dict[str, Any]]:
     """Return a row for each hand and control loop; stable means stable at every depth."""
     indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
@@ -273,7 +281,7 @@ def _simulate_pushes(
         return np.asarray(np.interp(at_m, depths_m, offsets_m) + beyond)
 
     trials = [
-        Trial(hand, loop, fraction * fitted.max_depth_m)
+        Trial(hand, loop, fraction * fitted.max_depth_m, jitter_s)
         for hand, loop, fraction in product(hands, loops, DEPTH_FRACTIONS)
     ]
     motion = simulate_release(
@@ -292,6 +300,7 @@ def _simulate_pushes(
         rows.append(
             {
                 **_describe(hand, loop.delay_s),
+                "jitter_ms": 1e3 * jitter_s,
                 "filter_ms": 1e3 * loop.filter_s,
                 "advance_per_depth": fitted.centre.advance_per_depth,
                 "stable": bool(gains[0]),

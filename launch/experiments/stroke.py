@@ -19,7 +19,6 @@ from scipy.interpolate import make_smoothing_spline
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.lag import estimate_lag_s
-from flexsheet.launch.experiments.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
@@ -38,6 +37,7 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from flexsheet.launch.experiments import compliance, image, stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Progress, require_scene, run_experiment
-from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.methods.blocks import attribute_error
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -34,6 +33,7 @@ from flexsheet.nodes import NodeRole, node_class
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
+from flexsheet.nodes.twin.sheet_surface import SheetSurface
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -5,16 +5,26 @@ The planner does so by moving the sheet along its normal, so that the finger fee
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import load_sheet_calibration
 from flexsheet.nodes import cache
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
-from flexsheet.nodes.models.hand_loop import OffsetBounds
+from flexsheet.nodes.cache import load_cached
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.soft_body_factory import (
+    FACTORY_PARAMETERS,
+    SoftBodyFactory,
+    choose_method,
+)
+from flexsheet.nodes.models.hand_loop import OffsetBounds, OffsetBoundsTable
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel
 from flexsheet.nodes.planner.compliance import (
     TARGET_ERROR_RATIO,
@@ -26,12 +36,17 @@ from flexsheet.nodes.planner.compliance import (
     fit_compliance,
     make_stretch_limits,
 )
-from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
+from flexsheet.nodes.planner.hand_bounds import bounds_cache, load_or_compute_bounds
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import make_force_model
 
 Floats = NDArray[np.float64]
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
+FINGERTIP_AGE_S = 0.012
+"""Age of a fingertip when it is published: half an exposure, the read-out and the computation."""
+
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Push depths in the report, as fractions of the maximum push depth."""
 
@@ -78,6 +93,105 @@ def compute_compliance(
     )
 
 
+class LoopRisk(StrEnum):
+    """Consequence of a scene that asks the loop of sheet and hand for more than is stable.
+
+    OSCILLATION: a hand of low damping can oscillate, since the sheet retreats too late.
+    DELAY: the stable advance of the sheet is too small to render the object's force.
+    SHEET: the sheet cannot render the object's force at any delay.
+    """
+
+    OSCILLATION = "oscillation"
+    DELAY = "delay"
+    SHEET = "sheet"
+
+
+@dataclass(frozen=True, slots=True)
+class LoopFinding:
+    """Result of `find_loop_risk`.
+
+    delay_s: time from a measured depth until the sheet has moved accordingly. error_ratio: largest
+    relative error of the rendered force within the stable bounds.
+    """
+
+    risk: LoopRisk
+    delay_s: float
+    error_ratio: float
+
+    def describe(self) -> str:
+        """Return the finding as a sentence with its remedy."""
+        delay_ms, error_percent = 1e3 * self.delay_s, 100.0 * self.error_ratio
+        match self.risk:
+            case LoopRisk.OSCILLATION:
+                return (
+                    f"a hand of low damping can oscillate at a delay of {delay_ms:.0f} ms; reduce "
+                    "the delay or use a stiffer object"
+                )
+            case LoopRisk.DELAY:
+                return (
+                    f"at a delay of {delay_ms:.0f} ms, the force of the object is rendered with an "
+                    f"error of {error_percent:.0f} %; reduce the delay or use a softer object"
+                )
+            case LoopRisk.SHEET:
+                return (
+                    "the sheet cannot render the force of the object: the error is "
+                    f"{error_percent:.0f} %; use another sheet or object"
+                )
+
+
+def find_loop_risk(
+    scene: Scene,
+    law: SheetForceModel,
+    curve: ObjectCurve,
+    table: OffsetBoundsTable,
+    delay_s: float,
+) -> LoopFinding | None:
+    """Return what the scene asks for beyond the range of sheet, delay and hand, if anything."""
+    bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
+    error_ratio = float(np.abs(bounded.centre.error_ratio).max())
+    if not bounded.choose_filter_s()[1]:
+        return LoopFinding(LoopRisk.OSCILLATION, delay_s, error_ratio)
+    if error_ratio <= TARGET_ERROR_RATIO:
+        return None
+    free = compute_compliance(scene, law, curve)
+    by_sheet = float(np.abs(free.centre.error_ratio).max()) > TARGET_ERROR_RATIO
+    return LoopFinding(LoopRisk.SHEET if by_sheet else LoopRisk.DELAY, delay_s, error_ratio)
+
+
+def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
+    """Return the risk of the loop of sheet and hand in a graph, before it starts.
+
+    The delay is that of the planner's parameters. Only cached data are used, since computing them
+    takes up to minutes: without the stability bounds or the soft body there is no finding, and the
+    planner reports the risk when it has them.
+    """
+    scene = plan.scene_message()
+    planners = [node for node in plan.nodes.values() if node.type == "planner"]
+    solvers = [node for node in plan.nodes.values() if node.type == "fem_solver"]
+    if scene is None or not planners or not solvers:
+        return None
+    given = PlannerParameters.model_validate(planners[0].parameters)
+    table = load_cached(bounds_cache(scene.camera.rate_hz), given.cache_dir)
+    if given.choose_compliance(scene) != "force_curve" or table is None:
+        return None
+    solver = FemSolverParameters.model_validate(solvers[0].parameters)
+    method, spacing_m = choose_method(scene, solver.method, solver.skin_spacing_m)
+    folder = solver.cache_dir or cache.default_cache_dir()
+    factory = SoftBodyFactory(spacing_m, folder, **solver.model_dump(include=FACTORY_PARAMETERS))
+    if not factory.is_cached(scene):
+        return None
+    best, *_ = factory.bodies(scene, method, lambda done, total, need: None)
+    calibration = given.sheet_calibration
+    law = make_force_model(
+        scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
+    )
+    fixed_s = given.prediction_horizon_s
+    delay_s = FINGERTIP_AGE_S + given.actuation_delay_s if fixed_s is None else fixed_s
+    return find_loop_risk(
+        scene, law, ObjectCurve.from_rows(best.at_rest().force_curve), table, delay_s
+    )
+
+
 def compliance_result(
     scene: Scene,
     law: SheetForceModel,
@@ -93,12 +207,10 @@ def compliance_result(
     table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     filter_s, stable = shown.choose_filter_s()
-    unstable_note = (
-        ""
-        if stable
-        else f"a hand of low damping can oscillate at a delay of {1e3 * delay_s:.0f} ms; reduce "
-        "the delay or use a stiffer object"
-    )
+    finding = find_loop_risk(scene, law, curve, table, delay_s)
+    # `shown.note` already describes what the sheet itself cannot render.
+    by_loop = finding is not None and finding.risk is not LoopRisk.SHEET
+    loop_note = finding.describe() if finding is not None and by_loop else ""
     depths = shown.max_depth_m * np.array(SHOWN_FRACTIONS)
     target, rendered = curve.force_n(depths), shown.rendered_force_n(depths)
     offsets = shown.normal_offset_m(depths)
@@ -128,6 +240,7 @@ def compliance_result(
         "delay_ms": 1e3 * delay_s,
         "filter_ms": 1e3 * filter_s,
         "stable_for_every_hand": stable,
-        "note": "; ".join(filter(None, (shown.note, unstable_note))),
+        "risk": None if finding is None else finding.risk,
+        "note": "; ".join(filter(None, (shown.note, loop_note))),
         "rows": rows,
     }

@@ -89,6 +89,13 @@ class SoftBodyFactory:
             return [linear]
         return [body.attach_table(linear, scene, model, table), linear]
 
+    def is_cached(self, scene: Scene) -> bool:
+        """Return whether `bodies` needs no computation that takes long."""
+        spec = body.make_soft_body_spec(
+            scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
+        )
+        return precompute.response_cache(spec).path(self.cache_dir).exists()
+
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:

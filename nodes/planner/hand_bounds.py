@@ -14,8 +14,8 @@ VERSION = 1
 """Version of the computation; tables of another version are computed again."""
 
 
-def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
-    """Return the cached bounds for a camera's rate, or compute and store them."""
+def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
+    """Return the cache entry of the bounds for a camera's rate."""
     depends_on = {
         "version": VERSION,
         "rate_hz": rate_hz,
@@ -26,11 +26,15 @@ def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoun
         "margins": [hand_loop.GAIN_MARGIN, hand_loop.DELAY_MARGIN_S, hand_loop.MIN_DECAY_PER_S],
         "hands": [asdict(hand) for hand in hand_loop.LIMITING_HANDS],
     }
-    specification: Specification[OffsetBoundsTable] = Specification(
+    return Specification(
         "hand-bounds", depends_on, encode_fields, lambda content: OffsetBoundsTable(**content)
     )
+
+
+def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
+    """Return the cached bounds for a camera's rate, or compute and store them."""
     return cached(
-        specification,
+        bounds_cache(rate_hz),
         cache_dir,
         lambda: compute_offset_bounds(1.0 / rate_hz, advance_limit=MAX_ADVANCE_PER_DEPTH),
     )

@@ -85,7 +85,7 @@ class OscillationWatchdog:
         before, after = (
             float(np.sqrt(np.mean(part**2))) for part in (depths[:half], depths[half:])
         )
-        driven = after > MIN_AMPLITUDE_M and float(works.sum()) > 0.0 and _changes_sign(depths)
+        driven = after > MIN_AMPLITUDE_M and float(works.sum()) > 0.0 and _oscillates(depths)
         steady = driven and after > STEADY_RATIO * before
         self._driven_s = self._driven_s + step_s if steady else 0.0
         if driven and (after > GROWTH_RATIO * before or self._driven_s > SUSTAINED_S):
@@ -93,6 +93,10 @@ class OscillationWatchdog:
             self.triggers += 1
 
 
-def _changes_sign(depths: np.ndarray) -> bool:
-    """Return whether the depths (n,) change their sign at least twice."""
-    return int(np.count_nonzero(np.diff(np.sign(depths)))) >= 2
+def _oscillates(depths: np.ndarray) -> bool:
+    """Return whether the depths (n,) change their sign at least twice, beyond the noise.
+
+    A push or a withdrawal by the user changes it once.
+    """
+    large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
+    return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

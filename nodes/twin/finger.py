@@ -241,12 +241,14 @@ class FingerState:
     position, velocity: (3,) in m and m/s.
     path_time_s: time since the first point of the path; negative during the reach to it.
     path_done: whether the end of the path is reached.
+    force: (3,) force of the sheet on the finger, N.
     """
 
     position: Floats
     velocity: Floats
     path_time_s: float
     path_done: bool
+    force: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -16,14 +19,17 @@ from pydantic import Field
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import NonNegative, Scene
-from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
+from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState, Floats
+from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 JITTER_STREAM = 1
@@ -51,6 +57,16 @@ class TwinFingerParameters(SimulatorParameters):
         description="other objects in the images. lab: sheet, hand, reflections; crowded: also a "
         "second marker, moving reflections, cables",
     )
+    hand: Literal["prescribed", "coupled"] = Field(
+        default="prescribed",
+        description="prescribed: the finger follows its path regardless of forces. coupled: the "
+        "simulated sheet pushes the finger off its path; the apparatus has the hand's impedance",
+    )
+    cache_dir: Path | None = Field(
+        default=None,
+        description="folder of the cached table of the sheet's force on a coupled finger; null: "
+        "the user's cache",
+    )
 
 
 class TwinFingerNode(Node):
@@ -60,6 +76,7 @@ class TwinFingerNode(Node):
     parameters: TwinFingerParameters
     scene: Input[Scene]
     twin__finger_path: Input[FingerPath]
+    twin__arms: Input[TwinArms]
     twin__finger: Output[TwinFinger]
     twin__stereo: Output[StereoPair]
 
@@ -70,11 +87,17 @@ class TwinFingerNode(Node):
     path_label = ""
     path_stroke_s: float | None = None
     missed_frames = 0
+    coupled: CoupledFinger | None = None
+    preparing: asyncio.Task[None] | None = None
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
         """Event that is set when the first scene has arrived."""
         return asyncio.Event()
+
+    @classmethod
+    def unused_inputs(cls, parameters: TwinFingerParameters, scene: Scene) -> frozenset[str]:
+        return frozenset({"twin__arms"} if parameters.hand == "prescribed" else ())
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
@@ -85,9 +108,10 @@ class TwinFingerNode(Node):
         self.filming = asyncio.create_task(self._film())
 
     async def close(self) -> None:
-        if self.filming is not None:
-            self.filming.cancel()
-            await asyncio.gather(self.filming, return_exceptions=True)
+        for task in (self.filming, self.preparing):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         truth = self.parameters.apparatus
@@ -109,8 +133,47 @@ class TwinFingerNode(Node):
         self.period_ns = round(1e9 / true_scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * true_scene.camera.exposure_s)
         self.has_scene.set()
-        if first and self.twin__finger_path.message is not None:
+        if self.parameters.hand == "coupled":
+            self.coupled, self.edges = None, EdgeTrack()
+            self.clamps = [
+                transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
+                for arm in (true_scene.arms.left, true_scene.arms.right)
+            ]
+            if self.preparing is not None:
+                self.preparing.cancel()
+            self.preparing = asyncio.create_task(self.call("couple", self._couple, scene))
+        elif first and self.twin__finger_path.message is not None:
             self._follow(self.twin__finger_path.message)
+
+    async def _couple(self, scene: Scene) -> None:
+        """Tabulate the sheet's force in a thread, couple the finger to it, and start the path."""
+        given = self.parameters
+        reaction = await asyncio.to_thread(
+            load_or_compute_reaction, scene, given.apparatus, given.cache_dir
+        )
+        true_scene = apply_apparatus(scene, given.apparatus)
+        sheet = await asyncio.to_thread(TrueSheet, true_scene, given.apparatus, reaction)
+        self.coupled = CoupledFinger(HandImpedance.of(given.apparatus), sheet, self._voluntary)
+        self.coupled.time_s = self._seconds(self.clock.now_ns())
+        if self.twin__finger_path.message is not None:
+            self._follow(self.twin__finger_path.message)
+
+    def _seconds(self, at_ns: int) -> float:
+        return (at_ns - self.started_ns) * 1e-9
+
+    def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
+        """Return position and velocity, each (3,), that the finger would have without contact."""
+        state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
+        return state.position, state.velocity
+
+    def on_twin__arms(self, arms: TwinArms, header: Header) -> None:
+        if self.coupled is None:
+            return
+        at_s = self._seconds(header.source_ns)
+        left, right = arms.world_from_flange_left, arms.world_from_flange_right
+        self.edges.add(at_s, left @ self.clamps[0], right @ self.clamps[1])
+        if self.edges:
+            self.coupled.advance(at_s, self.edges)
 
     def _make_resting(self, rest: Floats) -> FingerMotion:
         """Make a finger that rests at `rest`, with the tremor of the apparatus."""
@@ -127,7 +190,8 @@ class TwinFingerNode(Node):
         )
 
     def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
-        if self.camera is not None:
+        ready = self.parameters.hand == "prescribed" or self.coupled is not None
+        if self.camera is not None and ready:
             self._follow(path)
 
     def _follow(self, path: FingerPath) -> None:
@@ -136,6 +200,8 @@ class TwinFingerNode(Node):
         A path that the finger cannot follow raises FingerPathError and changes nothing.
         """
         now_ns = self.clock.now_ns()
+        if self.coupled is not None and self.edges:
+            self.coupled.advance(self._seconds(now_ns), self.edges)
         self.motion = self.motion.followed_by(
             (now_ns - self.motion_from_ns) * 1e-9,
             times_s=path.times_s,
@@ -157,7 +223,16 @@ class TwinFingerNode(Node):
 
     def truth(self, at_ns: int) -> FingerState:
         """Return the true state of the fingertip at a time of this node's clock."""
-        return self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
+        state = self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
+        if self.coupled is None or not self.edges:
+            return state
+        ahead = self.coupled.predict(self._seconds(at_ns), self.edges)
+        return replace(
+            state,
+            position=state.position + ahead.deviation_m,
+            velocity=state.velocity + ahead.rate_m_per_s,
+            force=ahead.force_n,
+        )
 
     def expose(self, middle_ns: int) -> StereoPair:
         """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
@@ -176,11 +251,12 @@ class TwinFingerNode(Node):
                 path_stroke_s=self.path_stroke_s,
                 position_world_m=state.position,
                 velocity_world_m_per_s=state.velocity,
+                force_world_n=state.force,
             ),
             source_ns=middle_ns,
         )
         left, right = self.camera.picture(
-            lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position,
+            self._track(exposed_ns),
             exposure_s=self.exposure_ns * 1e-9,
             time_s=exposed_ns * 1e-9,
         )
@@ -191,6 +267,13 @@ class TwinFingerNode(Node):
             left=left,
             right=right,
         )
+
+    def _track(self, exposed_ns: int) -> Callable[[float], Floats]:
+        """Return the position (3,) during an exposure as a function of the offset in time, s."""
+        if self.coupled is None:
+            return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
+        seen = self.truth(exposed_ns)
+        return lambda offset_s: seen.position + offset_s * seen.velocity
 
     def _stamp_error_ns(self) -> int:
         """Return a random sample of the true time of an exposure minus its timestamp."""
@@ -242,6 +325,8 @@ class TwinFingerNode(Node):
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
         self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'
+        if self.parameters.hand == "coupled" and self.coupled is None:
+            self.note = f"{self.note}; the force of the sheet on the finger is being computed"
 
     async def _sleep_until(self, at_ns: int) -> None:
         await asyncio.sleep(max(0.0, (at_ns - self.clock.now_ns()) * 1e-9))

@@ -286,11 +286,15 @@ _ROWS = (
               "Growdon 2000: 30 µm supported, twice that with the hand free"),
     Tolerance("finger.voluntary_bandwidth_hz", "Hz", 1.0, Uniform(1.0, 3.0),
               "visual tracking 1 to 2 Hz, submovements to 3 Hz, from memory"),
-    Tolerance("finger.hand_mass_kg", "kg", 1.0, LogUniform(0.006, 1.0), "Hajian and Howe 1997"),
-    Tolerance("finger.hand_damping_ns_per_m", "N s/m", 1.0, Uniform(0.8, 15.0),
-              "Hajian and Howe 1997; Mussa-Ivaldi 1985"),
-    Tolerance("finger.hand_stiffness_n_per_m", "N/m", 1.0, LogUniform(80.0, 600.0),
-              "Hajian and Howe 1997; Mussa-Ivaldi 1985"),
+    Tolerance("finger.hand_mass_kg", "kg", 1.0, LogUniform(0.005, 1.5),
+              "finger 4 to 6 g: Hajian and Howe 1997; wrist: resonance of 6 to 12 Hz, Lakie 2015; "
+              "arm 0.5 to 1.5 kg: Mussa-Ivaldi 1985"),
+    Tolerance("finger.hand_damping_ratio", "", 1.0, Uniform(0.15, 1.2),
+              "wrist and arm 0.15 to 0.4, from memory; digits of most young adults above 1: "
+              "10.1016/j.clinbiomech.2013.11.022"),
+    Tolerance("finger.hand_stiffness_n_per_m", "N/m", 1.0, LogUniform(50.0, 800.0),
+              "finger 200 to 800: Hajian and Howe 1997; arm 100 to 800: Mussa-Ivaldi 1985; "
+              f"relaxed finger 50 to 200: {J}"),
     Tolerance("eyes.centre_offset_m", "mm", MM,
               (Normal(0.0, 10e-3), Normal(0.0, 10e-3), Normal(0.0, 15e-3)), J,
               calibrated=Normal(0.0, 5e-3), calibrated_source=f"{J}: head tracker"),
@@ -323,12 +327,14 @@ _ROWS = (
 
 TOLERANCES: dict[str, Tolerance] = {row.key: row for row in _ROWS}
 
+_ONLY_COUPLED = "has an effect only with the finger simulator's parameter hand: coupled"
+
 NOT_SIMULATED: dict[str, str] = {
-    "finger.hand_mass_kg": "the finger follows its path regardless of the contact force",
-    "finger.hand_damping_ns_per_m": "the finger follows its path regardless of the contact force",
-    "finger.hand_stiffness_n_per_m": "the finger follows its path regardless of the contact force",
+    "finger.hand_mass_kg": _ONLY_COUPLED,
+    "finger.hand_damping_ratio": _ONLY_COUPLED,
+    "finger.hand_stiffness_n_per_m": _ONLY_COUPLED,
 }
-"""Keys that an apparatus can contain but that no simulator node uses yet, with the reason."""
+"""Keys of an apparatus without effect in the shipped graphs, with the reason."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:

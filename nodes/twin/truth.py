@@ -178,11 +178,12 @@ def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...
              "give at least minus the scene's eyes.interocular_m")
         )  # fmt: skip
     hand = apparatus.finger
-    given = [hand.hand_mass_kg, hand.hand_damping_ns_per_m, hand.hand_stiffness_n_per_m]
+    given = [hand.hand_mass_kg, hand.hand_damping_ratio, hand.hand_stiffness_n_per_m]
     if any(one is None for one in given) and any(one is not None for one in given):
         found.append(
             (("finger", "hand_mass_kg"), hand.hand_mass_kg,
-             "hand mass, damping and stiffness are not given together", "give all three or none")
+             "hand mass, damping ratio and stiffness are not given together",
+             "give all three or none")
         )  # fmt: skip
     if hand.tremor_frequency_hz <= 0.5 * hand.tremor_width_hz:
         found.append(

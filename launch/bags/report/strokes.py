@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
-from flexsheet.launch.experiments.sheet_surface import SheetSurface
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     make_edge_row,
@@ -33,6 +32,7 @@ from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]

@@ -1,0 +1,358 @@
+"""Evaluate the force that a coupled hand feels during gestures: `experiment stability --gestures`.
+
+The gestures are voluntary motions; the sheet pushes the finger off them. The force of the sheet is
+compared with the force of the object at the finger's true depth. Runs are in simulated time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.run import (
+    Progress,
+    make_settings,
+    require_scene,
+    run_experiment,
+)
+from flexsheet.launch.experiments.simulated_time import (
+    SETTLING_S,
+    TouchRecording,
+    touch_in_simulated_time,
+)
+from flexsheet.launch.experiments.stability import draw_hands
+from flexsheet.launch.experiments.stroke import object_pose
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath, Phase, SheetTarget, TwinFinger
+from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
+from flexsheet.nodes.twin.gestures import HOVER_M, minimum_jerk
+from flexsheet.nodes.twin.hand import CoupledFinger, HandImpedance, TrueSheet
+from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface, touchable
+from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
+
+Floats = NDArray[np.float64]
+
+DEPTH_FRACTION = 0.3
+"""Voluntary depth of the gestures, as a fraction of the scene's push depth."""
+
+TAPS, TAP_M, TAP_LIFT_M = 6, 0.004, 0.012
+STROKE_M_PER_S, MODULATION_HZ = 0.035, 1.0
+SLIP_FRACTION = 0.375
+"""Distance of a slip along the object, as a fraction of the sheet's width."""
+
+TRANSIENT_S = 0.1
+"""Time after a touch in which the force error counts as a transient of the contact."""
+
+MIN_CONTACT_N = 2e-3
+"""Force above which finger and sheet count as touching; a tenth of what a fingertip can feel."""
+
+
+def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
+    """Return times (n,) and surface positions (n, 3) of a push that is held and released."""
+    return minimum_jerk(
+        (0.0, 0.0, HOVER_M),
+        [
+            (0.6, (0.0, 0.0, -depth_m)),
+            (hold_s, (0.0, 0.0, -depth_m)),
+            (lift_s, (0.0, 0.0, HOVER_M)),
+        ],
+    )
+
+
+def _make_path(scene: Scene, label: str, motion: tuple[Floats, Floats]) -> FingerPath:
+    times_s, places = motion
+    return _place(scene, label, times_s, map_to_surface(scene, places))
+
+
+def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerPath:
+    return FingerPath(
+        label=label,
+        times_s=limit_path_speed(scene, times_s, points),
+        positions_world_m=points,
+        wander_m=0.0,
+        tremor_m=0.0,
+        joined_by="spline",
+    )
+
+
+def make_tap(scene: Scene, depth_m: float) -> FingerPath:
+    """Tap six times, three times a second, to a depth of 4 mm."""
+    above, below = (0.0, 0.0, TAP_LIFT_M), (0.0, 0.0, -TAP_M)
+    moves = [move for _ in range(TAPS) for move in ((0.11, below), (0.06, below), (0.16, above))]
+    return _make_path(scene, "tap", minimum_jerk(above, moves))
+
+
+def make_hold(scene: Scene, depth_m: float) -> FingerPath:
+    """Push and hold still for 3 s."""
+    return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
+
+
+def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
+    """Push, and withdraw the finger as fast as people do."""
+    return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
+
+
+def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
+    """Stroke around the object and back, while the depth oscillates by a half at 1 Hz."""
+    half_m = 0.4 * touchable(scene)[1]
+    stroke_s = 2.0 * half_m / STROKE_M_PER_S * 1.875
+    _, reach = minimum_jerk(
+        (0.0, -half_m, HOVER_M), [(0.8, (0.0, -half_m, -depth_m)), (0.3, (0.0, -half_m, -depth_m))]
+    )
+    times, places = minimum_jerk(
+        (0.0, -half_m, -depth_m),
+        [(stroke_s, (0.0, half_m, -depth_m)), (stroke_s, (0.0, -half_m, -depth_m))],
+    )
+    phase = 2.0 * np.pi * MODULATION_HZ * times
+    places[:, 2] += 0.25 * depth_m * (1.0 - np.cos(phase)) * (times < np.floor(times[-1]))
+    _, lift = minimum_jerk((0.0, -half_m, -depth_m), [(0.8, (0.0, -half_m, HOVER_M))])
+    all_places = np.concatenate([reach, places[1:], lift[1:]])
+    return _make_path(scene, "stroke", (0.004 * np.arange(len(all_places)), all_places))
+
+
+def make_slip(scene: Scene, depth_m: float) -> FingerPath:
+    """Push, slide along a straight line off the object's end, and lift."""
+    times, places = _press(0.5 * depth_m, 2.5, 0.8)
+    points = map_to_surface(scene, places)
+    ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    slide, moved = minimum_jerk((0.0,), [(0.9, (0.0,)), (2.0, (1.0,)), (10.0, (1.0,))])
+    distances_m = np.interp(times, slide, moved[:, 0]) * SLIP_FRACTION * scene.sheet.width_m
+    for fraction in np.linspace(1.0, 0.0, 21):
+        slipped = points + fraction * distances_m[:, None] * along
+        if inside(scene, slipped, 0.0):
+            break
+    return _place(scene, "slip", times, slipped)
+
+
+HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
+    "tap": (make_tap, TAPS),
+    "hold": (make_hold, 1),
+    "stroke": (make_stroke, 1),
+    "let-go": (make_let_go, 1),
+    "slip": (make_slip, 1),
+}
+"""Gesture by name, and the number of touches that it consists of."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeltForce:
+    """Force that a finger feels, and force of the object at its depth.
+
+    times_s, depths_m, felt_n, wanted_n: (n,).
+    """
+
+    times_s: Floats
+    depths_m: Floats
+    felt_n: Floats
+    wanted_n: Floats
+
+
+def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
+    """Compute the forces of a run; curve: force of the object over depth (m, 2)."""
+    shape = make_shape(dict(scene.object.geometry))
+    points = apply(inverse(object_pose(scene)), recorded.positions_m)
+    depths_m = -shape.closest(points).height_m
+    times_s, felt_n = recorded.steps[:, 0], recorded.steps[:, 2]
+    at_steps_m = np.interp(times_s, recorded.times_s, depths_m)
+    wanted = PchipInterpolator(curve[:, 0], curve[:, 1])
+    wanted_n = np.asarray(wanted(np.clip(at_steps_m, 0.0, curve[-1, 0])))
+    return FeltForce(times_s - SETTLING_S, at_steps_m, felt_n, wanted_n)
+
+
+def evaluate_touch(recorded: TouchRecording, force: FeltForce, touches: int) -> dict[str, Any]:
+    """Return the force errors and the numbers of contacts of a run.
+
+    touches: number of touches that the gesture consists of. chatter: touches beyond these.
+    transient_n: largest force error within TRANSIENT_S after a touch.
+    """
+    touching = force.felt_n > MIN_CONTACT_N
+    active = touching | (force.wanted_n > MIN_CONTACT_N)
+    error_n = np.abs(force.felt_n - force.wanted_n)
+    begins = np.flatnonzero(touching & ~np.concatenate([[False], touching[:-1]]))
+    since_s = np.full(len(touching), np.inf)
+    for at in begins:
+        since_s[at:] = force.times_s[at:] - force.times_s[at]
+    transient = active & (since_s <= TRANSIENT_S)
+    phases = np.array(recorded.phases)
+    contact = phases == "contact"
+    ratio = error_n / np.maximum(force.wanted_n, FORCE_JND_FLOOR_N)
+
+    def largest(values: Floats) -> float:
+        return float(values.max(initial=0.0))
+
+    return {
+        "peak_force_n": largest(force.felt_n),
+        "peak_error_n": largest(error_n[active]),
+        "mean_error_n": float(error_n[active].mean()) if active.any() else 0.0,
+        "median_error_percent": 100.0 * float(np.median(ratio[active])) if active.any() else 0.0,
+        "transient_n": largest(error_n[transient]),
+        "touches": len(begins),
+        "chatter": len(begins) - touches,
+        "planner_contacts": int(np.count_nonzero(contact[1:] & ~contact[:-1])),
+        "phase_changes": int(np.count_nonzero(phases[1:] != phases[:-1])),
+        "watchdog_triggers": recorded.watchdog_triggers,
+        "delay_ms": 1e3 * recorded.delay_s,
+    }
+
+
+def hand_gestures_result(
+    scene: Scene,
+    curve: Floats,
+    progress: Progress,
+    *,
+    hands: int = 1,
+    seed: int = 0,
+    names: Sequence[str] = tuple(HAND_GESTURES),
+    cache_dir: Path | None = None,
+) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
+    """Simulate gestures with random hands; return the result, and the forces for the picture.
+
+    hands: number of hands of each kind: finger, wrist and arm. curve: force of the object over
+    depth, (m, 2). The forces are by the hand's kind and the gesture.
+    """
+    progress("computing the reaction of the sheet (only once)")
+    reaction = load_or_compute_reaction(scene, None, cache_dir)
+    bounds = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
+    depth_m = DEPTH_FRACTION * scene.working_range.push_depth_m
+    rows: list[dict[str, Any]] = []
+    forces: dict[tuple[str, str], FeltForce] = {}
+    for number, hand in enumerate(draw_hands(hands, seed)):
+        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
+        impedance = HandImpedance(
+            hand.mass_kg, hand.stiffness_n_per_m, hand.damping_ns_per_m / critical
+        )
+        kind = f"{1e3 * hand.mass_kg:.0f} g"
+        progress(f"hand {number + 1} of {3 * hands}: {kind}, {hand.stiffness_n_per_m:.0f} N/m")
+        for name in names:
+            make_path, touches = HAND_GESTURES[name]
+            recorded = touch_in_simulated_time(
+                scene,
+                make_path(scene, depth_m),
+                curve,
+                lambda path, given=impedance: CoupledFinger(
+                    given, TrueSheet(scene, None, reaction), path
+                ),
+                bounds=bounds,
+            )
+            force = compute_felt_force(scene, recorded, curve)
+            forces[kind, name] = force
+            rows.append(
+                {
+                    "gesture": name,
+                    "mass_kg": hand.mass_kg,
+                    "damping_ns_per_m": hand.damping_ns_per_m,
+                    "stiffness_n_per_m": hand.stiffness_n_per_m,
+                    **evaluate_touch(recorded, force, touches),
+                }
+            )
+    return _make_result(scene, seed, rows), forces
+
+
+def run_gestures(
+    launch_file: Path,
+    settings: Sequence[str],
+    folder: Path,
+    curve: Floats,
+    progress: Progress,
+    *,
+    apparatus: str | None = None,
+) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
+    """Perform the gestures in a running graph; the result is as that of `hand_gestures_result`.
+
+    The force is sampled at the exposures only, so that shorter peaks are missed. apparatus: as for
+    `load_graph`; it has the hand's impedance.
+    """
+    coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
+    plan = load_graph(launch_file, settings=coupled, apparatus=apparatus)
+    scene, truth = require_scene(plan), plan.apparatus_message()
+    depth_m = DEPTH_FRACTION * scene.working_range.push_depth_m
+    progress("computing the reaction of the sheet (only once)")
+    load_or_compute_reaction(scene, truth)
+
+    async def procedure(driver: Driver, _: Scene) -> None:
+        for name, (make_path, _touches) in HAND_GESTURES.items():
+            progress(name)
+            await driver.follow(make_path(scene, depth_m))
+
+    bag = folder / "gestures.mcap"
+    run_experiment(launch_file, coupled, bag, procedure, progress, apparatus=apparatus)
+    hand = HandImpedance.of(truth)
+    kind = f"{1e3 * hand.mass_kg:.0f} g"
+    rows: list[dict[str, Any]] = []
+    forces: dict[tuple[str, str], FeltForce] = {}
+    for name, recorded in read_touches(bag).items():
+        force = compute_felt_force(scene, recorded, curve)
+        forces[kind, name] = force
+        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
+        rows.append(
+            {
+                "gesture": name,
+                "mass_kg": hand.mass_kg,
+                "damping_ns_per_m": hand.damping_ratio * critical,
+                "stiffness_n_per_m": hand.stiffness_n_per_m,
+                **evaluate_touch(recorded, force, HAND_GESTURES[name][1]),
+            }
+        )
+    return {**_make_result(scene, None, rows), "bag": str(bag)}, forces
+
+
+SUMMARY = ("peak_error_n", "mean_error_n", "median_error_percent", "transient_n", "chatter")
+
+
+def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the result with a summary: for each gesture, the worst value of all hands."""
+    names = dict.fromkeys(row["gesture"] for row in rows)
+    summary = {
+        name: {key: max(row[key] for row in rows if row["gesture"] == name) for key in SUMMARY}
+        for name in names
+    }
+    return {"scene": scene.name, "seed": seed, "gestures": rows, "summary": summary}
+
+
+def read_touches(bag: Path) -> dict[str, TouchRecording]:
+    """Read the runs of a coupled finger from a bag, by the label of the finger path."""
+    fingers: dict[int, TwinFinger] = {}
+    phases: dict[int, Phase] = {}
+    valid_at: list[int] = []
+    for _, message, header, _ in BagReader(bag, topics=["twin/finger", "sheet_target"]):
+        match message:
+            case TwinFinger() if message.path_label in HAND_GESTURES and message.path_time_s >= 0.0:
+                fingers[header.source_ns] = message
+            case SheetTarget():
+                phases[header.source_ns] = message.phase
+                valid_at.append(message.valid_at_ns - header.source_ns)
+            case _:
+                pass
+    runs: dict[str, list[tuple[int, TwinFinger]]] = {}
+    for at_ns in sorted(fingers):
+        if at_ns in phases:
+            runs.setdefault(fingers[at_ns].path_label, []).append((at_ns, fingers[at_ns]))
+    return {
+        label: TouchRecording(
+            np.array([finger.path_time_s + SETTLING_S for _, finger in run]),
+            np.array([finger.position_world_m for _, finger in run]),
+            [phases[at_ns] for at_ns, _ in run],
+            np.array(
+                [
+                    (finger.path_time_s + SETTLING_S, 0.0, np.linalg.norm(finger.force_world_n))
+                    for _, finger in run
+                ]
+            ),
+            None,
+            1e-9 * float(np.median(valid_at)),
+        )
+        for label, run in runs.items()
+    }

@@ -1,0 +1,254 @@
+"""Simulate the hand behind the finger: a mass on a spring and a damper, pushed by the sheet.
+
+Without contact, the finger follows its voluntary path exactly. The force F of the sheet moves it by
+a deviation e from this path, for mass m, damping b and stiffness k of the hand at the fingertip:
+
+    m e'' + b e' + k e = F(path + e)
+
+F acts along the sheet's normal. Friction forces along the sheet are neglected. In each step F is
+constant, evaluated at its middle; the linear equation is solved exactly.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.twin.force_history import ForceHistory
+from flexsheet.nodes.twin.sheet_reaction import SheetReaction
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
+
+Floats = NDArray[np.float64]
+VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
+"""Voluntary position (3,) m and velocity (3,) m/s at a time, s."""
+
+Edges = Callable[[float], tuple[Floats, Floats]]
+"""Poses (4, 4) of the left and the right edge of the sheet at a time, s."""
+
+STEP_S = 0.0005
+"""Maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
+
+INTERVAL_S = 0.004
+"""Maximum interval in which path and sheet are interpolated."""
+
+NEAR_M = 0.005
+"""Distance from the sheet beyond which no force is computed."""
+
+MAX_EXTRAPOLATION_S = 0.02
+"""Time after the newest pose of the edges for which they are assumed to keep their velocity."""
+
+MAX_PREDICTION_S = 0.1
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class HandImpedance:
+    """Mechanical impedance of a hand at the fingertip, equal in all directions.
+
+    The default is a finger whose wrist moves too. Its natural frequency is 5 Hz in the air (Lakie
+    et al. 2015: 6 to 12 Hz with less mass).
+    """
+
+    mass_kg: float = 0.15
+    stiffness_n_per_m: float = 150.0
+    damping_ratio: float = 0.3
+
+    @classmethod
+    def of(cls, apparatus: Apparatus | None) -> Self:
+        """Return the impedance that the apparatus states; if it states none, the default."""
+        finger = None if apparatus is None else apparatus.finger
+        if finger is None or finger.hand_mass_kg is None:
+            return cls()
+        assert finger.hand_stiffness_n_per_m is not None
+        assert finger.hand_damping_ratio is not None
+        return cls(finger.hand_mass_kg, finger.hand_stiffness_n_per_m, finger.hand_damping_ratio)
+
+    def transition(self, step_s: float) -> tuple[float, float, float, float]:
+        """Return the exact matrix, row by row, of the free deviation and its rate over a step."""
+        pace = math.sqrt(self.stiffness_n_per_m / self.mass_kg)
+        decay = self.damping_ratio * pace
+        split = pace * cmath.sqrt(self.damping_ratio**2 - 1.0)
+        if abs(split) * step_s < 1e-6:
+            split = 1e-6 / step_s
+        fade = math.exp(-decay * step_s)
+        cosine = (fade * cmath.cosh(split * step_s)).real
+        sine = (fade * cmath.sinh(split * step_s) / split).real
+        return cosine + decay * sine, sine, -pace * pace * sine, cosine - decay * sine
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """Sheet under the finger at one time.
+
+    origin: point (3,) of the unloaded sheet's tangent plane. normal: (3,) towards the user.
+    curve_n: normal force over the depths of the reaction's table.
+    """
+
+    origin: Floats
+    normal: Floats
+    curve_n: Floats
+
+
+class TrueSheet:
+    """Force of the simulated sheet on the finger, for given poses of its edges."""
+
+    def __init__(self, scene: Scene, apparatus: Apparatus | None, reaction: SheetReaction) -> None:
+        self.step_m = float(reaction.depths_m[1])
+        self.history = ForceHistory.of(apparatus)
+        self._reaction, self._surface = reaction, SheetSurface.of(scene, apparatus)
+
+    def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
+        """Return the sheet at the projection of the fingertip (3,) onto it."""
+        left, right = edges
+        across = right[:3, 3] - left[:3, 3]
+        distance_m = float(np.linalg.norm(across))
+        x_axis = across / distance_m
+        normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
+        normal /= np.linalg.norm(normal)
+        middle = 0.5 * (left[:3, 3] + right[:3, 3])
+        if float((tip - middle) @ normal) > NEAR_M:
+            return Touch(middle, normal, np.zeros(2))
+        plane = SheetPlanes(middle[None], normal[None], x_axis[None], np.array([distance_m]))
+        surface = self._surface.find_tangent_planes(plane, tip[None], UP)
+        x_m = float((tip - middle) @ x_axis)
+        y_m = float((tip - middle) @ np.cross(normal, x_axis))
+        sag_m = 0.0
+        if surface is not plane:
+            sag_m = float((surface.points[0] - middle) @ normal)
+        curve_n = self._reaction.curve_n(distance_m, x_m, y_m)
+        return Touch(middle + sag_m * normal, normal, curve_n)
+
+
+class EdgeTrack:
+    """Poses of the sheet's edges between and shortly after two samples, linear in time."""
+
+    def __init__(self) -> None:
+        self._samples: list[tuple[float, Floats]] = []
+
+    def add(self, time_s: float, left: Floats, right: Floats) -> None:
+        """Add the poses (4, 4) of the edges at a time; a time that does not ascend is ignored."""
+        if not self._samples or time_s > self._samples[-1][0]:
+            self._samples = [*self._samples[-1:], (time_s, np.stack([left, right]))]
+
+    def __bool__(self) -> bool:
+        return len(self._samples) == 2
+
+    def __call__(self, time_s: float) -> tuple[Floats, Floats]:
+        """Return both poses (4, 4), extrapolated by MAX_EXTRAPOLATION_S at most."""
+        (before_s, before), (after_s, after) = self._samples
+        at_s = min(max(time_s, before_s), after_s + MAX_EXTRAPOLATION_S)
+        left, right = after + (at_s - after_s) / (after_s - before_s) * (after - before)
+        return left, right
+
+
+class CoupledFinger:
+    """Deviation of the finger from its voluntary path, integrated over time.
+
+    path: voluntary motion; may be replaced at any time. deviation_m, rate_m_per_s: (3,).
+    force_n: (3,) force of the sheet on the finger, mean over the last interval.
+    log: rows (time s, indentation m, force N) of each step; None: not recorded.
+    """
+
+    def __init__(self, impedance: HandImpedance, sheet: TrueSheet, path: VoluntaryPath) -> None:
+        self.path, self.time_s = path, 0.0
+        self.deviation_m, self.rate_m_per_s = np.zeros(3), np.zeros(3)
+        self.force_n = np.zeros(3)
+        self.log: list[tuple[float, float, float]] | None = None
+        self._impedance, self._sheet = impedance, sheet
+        self._ratio, self._remembers = 1.0, sheet.history is not None
+
+    def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
+        """Return a copy that is advanced to a time.
+
+        This finger is advanced only if it is more than MAX_PREDICTION_S behind, since the poses of
+        the edges do not arrive.
+        """
+        self.advance(time_s - MAX_PREDICTION_S, edges)
+        ahead = copy(self)
+        ahead._remembers, ahead.log = False, None
+        ahead.advance(time_s, edges)
+        return ahead
+
+    def position(self) -> tuple[Floats, Floats]:
+        """Return position (m) and velocity (m/s), each (3,), at `time_s`."""
+        position, velocity = self.path(self.time_s)
+        return position + self.deviation_m, velocity + self.rate_m_per_s
+
+    def advance(self, until_s: float, edges: Edges) -> None:
+        """Integrate the motion until a time; an earlier time has no effect."""
+        span_s = until_s - self.time_s
+        if span_s <= 0.0:
+            return
+        times = np.linspace(self.time_s, until_s, math.ceil(span_s / INTERVAL_S) + 1)
+        for start_s, end_s in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+            self._advance_interval(start_s, end_s, edges)
+        self.time_s = until_s
+
+    def _advance_interval(self, start_s: float, end_s: float, edges: Edges) -> None:
+        (before, speed_before), (after, speed_after) = self.path(start_s), self.path(end_s)
+        first, last = edges(start_s), edges(end_s)
+        touch = self._sheet.find_touch(last, after + self.deviation_m)
+        normal = touch.normal
+        moved = 0.5 * sum(now[:3, 3] - old[:3, 3] for now, old in zip(last, first, strict=True))
+        span_s = end_s - start_s
+        # Gap between the sheet and the voluntary path at both ends, and its rates: a cubic.
+        gap_after = float((touch.origin - after) @ normal)
+        gap_before = float((touch.origin - moved - before) @ normal)
+        rates = [float((moved / span_s - speed) @ normal) for speed in (speed_before, speed_after)]
+        along, rate = float(self.deviation_m @ normal), float(self.rate_m_per_s @ normal)
+        aside = self.deviation_m - along * normal, self.rate_m_per_s - rate * normal
+        steps = math.ceil(span_s / STEP_S)
+        step_s = span_s / steps
+        a, b, c, d = self._impedance.transition(step_s)
+        curve_n, inverse_m = touch.curve_n.tolist(), 1.0 / self._sheet.step_m
+        ratio, stiffness = self._ratio, self._impedance.stiffness_n_per_m
+        total_n = elastic_n = 0.0
+        for number in range(steps):
+            t = (number + 0.5) / steps
+            gap_m = _hermite(t, span_s, gap_before, gap_after, rates)
+            indented_m = gap_m - along - 0.5 * step_s * rate
+            elastic_n = _interpolate(curve_n, indented_m * inverse_m)
+            force_n = ratio * elastic_n
+            total_n += force_n
+            shift_m = force_n / stiffness
+            along, rate = (
+                a * (along - shift_m) + b * rate + shift_m,
+                c * (along - shift_m) + d * rate,
+            )
+            if self.log is not None:
+                self.log.append((start_s + t * span_s, indented_m, force_n))
+        a, b, c, d = self._impedance.transition(span_s)
+        self.deviation_m = a * aside[0] + b * aside[1] + along * normal
+        self.rate_m_per_s = c * aside[0] + d * aside[1] + rate * normal
+        self.force_n = total_n / steps * normal
+        history = self._sheet.history
+        if self._remembers and history is not None and elastic_n > 0.0:
+            self._ratio = history.update(end_s, elastic_n) / elastic_n
+
+
+def _hermite(t: float, span_s: float, before: float, after: float, rates: list[float]) -> float:
+    """Interpolate a value at a fraction t of a span, from values and rates at both ends."""
+    s = 1.0 - t
+    return (
+        s * s * (1.0 + 2.0 * t) * before
+        + t * t * (1.0 + 2.0 * s) * after
+        + span_s * s * t * (s * rates[0] - t * rates[1])
+    )
+
+
+def _interpolate(curve: list[float], at: float) -> float:
+    """Interpolate a curve at a fractional index: zero below 0, the last slope beyond its end."""
+    if at <= 0.0:
+        return 0.0
+    index = min(int(at), len(curve) - 2)
+    return curve[index] + (at - index) * (curve[index + 1] - curve[index])
