@@ -65,16 +65,20 @@ class TrueSheetForce:
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
         """Return the force at a time, which must not decrease, for true tip and flange poses."""
         edges = left @ self._clamps[0], right @ self._clamps[1]
-        pressed = solve(
-            self._rubber,
-            *edges,
-            finger_tip=tip,
-            finger_radius_m=self._radius_m,
-            friction_coefficient=self._friction,
-            cells=CELLS,
-        )
-        normal = np.cross(edges[1][:3, 3] - edges[0][:3, 3], edges[0][:3, 1] + edges[1][:3, 1])
-        elastic_n = max(float(pressed.finger_force_n @ normal / np.linalg.norm(normal)), 0.0)
+        across = edges[1][:3, 3] - edges[0][:3, 3]
+        normal = np.cross(across, edges[0][:3, 1] + edges[1][:3, 1])
+        normal /= np.linalg.norm(normal)
+        elastic_n = 0.0
+        if (tip - 0.5 * (edges[0][:3, 3] + edges[1][:3, 3])) @ normal < 0.0:
+            pressed = solve(
+                self._rubber,
+                *edges,
+                finger_tip=tip,
+                finger_radius_m=self._radius_m,
+                friction_coefficient=self._friction,
+                cells=CELLS,
+            )
+            elastic_n = max(float(pressed.finger_force_n @ normal), 0.0)
         return elastic_n if self._history is None else self._history.update(time_s, elastic_n)
 
 
