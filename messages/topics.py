@@ -70,7 +70,7 @@ _ROWS = (
     Topic("soft_body", types.SoftBody, _LATEST, (20, 1000), True,
           "response of the skin to the finger",
           max_bytes=16 << 20),
-    Topic("force", types.Force, _LATEST, (1, 1000), True,
+    Topic("force", types.Force, _LATEST, None, True,
           "measured force of the finger on the sheet, or of the sheet on an arm",
           many_writers=True, open_to_tools=False),
     Topic("display", types.Display, _LATCHED, None, True, "settings of the renderer",

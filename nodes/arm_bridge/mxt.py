@@ -39,7 +39,7 @@ PACKET_BYTES = 196
 
 COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
 TYPE_NONE, TYPE_POSE, TYPE_JOINTS, TYPE_PULSES = 0, 1, 2, 3
-TYPE_JOINTS_MEASURED = 8
+TYPE_JOINTS_MEASURED, TYPE_CURRENTS_MEASURED = 8, 11
 
 FLAG_RIGHT, FLAG_ABOVE, FLAG_NONFLIP = 4, 2, 1
 
@@ -72,7 +72,10 @@ PACKET = (
     BlockField("io_data", "H", 1, "0"),
     BlockField("timeouts", "H", 1, "in an answer: the controller's cycles without a command"),
     BlockField("count", "I", 1, "in an answer: the communications since the program's start"),
-    BlockField("more_1", "x", 44, "a second monitor: type, pad, data; not used"),
+    BlockField("monitor_type", "H", 1, "type of a second quantity: 0 none, 11 measured currents"),
+    BlockField("monitor_reserved", "x", 2, "0"),
+    BlockField("currents", "i", 8, "in an answer: motor currents, percent of the rated ones"),
+    BlockField("monitor_flags", "x", 8, "0"),
     BlockField("more_2", "x", 44, "a third"),
     BlockField("more_3", "x", 44, "a fourth"),
 )
@@ -95,19 +98,33 @@ class MxtStatus(ArmStatus):
 
 
 def encode(
-    command: int, *, send_type: int = 0, data: Sequence[float] = (), flags: int = 0
+    command: int,
+    *,
+    send_type: int = 0,
+    data: Sequence[float] = (),
+    flags: int = 0,
+    with_currents: bool = False,
 ) -> bytes:
-    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers."""
+    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers.
+
+    with_currents: whether to request the motor currents too.
+    """
     padded = (*data, *([0.0] * (8 - len(data))))
-    return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, flags, *([0] * 8))
+    head = (command, send_type, TYPE_JOINTS_MEASURED, *padded, flags, *([0] * 8))
+    return _PACKET.pack(*head, TYPE_CURRENTS_MEASURED if with_currents else TYPE_NONE, *([0] * 8))
 
 
-def encode_joints(joints_rad: Floats) -> bytes:
+def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
     """Encode a motion to joints (6,) rad; raises ValueError unless there are six finite ones."""
-    return encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=validate_joints(joints_rad))
+    return encode(
+        COMMAND_MOVE,
+        send_type=TYPE_JOINTS,
+        data=validate_joints(joints_rad),
+        with_currents=with_currents,
+    )
 
 
-def encode_pose(joints_rad: Floats) -> bytes:
+def encode_pose(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
     """Encode a motion of the flange to its pose at joints (6,) rad, with their structure flags."""
     pose = forward(validate_joints(joints_rad))
     rotation = pose[:3, :3]
@@ -127,6 +144,7 @@ def encode_pose(joints_rad: Floats) -> bytes:
         send_type=TYPE_POSE,
         data=(*(pose[:3, 3] * 1e3).tolist(), a, b, c),
         flags=find_branch_flags(joints_rad, pose),
+        with_currents=with_currents,
     )
 
 
@@ -142,9 +160,9 @@ def decode_answer(packet: bytes) -> MxtStatus:
     """Decode an answer; raises ArmAnswerError if it is invalid."""
     if len(packet) != PACKET_BYTES:
         raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
-    command, send_type, receive_type, *data, _, _, _, _, _, _, _, timeouts, count = _PACKET.unpack(
-        packet
-    )
+    numbers = _PACKET.unpack(packet)
+    (command, send_type, receive_type), data = numbers[:3], numbers[3:11]
+    timeouts, count, monitor_type = numbers[18:21]
     if command not in (COMMAND_NONE, COMMAND_MOVE):
         raise ArmRefusedError("the controller has ended external control")
     # According to the manual, both fields contain the type of the answer's data.
@@ -156,7 +174,16 @@ def decode_answer(packet: bytes) -> MxtStatus:
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
         raise ArmAnswerError("measured joints are not angles: a value is too large or NaN")
-    return MxtStatus(joints_rad=joints, faults=(), count=count, timeouts=timeouts)
+    currents = None
+    if monitor_type == TYPE_CURRENTS_MEASURED:
+        currents = np.array(numbers[21 : 21 + JOINTS], dtype=np.float64)
+    return MxtStatus(
+        joints_rad=joints,
+        faults=(),
+        count=count,
+        timeouts=timeouts,
+        currents_percent=currents,
+    )
 
 
 def has_advanced(count: int, before: int, steps: int) -> bool:
@@ -180,10 +207,11 @@ class MxtLink:
         *,
         timeout_s: float = 2.0 * CONTROLLER_CYCLE_S,
         poses: bool = False,
+        with_currents: bool = False,
     ) -> None:
         self.host, self.port = host, port
         self.stale = 0
-        self._timeout_s = timeout_s
+        self._timeout_s, self._with_currents = timeout_s, with_currents
         self._move_packet = encode_pose if poses else encode_joints
         self._socket: socket.socket | None = None
         self._count: int | None = None
@@ -203,7 +231,11 @@ class MxtLink:
             self._count, self._unanswered = None, 0
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        packet = self._move_packet(joints_rad) if mode == "move" else encode(COMMAND_NONE)
+        currents = self._with_currents
+        if mode == "move":
+            packet = self._move_packet(joints_rad, with_currents=currents)
+        else:
+            packet = encode(COMMAND_NONE, with_currents=currents)
         try:
             link = await self._open()
             self._drop_late_answers(link)
