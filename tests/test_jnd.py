@@ -66,7 +66,7 @@ def test_the_weber_fraction_of_20_participants_is_recovered(tmp_path: Path) -> N
     summary = result["summary"]
     assert summary["median_error_percent"] < 10.0
     assert abs(summary["median_signed_error_percent"]) < 10.0
-    assert summary["covered_ratio"] >= 0.8
+    assert summary["covered_percent"] >= 80.0
     assert len({row["csv"] for row in result["rows"]}) == 20
     for row in result["rows"]:
         assert json.loads((tmp_path / f"{row['participant']}.json").read_text()) == row

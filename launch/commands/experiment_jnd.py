@@ -240,6 +240,6 @@ def _summarize(rows: list[dict[str, Any]], reference_pa: float) -> dict[str, Any
         result["summary"] = {
             "median_error_percent": float(np.median(np.abs(errors))),
             "median_signed_error_percent": float(np.median(errors)),
-            "covered_ratio": float(np.mean(covered)),
+            "covered_percent": 100.0 * float(np.mean(covered)),
         }
     return result
