@@ -19,7 +19,7 @@ Ask = Callable[[str], Awaitable[str]]
 INSTRUCTIONS = """\
 Instructions for the operator
   Before: obtain the ethics approval and the signed information sheet
-  (docs/participant-information.md). Test the hardware stop of the arms.
+  (docs/participant-information.txt). Test the hardware stop of the arms.
   Code: use a random participant code, never a name. Keep the list of codes elsewhere.
   Say: "You push two soft objects, one after the other, each to about the same depth. Then say
   which one was stiffer, 1 or 2. Guess if you are not sure. You may pause or stop at any time."
