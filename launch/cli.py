@@ -36,7 +36,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "topic": ("topic",),
     "bag": ("bag",),
     "arms": ("arms",),
-    "experiment": ("experiment", "experiment_sweeps"),
+    "experiment": ("experiment", "experiment_jnd", "experiment_sweeps"),
     "apparatus": ("apparatus",),
     "demo": ("demo",),
     "chart": ("chart",),

@@ -288,6 +288,35 @@ class SoftBody(Message):
     displacement_world_m: Points3
 
 
+ForceSource = Literal["gauge", "motor_currents"]
+ForceAxis = Literal["sheet_normal", "left_edge", "right_edge"]
+"""Measured component of a force, in the frame of the sheet.
+
+sheet_normal: force of the finger on the sheet, positive away from the user. left_edge, right_edge:
+pull of the sheet on an arm's clamped edge, positive towards the other edge.
+"""
+
+ForceReason = Literal["ok", "no_reading", "overload", "in_motion"]
+"""Reason why a force is not valid, in the order of the values.
+
+The device has sent no readable number for some time; the force exceeds the device's range; the arm
+moves, so that its motor currents contain friction and acceleration.
+"""
+
+
+class Force(Message):
+    """Measured force; the source timestamp is the time of the measurement."""
+
+    source: ForceSource
+    axis: ForceAxis
+    valid: bool
+    reason: ForceReason
+    force_n: Finite = Field(description="measured force, N; the last one if `valid` is false")
+    standard_deviation_n: NonNegative = Field(
+        description="standard deviation of noise and calibration error, N"
+    )
+
+
 class Eye(Message):
     """Position of the user's eyes from a head tracker; without one, the scene's `eyes` are used."""
 

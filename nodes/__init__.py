@@ -52,11 +52,13 @@ NODES: dict[str, str] = {
     "arm_bridge": "flexsheet.nodes.arm_bridge.node:ArmBridge",
     "fem_solver": "flexsheet.nodes.fem_solver.node:FemSolver",
     "renderer": "flexsheet.nodes.renderer.node:Renderer",
+    "gauge": "flexsheet.nodes.gauge.node:Gauge",
     "clock": "flexsheet.nodes.clock.node:ClockNode",
     "recorder": "flexsheet.nodes.recorder.node:Recorder",
     "console": "flexsheet.nodes.console.node:Console",
     "twin_finger": "flexsheet.nodes.twin.finger_node:TwinFingerNode",
     "twin_arms": "flexsheet.nodes.twin.arms_node:TwinArmsNode",
+    "twin_gauge": "flexsheet.nodes.twin.gauge_node:TwinGauge",
     "twin_eye": "flexsheet.nodes.twin.eye_node:TwinEyeNode",
 }
 

@@ -302,6 +302,11 @@ class Node:
         return frozenset()
 
     @classmethod
+    def unused_outputs(cls, parameters: Any) -> frozenset[str]:
+        """Return the outputs on which a node with these parameters publishes nothing."""
+        return frozenset()
+
+    @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
         """Return the topics to subscribe to in addition to the declared ports.
 

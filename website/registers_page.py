@@ -15,7 +15,7 @@ from flexsheet.nodes.arm_bridge.modbus import (
     count_registers,
 )
 
-KINDS = {"H": "u16", "I": "u32", "f": "float32"}
+KINDS = {"H": "u16", "I": "u32", "i": "i32", "f": "float32"}
 
 
 def render() -> str:

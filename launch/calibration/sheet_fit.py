@@ -135,14 +135,27 @@ def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) ->
 NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ratio")
 
 
+PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
+"""Standard deviations of a width that was measured with a ruler (tolerance of the slack width), and
+of the logarithm of the cubic ratio, which is 1 for ideal rubber."""
+
+
 def fit_sheet_model(
-    pushes: Sequence[MeasuredPush], nominal: Rubber, *, with_mooney: bool = False
+    pushes: Sequence[MeasuredPush],
+    nominal: Rubber,
+    *,
+    with_mooney: bool = False,
+    with_prior: bool = False,
 ) -> SheetModelFit:
     """Fit modulus times thickness, unstretched width, cubic ratio and optionally Mooney weight.
 
     The last two are the ratio of the cubic term and the weight of the Mooney term. The
-    least-squares fit is robust: first with soft-L1 loss, then without outliers. Raises
-    SheetModelFitError for too few rows, and for rows that do not determine a parameter.
+    least-squares fit is robust: first with soft-L1 loss, then without outliers.
+
+    with_prior: also use the nominal width and ideal rubber as measurements, for rows that have
+    almost one stretch and so do not determine the width.
+
+    Raises SheetModelFitError for too few rows, and for rows that do not determine a parameter.
     """
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
@@ -164,7 +177,11 @@ def fit_sheet_model(
         )
 
     def residuals(numbers: Floats, used: Bools) -> Floats:
-        return _residuals(build_model(numbers), pushes, nominal.width_m, used)
+        rows = _residuals(build_model(numbers), pushes, nominal.width_m, used)
+        if not with_prior:
+            return rows
+        width_sigmas = numbers[1] * nominal.width_m / PRIOR_WIDTH_M
+        return np.append(rows, [width_sigmas, numbers[2] / PRIOR_LOG_CUBIC])
 
     used = np.ones(len(pushes), dtype=bool)
     for loss in ("soft_l1", "linear"):

@@ -38,6 +38,7 @@ def register(app: typer.Typer) -> None:
         "sheet",
         epilog=examples(
             "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
+            "flexsheet calibrate sheet --bag pushes.mcap -o sheet.yaml",
             "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
         ),
     )(sheet)
@@ -52,6 +53,14 @@ def sheet(
             metavar="CSV",
             help="CSV file of measured pushes; columns: depth_mm, force_n, edge_distance_mm or "
             "stretch_ratio; optional ones: docs/sheet.md.",
+        ),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="BAG",
+            help="Recording with the topics force, fingertip, arm_left and arm_right, in which a "
+            "finger rests at several depths; its scene replaces --scene.",
         ),
     ] = None,
     scene_file: SceneOption = CYLINDER,
@@ -90,7 +99,8 @@ def sheet(
     """Fit the force model of a sheet to forces of a finger that pushes it.
 
     The fitted parameters are modulus times thickness, width without tension, and a cubic term. The
-    pushes are rows of a CSV file (--rows, --scene) or are simulated (--twin).
+    pushes are rows of a CSV file (--rows, --scene), or come from a recording with a force gauge
+    (--bag), or are simulated (--twin).
     """
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
@@ -98,14 +108,19 @@ def sheet(
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
     check_folder("-o", output)
-    if (rows is None) == (twin is None):
-        raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
+    if sum(one is not None for one in (rows, bag, twin)) != 1:
+        raise CommandError("give exactly one of --rows CSV, --bag BAG and --twin SCENE", BAD_INPUT)
     command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
         scene = load_scene(scene_file)
         pushes, lines = read_rows(rows, scene.sheet, scene.finger.radius_m)
         command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
+    elif bag is not None:
+        scene, pushes = _read_bag(bag)
+        lines = list(range(1, len(pushes) + 1))
+        command += ["--bag", str(bag)]
+        source = str(bag)
     else:
         assert twin is not None
         scene = load_scene(twin)
@@ -118,7 +133,13 @@ def sheet(
     command += ["--mooney"] if mooney else []
     try:
         calibration = make_calibration(
-            scene, pushes, lines, source=source, with_mooney=mooney, with_table=table
+            scene,
+            pushes,
+            lines,
+            source=source,
+            with_mooney=mooney,
+            with_table=table,
+            with_prior=bag is not None,
         )
     except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}", BAD_INPUT) from error
@@ -134,12 +155,14 @@ def make_calibration(
     source: str,
     with_mooney: bool,
     with_table: bool,
+    with_prior: bool = False,
 ) -> SheetCalibration:
     """Fit the force model of the sheet to pushes, and return it as a calibration.
 
-    lines: line number of each push in its file. Raises SheetModelFitError if the pushes do not
-    determine the parameters.
+    lines: line number of each push in its file. with_prior: see `fit_sheet_model`. Raises
+    SheetModelFitError if the pushes do not determine the parameters.
     """
+    from functools import partial
     from importlib.metadata import version
 
     from flexsheet.launch.calibration.sheet_fit import (
@@ -156,11 +179,17 @@ def make_calibration(
     )
     from flexsheet.nodes.planner.sheet_force import make_rubber
 
-    fit = fit_sheet_model(pushes, make_rubber(scene.sheet), with_mooney=with_mooney)
+    fit_model = partial(
+        fit_sheet_model,
+        nominal=make_rubber(scene.sheet),
+        with_mooney=with_mooney,
+        with_prior=with_prior,
+    )
+    fit = fit_model(pushes)
     hysteresis = estimate_hysteresis(fit, pushes)
     if hysteresis is not None:
         pushes = remove_hysteresis(pushes, hysteresis)
-        fit = fit_sheet_model(pushes, make_rubber(scene.sheet), with_mooney=with_mooney)
+        fit = fit_model(pushes)
     numbers = {
         name: Fitted(value=value, standard_deviation=deviation)
         for name, value, deviation in zip(
@@ -208,6 +237,16 @@ def make_calibration(
         max_depth_m=max(push.depth_m for push in pushes),
         table=table,
     )
+
+
+def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
+    from flexsheet.launch.calibration.sheet_bag import read_pushes
+    from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
+
+    try:
+        return read_pushes(bag)
+    except SheetModelFitError as error:
+        raise CommandError(f"{bag}: {error}", BAD_INPUT) from error
 
 
 def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:

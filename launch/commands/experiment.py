@@ -322,8 +322,9 @@ def compliance(
         print_json({**result, "figure": str(image)})
         return
     columns = ["position", "depth, mm", "object, N", "rendered, N", "error, %", "offset, mm"]
+    columns += ["measured, N"] if "measured_n" in result["rows"][0] else []
     cells = [
-        [cell if isinstance(cell, str) else f"{cell:.2f}" for cell in row.values()]
+        [f"{cell:.2f}" if isinstance(cell, float) else cell or "-" for cell in row.values()]
         for row in result["rows"]
     ]
     print_table(columns, cells)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
+from flexsheet.messages.types import FingerPath, Force, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
@@ -53,6 +53,9 @@ APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
 """Duration of a rest, and duration of its last part, in which the force is evaluated."""
+
+MEASURED_S = 0.6
+"""Duration of the last part of a rest in which measured forces are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
@@ -153,6 +156,7 @@ class ComplianceRecording:
 
     windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
     as rows (16,). curves: object force over depth, (m, 2) each, published at `curve_times_ns`.
+    forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
     """
 
     scene: Scene
@@ -162,6 +166,7 @@ class ComplianceRecording:
     curve_times_ns: list[int]
     curves: list[Floats]
     apparatus: Apparatus | None = None
+    forces: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
@@ -172,7 +177,8 @@ def read_bag(bag: Path) -> ComplianceRecording:
     windows: dict[str, tuple[int, int]] = {}
     flanges: tuple[list[tuple[int, Floats]], list[tuple[int, Floats]]] = ([], [])
     curves: list[tuple[int, Floats]] = []
-    topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body"]
+    forces: list[tuple[float, float]] = []
+    topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body", "force"]
     for _, message, header, _ in BagReader(bag, topics=topics):
         match message:
             case Scene():
@@ -188,6 +194,8 @@ def read_bag(bag: Path) -> ComplianceRecording:
                 flanges[1].append((header.source_ns, message.world_from_flange_right.ravel()))
             case SoftBody() if len(message.force_curve) > 0:
                 curves.append((header.source_ns, message.force_curve))
+            case Force() if message.valid and message.axis == "sheet_normal":
+                forces.append((header.source_ns, message.force_n))
             case _:
                 pass
     if scene is None or not curves:
@@ -204,6 +212,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
         edges=(make_motion(flanges[0], "twin/arms"), make_motion(flanges[1], "twin/arms")),
         curve_times_ns=[time for time, _ in curves],
         curves=[curve for _, curve in curves],
+        forces=np.array(forces).reshape(-1, 2),
     )
 
 
@@ -345,9 +354,10 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         begin_ns, end_ns = find_recorded(recorded.windows_ns, "finger path", label)
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, REST_SAMPLES) * 1e9)
-            resting.append(
-                _make_row(press, hold, [reference.evaluate(int(at), press) for at in times])
-            )
+            row = _make_row(press, hold, [reference.evaluate(int(at), press) for at in times])
+            if len(recorded.forces):
+                row["measured_n"] = _measure_n(recorded.forces, begin_ns, hold)
+            resting.append(row)
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
     errors = np.array([row["error_percent"] for row in resting])
@@ -373,6 +383,16 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         "apparatus": "nominal" if recorded.apparatus is None else recorded.apparatus.origin,
         "bag": str(bag),
     }
+
+
+def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
+    """Return the mean measured force of a rest, N; None if there is none in its interval.
+
+    The interval begins earlier than that of the true force, because gauges are slow.
+    """
+    since_s = 1e-9 * (forces[:, 0] - begin_ns)
+    chosen = forces[(since_s > hold.end_s - MEASURED_S) & (since_s < hold.end_s), 1]
+    return float(chosen.mean()) if len(chosen) else None
 
 
 def _evaluate_moving(

@@ -19,6 +19,7 @@ from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
     Correction,
@@ -27,12 +28,23 @@ from flexsheet.messages.types import (
     Pattern,
     Shading,
     SheetTarget,
+    Skin,
     Status,
     TwinEye,
     TwinFinger,
 )
 
-READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
+READ = (
+    "twin/finger",
+    "twin/eye",
+    "sheet_target",
+    "arm_left",
+    "arm_right",
+    "skin",
+    "soft_body",
+    "force",
+    "status",
+)
 WRITTEN = ("twin/finger_path", "display")
 
 # Measurement noise of the finger moves the sheet slightly; below these limits it counts as at rest.
@@ -54,10 +66,21 @@ class Driver:
     """Connection of an experiment to a running graph; an asynchronous context manager."""
 
     def __init__(
-        self, plan: ResolvedGraph, run: Run, pids: Callable[[], Mapping[str, int]] = dict
+        self,
+        plan: ResolvedGraph,
+        run: Run,
+        pids: Callable[[], Mapping[str, int]] = dict,
+        publish_scene: Callable[[Scene], int] | None = None,
     ) -> None:
-        """pids: function that returns the process id of each running node, for measurements."""
+        """Connect nothing yet.
+
+        pids: function that returns the process id of each running node, for measurements.
+        publish_scene: function that replaces the scene and returns its source timestamp.
+        """
         self._plan, self._run, self.pids = plan, run, pids
+        self._publish_scene = publish_scene
+        self.on_message: Callable[[Message], None] = lambda message: None
+        self._skin_source_ns = 0
         self._writer: GraphWriter | None = None
         self._subscribers: list[Subscriber] = []
         self._newest: dict[str, Message] = {}
@@ -96,6 +119,11 @@ class Driver:
     def _make_handler(self, name: str) -> Callable[[Message, Header], None]:
         def handle(message: Message, header: Header) -> None:
             self._newest[name] = message
+            self.on_message(message)
+            if isinstance(message, Skin):
+                # The bodies of the former scene answer no more.
+                self._skin_source_ns = header.source_ns
+                self._newest.pop("soft_body", None)
             if isinstance(message, Status):
                 self._notes[message.node] = message.note or message.last_error
             if isinstance(message, ArmState):
@@ -156,6 +184,16 @@ class Driver:
 
         what = " and a soft body" if needs_body else ""
         await self.wait_for(ready, f"both arms in mode follow{what}", 3 * WAIT_S)
+
+    async def change_scene(self, scene: Scene) -> None:
+        """Replace the scene of the graph, and wait for its soft body and both arms."""
+        if self._publish_scene is None:
+            raise RuntimeError("this driver cannot publish a scene")
+        source_ns = self._publish_scene(scene)
+        await self.wait_for(
+            lambda: self._skin_source_ns >= source_ns, "the skin of the new object", 3 * WAIT_S
+        )
+        await self.wait_ready()
 
     def move_finger(self, path: FingerPath) -> None:
         self._publish("twin/finger_path", path)

@@ -60,7 +60,8 @@ async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()
-        async with Driver(plan, graph.run, lambda: graph.pids) as driver:
+        driver = Driver(plan, graph.run, lambda: graph.pids, graph.publish_scene)
+        async with driver:
             await _run_while_graph_runs(graph, _run_procedure(driver, scene, procedure, progress))
 
 
@@ -95,7 +96,7 @@ async def _run_while_graph_runs(graph: RunningGraph, work: Coroutine[Any, Any, N
 def run_experiment(
     launch_file: Path,
     settings: Sequence[str],
-    bag: Path,
+    bag: Path | None,
     procedure: Procedure,
     progress: Progress,
     *,
@@ -103,7 +104,7 @@ def run_experiment(
     needed: Collection[str] = (),
     without: Collection[Feature] = (),
 ) -> None:
-    """Run a procedure on the graph of a launch file, and record all topics to `bag`.
+    """Run a procedure on the graph of a launch file, and record all topics to `bag`, if given.
 
     settings, apparatus, needed, without: arguments for `load_graph`.
     """
@@ -119,7 +120,7 @@ def run_experiment(
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
     except ExperimentError as error:
-        if not bag.exists():
+        if bag is None or not bag.exists():
             raise
         raise ExperimentError(f"{error}\nrecording until the error: {bag}") from error
 

@@ -40,8 +40,9 @@ def omit_unneeded(
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons.
 
-    Inputs that a node does not use with this scene are disconnected.  If a node of the graph
-    publishes scenes, it may later publish one that needs more nodes, so the scene is ignored.
+    Ports that a node does not use with its parameters and this scene are disconnected.  If a node
+    of the graph publishes scenes, it may later publish one that needs more nodes, so the scene is
+    ignored.
 
     needed: topics that command-line tools read.
     """
@@ -50,7 +51,10 @@ def omit_unneeded(
         fixed = None
     kept, omitted = list(entries), list[OmittedNode]()
     for entry in entries:
-        if fixed is not None and entry.type is not None and entry.parameters is not None:
+        if entry.type is None or entry.parameters is None:
+            continue
+        entry.disconnect(entry.type.unused_outputs(entry.parameters))
+        if fixed is not None:
             entry.disconnect(entry.type.unused_inputs(entry.parameters, fixed))
     while True:
         found = next(_find_unneeded(kept, fixed, needed), None)

@@ -73,7 +73,7 @@ class NodeEntry:
         )
 
     def disconnect(self, ports: Iterable[str]) -> None:
-        """Disconnect the named inputs, except those to which the launch file assigns a topic."""
+        """Disconnect the named ports, except those to which the launch file assigns a topic."""
         names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
             if port.name in names:

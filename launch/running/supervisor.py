@@ -61,6 +61,7 @@ from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.notes import NodeNote
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
@@ -285,7 +286,9 @@ class RunningGraph:
         self._children: dict[str, Child] = {}
         self._supervisors: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
-        self._publishers: list[Publisher] = []
+        self._publishers: dict[str, Publisher] = {}
+        self._sequences: dict[str, int] = {}
+        self._epoch_ns = 0
         self._agents: dict[str, HostAgent] = {}
         self._rings: dict[str, KeyRing] = {}
         self._keys_watch: asyncio.Task[None] | None = None
@@ -393,7 +396,7 @@ class RunningGraph:
                 child.kill_now()
             for name, child in self._children.items():
                 self._set_exit_code(self._processes[name], child.exited.result())
-            for publisher in self._publishers:
+            for publisher in self._publishers.values():
                 publisher.close()
             self._publishers.clear()
             for agent in self._agents.values():
@@ -441,32 +444,48 @@ class RunningGraph:
         for name, process in self._processes.items():
             self._supervisors[name] = asyncio.create_task(self._supervise(process), name=name)
 
-    def _publish_latched(self, topic: str, message: Message | None) -> None:
-        """Publish a message that subscribers also receive if they connect later."""
+    def publish_scene(self, scene: Scene) -> int:
+        """Replace the scene of the running graph, and return the source timestamp of the message.
+
+        Raises RuntimeError if a node of the graph publishes the scene, such as the console.
+        """
+        source_ns = self._publish_latched("scene", scene)
+        if source_ns is None:
+            raise RuntimeError("a node of the graph publishes the scene; omit it (--without NODE)")
+        return source_ns
+
+    def _publish_latched(self, topic: str, message: Message | None) -> int | None:
+        """Publish a message that subscribers also receive if they connect later.
+
+        Returns its source timestamp; None if there is no message, or another writer of the topic.
+        """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
-            return
-        publisher = Publisher(
-            find_topic(topic),
-            local_endpoints(self.run, writer.endpoints),
-            keys=self._rings.get(MAIN),
-            on_refused=partial(self._report, LAUNCHER),
-        )
-        self._publishers.append(publisher)
+            return None
         clock = SystemClock()
         now_ns = clock.now_ns()
-        publisher.send(
+        if topic not in self._publishers:
+            self._publishers[topic] = Publisher(
+                find_topic(topic),
+                local_endpoints(self.run, writer.endpoints),
+                keys=self._rings.get(MAIN),
+                on_refused=partial(self._report, LAUNCHER),
+            )
+            self._epoch_ns = self._epoch_ns or now_ns
+        self._sequences[topic] = self._sequences.get(topic, 0) + 1
+        self._publishers[topic].send(
             message,
             Header(
-                sequence=1,
+                sequence=self._sequences[topic],
                 source_ns=now_ns,
                 publish_ns=now_ns,
                 clock_id=clock.id,
                 writer=LAUNCHER,
-                epoch=now_ns,
+                epoch=self._epoch_ns,
                 plan=self.plan.hash,
             ),
         )
+        return now_ns
 
     def _start_agent(self, host: str) -> None:
         git = json.loads((self.run.directory / "git.json").read_text())
@@ -520,7 +539,7 @@ class RunningGraph:
                 reported = ""
                 self._report(LAUNCHER, f"keys of {host} reloaded")
                 if host == MAIN:
-                    for publisher in self._publishers:
+                    for publisher in self._publishers.values():
                         publisher.renew_keys(change)
                 if host in self._agents:
                     self._agents[host].renew_keys(change)

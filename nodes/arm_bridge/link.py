@@ -134,18 +134,22 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """Answer of an arm: measured joints (6,) rad, faults, and whether the joints are new."""
+    """Answer of an arm: measured joints (6,) rad, faults, and whether the joints are new.
+
+    currents_percent: motor currents (6,), percent of the rated ones; None if they are not reported.
+    """
 
     joints_rad: Floats
     faults: tuple[ArmFault, ...]
     freshness: Freshness = field(default=Freshness.FIRST, kw_only=True)
+    currents_percent: Floats | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
 class BlockField:
     """Field of a register block or packet.
 
-    kind: code of Python's `struct`: H (u16), I (u32), f (float32) or x (padding).
+    kind: code of Python's `struct`: H (u16), I (u32), i (i32), f (float32) or x (padding).
     """
 
     name: str

@@ -11,9 +11,14 @@ from flexsheet.nodes.arm_bridge.mxt import MxtLink
 Driver = Literal["modbus", "mxt"]
 
 
-def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
-    """Create the link to an arm, without opening it; timeout_s None: the driver's default."""
+def make_link(
+    driver: Driver, host: str, port: int, timeout_s: float | None, *, with_currents: bool = False
+) -> ArmLink:
+    """Create the link to an arm, without opening it; timeout_s None: the driver's default.
+
+    with_currents: whether to request the motor currents, which only MXT reports.
+    """
     options = {} if timeout_s is None else {"timeout_s": timeout_s}
     if driver == "modbus":
         return ModbusLink(host, port, **options)
-    return MxtLink(host, port, **options)
+    return MxtLink(host, port, with_currents=with_currents, **options)

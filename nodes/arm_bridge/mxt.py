@@ -37,7 +37,7 @@ CONTROLLER_CYCLE_S = 0.0071
 PACKET_BYTES = 196
 
 COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
-TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED = 0, 2, 8
+TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED, TYPE_CURRENTS_MEASURED = 0, 2, 8, 11
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
 """Maximum plausible angle of a joint; an answer with a larger angle is invalid."""
@@ -63,7 +63,10 @@ PACKET = (
     BlockField("io_data", "H", 1, "0"),
     BlockField("timeouts", "H", 1, "in an answer: the controller's cycles without a command"),
     BlockField("count", "I", 1, "in an answer: the communications since the program's start"),
-    BlockField("more_1", "x", 44, "a second monitor: type, pad, data; not used"),
+    BlockField("monitor_type", "H", 1, "type of a second quantity: 0 none, 11 measured currents"),
+    BlockField("monitor_reserved", "x", 2, "0"),
+    BlockField("currents", "i", 8, "in an answer: motor currents, percent of the rated ones"),
+    BlockField("monitor_flags", "x", 8, "0"),
     BlockField("more_2", "x", 44, "a third"),
     BlockField("more_3", "x", 44, "a fourth"),
 )
@@ -85,24 +88,35 @@ class MxtStatus(ArmStatus):
     timeouts: int
 
 
-def encode(command: int, *, send_type: int = 0, data: Sequence[float] = ()) -> bytes:
-    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers."""
+def encode(
+    command: int, *, send_type: int = 0, data: Sequence[float] = (), with_currents: bool = False
+) -> bytes:
+    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers.
+
+    with_currents: whether to request the motor currents too.
+    """
     padded = (*data, *([0.0] * (8 - len(data))))
-    return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, *([0] * 9))
+    head = (command, send_type, TYPE_JOINTS_MEASURED, *padded, *([0] * 9))
+    return _PACKET.pack(*head, TYPE_CURRENTS_MEASURED if with_currents else TYPE_NONE, *([0] * 8))
 
 
-def encode_joints(joints_rad: Floats) -> bytes:
+def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
     """Encode a motion to joints (6,) rad; raises ValueError unless there are six finite ones."""
-    return encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=validate_joints(joints_rad))
+    return encode(
+        COMMAND_MOVE,
+        send_type=TYPE_JOINTS,
+        data=validate_joints(joints_rad),
+        with_currents=with_currents,
+    )
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
     """Decode an answer; raises ArmAnswerError if it is invalid."""
     if len(packet) != PACKET_BYTES:
         raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
-    command, send_type, receive_type, *data, _, _, _, _, _, _, _, timeouts, count = _PACKET.unpack(
-        packet
-    )
+    numbers = _PACKET.unpack(packet)
+    (command, send_type, receive_type), data = numbers[:3], numbers[3:11]
+    timeouts, count, monitor_type = numbers[18:21]
     if command not in (COMMAND_NONE, COMMAND_MOVE):
         raise ArmRefusedError("the controller has ended external control")
     # According to the manual, both fields contain the type of the answer's data.
@@ -114,7 +128,16 @@ def decode_answer(packet: bytes) -> MxtStatus:
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
         raise ArmAnswerError("measured joints are not angles: a value is too large or NaN")
-    return MxtStatus(joints_rad=joints, faults=(), count=count, timeouts=timeouts)
+    currents = None
+    if monitor_type == TYPE_CURRENTS_MEASURED:
+        currents = np.array(numbers[21 : 21 + JOINTS], dtype=np.float64)
+    return MxtStatus(
+        joints_rad=joints,
+        faults=(),
+        count=count,
+        timeouts=timeouts,
+        currents_percent=currents,
+    )
 
 
 def has_advanced(count: int, before: int, steps: int) -> bool:
@@ -132,11 +155,16 @@ class MxtLink:
     """
 
     def __init__(
-        self, host: str, port: int, *, timeout_s: float = 2.0 * CONTROLLER_CYCLE_S
+        self,
+        host: str,
+        port: int,
+        *,
+        timeout_s: float = 2.0 * CONTROLLER_CYCLE_S,
+        with_currents: bool = False,
     ) -> None:
         self.host, self.port = host, port
         self.stale = 0
-        self._timeout_s = timeout_s
+        self._timeout_s, self._with_currents = timeout_s, with_currents
         self._socket: socket.socket | None = None
         self._count: int | None = None
         self._counters = CounterMonitor()
@@ -155,7 +183,11 @@ class MxtLink:
             self._count, self._unanswered = None, 0
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        packet = encode_joints(joints_rad) if mode == "move" else encode(COMMAND_NONE)
+        currents = self._with_currents
+        if mode == "move":
+            packet = encode_joints(joints_rad, with_currents=currents)
+        else:
+            packet = encode(COMMAND_NONE, with_currents=currents)
         try:
             link = await self._open()
             self._drop_late_answers(link)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.link_drivers import Driver
+from flexsheet.nodes.arm_bridge.motor_force import MotorForceCalibration
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
@@ -67,3 +68,14 @@ class ArmBridgeParameters(NodeParameters):
         description="manual: the operator enables the arm's motion with `flexsheet arms enable`, "
         "at first and after each stop; auto: it enables itself, only for simulated arms",
     )
+    motor_force: MotorForceCalibration | None = Field(
+        default=None,
+        description="publish the sheet's pull, estimated from the motor currents, as topic force; "
+        "only with an mxt driver; null: the currents are not requested",
+    )
+
+    @model_validator(mode="after")
+    def _check_motor_force(self) -> Self:
+        if self.motor_force is not None and self.driver == "modbus":
+            raise ValueError("motor_force requires driver mxt or mxt_pose: modbus has no currents")
+        return self

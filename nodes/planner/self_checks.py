@@ -1,10 +1,17 @@
-"""Compare the stiffness of the sheet in the scene with its calibration."""
+"""Compare the stiffness of the sheet in the scene with its calibration and with measured forces."""
 
 from __future__ import annotations
 
-from flexsheet.messages.scene import SheetSpec
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration
-from flexsheet.messages.types import SelfCheck
+from flexsheet.messages.types import Force, SelfCheck
+from flexsheet.nodes.models.residuals import ResidualMonitor
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel
 
 MAX_STIFFNESS_RATIO = 0.05
 """Accepted relative difference of the stiffness: three standard deviations of a calibration."""
@@ -33,3 +40,85 @@ def check_stiffness(
             suspected=abs(measured.value - expected) > threshold,
         ),
     )
+
+
+MAX_FORCE_RATIO = 0.12
+"""Accepted relative error of the predicted force: hysteresis of the rubber 5 %, sheet model 3 %,
+0.3 mm of the depth 3 to 6 %, gauge 1 %."""
+
+MIN_INDENTATION_M = 0.005
+MIN_FORCE_N = 0.2
+"""Smallest push and force that are compared; smaller ones consist of errors of depth and gauge."""
+
+QUIET_S, QUIET_M = 0.15, 0.0005
+"""Time before and after a measured force in which the indentation must change by less."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedPush:
+    """State of the sheet for which a target is valid: stretch, indentation and contact point."""
+
+    valid_at_ns: int
+    stretch_ratio: float
+    indentation_m: float
+    position_m: tuple[float, float]
+
+
+class MeasuredForceCheck:
+    """Comparison of the measured force of the finger with the force model in use.
+
+    The ratio of both forces is the ratio of the true to the assumed modulus times thickness.
+    """
+
+    def __init__(self, scene: Scene, model: SheetForceModel) -> None:
+        self._model, self._radius_m = model, scene.finger.radius_m
+        self._expected = scene.sheet.young_modulus_pa * scene.sheet.thickness_m
+        self._pushes: deque[PlannedPush] = deque(maxlen=256)
+        self._waiting: deque[tuple[int, float]] = deque(maxlen=64)
+        self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
+
+    def add_push(self, push: PlannedPush) -> None:
+        """Add a planned push, and compare the forces whose time it completes."""
+        self._pushes.append(push)
+        limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)
+        while self._waiting and self._waiting[0][0] <= limit_ns:
+            self._compare(*self._waiting.popleft())
+
+    def add_force(self, force: Force, at_ns: int) -> None:
+        """Add a measured force with the time of its measurement; only contact forces count."""
+        if force.valid and force.axis == "sheet_normal":
+            self._waiting.append((at_ns, force.force_n))
+
+    def _compare(self, at_ns: int, force_n: float) -> None:
+        window_ns = 1e9 * QUIET_S
+        near = [one for one in self._pushes if abs(one.valid_at_ns - at_ns) <= window_ns]
+        if not near:
+            return
+        depths = [one.indentation_m for one in near]
+        if min(depths) < MIN_INDENTATION_M or max(depths) - min(depths) > QUIET_M:
+            return
+        push = min(near, key=lambda one: abs(one.valid_at_ns - at_ns))
+        where = {"position_m": push.position_m, "finger_radius_m": self._radius_m}
+        if self._model.invalid_reason(push.stretch_ratio, push.indentation_m, **where):
+            return
+        pressed = self._model.evaluate(push.stretch_ratio, np.array([push.indentation_m]), **where)
+        predicted_n = float(pressed.force_n[0])
+        if predicted_n > MIN_FORCE_N:
+            self._monitor.add(np.array([force_n / predicted_n - 1.0]), at_ns)
+
+    @property
+    def result(self) -> tuple[SelfCheck, ...]:
+        """Return the check, or () before there are enough comparisons."""
+        if not self._monitor.has_data:
+            return ()
+        return (
+            SelfCheck(
+                cause="sheet_stiffness",
+                subject="measured force",
+                unit="N/m",
+                value=self._expected * (1.0 + float(self._monitor.mean[0])),
+                expected=self._expected,
+                threshold=self._expected * MAX_FORCE_RATIO,
+                suspected=self._monitor.suspected,
+            ),
+        )

@@ -99,6 +99,16 @@ def is_valid_position(joints_rad: Floats) -> bool:
     return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
 
 
+def joint_torques_nm(joints_rad: Floats, flange_from_edge: Floats, force_n: Floats) -> Floats:
+    """Return the torques (6,) of a force (3,), base frame, on the edge: its work per rotation."""
+    step_rad = 1e-4
+    torques = np.zeros(6)
+    for joint, turn in enumerate(step_rad * np.eye(6)):
+        ahead, behind = ((forward(joints_rad + s * turn) @ flange_from_edge) for s in (1, -1))
+        torques[joint] = (ahead[:3, 3] - behind[:3, 3]) @ force_n / (2.0 * step_rad)
+    return torques
+
+
 class TwinArmsNode(Node):
     """Simulate both arms with the sheet between them; they start when the first scene arrives."""
 
@@ -219,6 +229,21 @@ class TwinArmsNode(Node):
             controller.advance(duration_s)
             self._stored_joints[side][:] = controller.servo.joints_rad
 
+    def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
+        """Set the torques of the sheet's pull between both edges, which only MXT reports."""
+        across = right[:3, 3] - left[:3, 3]
+        distance_m = float(np.linalg.norm(across))
+        if self._pull is None or distance_m <= 0.0:
+            return
+        pull_n = self._pull.force_n(distance_m) * across / distance_m
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            controller = self.servers[side].controller
+            if isinstance(controller, MxtController):
+                force_n = sign * self._world_from_base[side][:3, :3].T @ pull_n
+                controller.load_nm = joint_torques_nm(
+                    joints[side], self._flange_from_edge[side], force_n
+                )
+
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
@@ -243,6 +268,7 @@ class TwinArmsNode(Node):
                 clamps["right"],
                 time_s=self.clock.now_ns() * 1e-9,
             )
+            self._load_motors(joints, left @ clamps["left"], right @ clamps["right"])
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],

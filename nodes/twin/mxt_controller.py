@@ -31,13 +31,26 @@ Address = tuple[str, int]
 
 _HEAD = struct.Struct("<HHHxx8f2I5HHI")
 _MONITOR = struct.Struct("<Hxx8f2I")
+_CURRENTS = struct.Struct("<Hxx8i8x")
 _BYTES = 196
 _NONE, _MOVE, _END = 0, 1, 255
-_JOINTS, _PULSES = (2, 5, 8), 3
+_JOINTS, _PULSES, _CURRENT = (2, 5, 8), 3, 11
 _MORE_AT = (64, 108, 152)
+
+TORQUE_PER_PERCENT_NM = np.array([0.3, 0.3, 0.2, 0.05, 0.05, 0.03])
+"""Torque of each simulated joint per percent of its motor's rated current."""
+
+UNLOADED_PERCENT = np.array([0.0, 22.0, 30.0, 0.0, 8.0, 0.0])
+"""Currents that hold the simulated arm without a load; their change with the pose is neglected."""
+
+FRICTION_PERCENT = 6.0
+"""Maximum current that the simulated gears take up by static friction, in either direction."""
 
 FILTER_S = 0.01
 """Time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
+
+FRICTION_STREAM = 11
+"""Second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
 """Maximum difference of each joint between the first set-point and the arm."""
@@ -63,6 +76,7 @@ class MxtController:
 
     servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
     filter_s: time constant of the low-pass filter on set-points.
+    load_nm: torques (6,) of the sheet's pull on the joints, set by the simulator.
     restart_after_s: time after which the program restarts by itself.
     cycle_s, cycle_jitter_s: mean and standard deviation of the cycle's duration.
     latency_s: time from the arrival of a set-point until it takes effect.
@@ -86,6 +100,7 @@ class MxtController:
         self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
         self.fault: Fault = "none"
         self.error = ""
+        self.load_nm = np.zeros(6)
         self.commands = 0
         self.refused = 0
         self.wanted_rad = self.servo.joints_rad.copy()
@@ -101,6 +116,8 @@ class MxtController:
         self._restart_cycles = restart_after_s / cycle_s
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
+        friction = np.random.default_rng((seed, FRICTION_STREAM))
+        self._stuck_percent = friction.uniform(-FRICTION_PERCENT, FRICTION_PERCENT, 6)
         self._into_cycle_s = 0.0
         self._waiting: tuple[bytes, Address] | None = None
         self._late: list[tuple[int, Floats]] = []
@@ -234,7 +251,11 @@ class MxtController:
             found = _PULSES
         whole = _HEAD.pack(command, found, found, *numbers, *([0] * 5), self._timeouts, self._count)
         for at in _MORE_AT:
-            whole += _MONITOR.pack(*self._monitor(*struct.unpack_from("<H", packet, at)))
+            (wanted,) = struct.unpack_from("<H", packet, at)
+            if wanted == _CURRENT:
+                whole += _CURRENTS.pack(wanted, *self._currents_percent(), 0, 0)
+            else:
+                whole += _MONITOR.pack(*self._monitor(wanted))
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
@@ -246,6 +267,11 @@ class MxtController:
             joints = self._seen(_JOINTS.index(wanted_type))
             return (wanted_type, *joints, 0.0, 0.0, 0, 0)
         return (0, *([0.0] * 8), 0, 0)
+
+    def _currents_percent(self) -> list[int]:
+        """Return the motor currents (6,) in whole percent; static friction carries a part."""
+        balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
+        return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
         """Return joints (6,): 0: the set-point; 1: the filtered set-point; 2: the measurement."""

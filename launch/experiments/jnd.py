@@ -1,0 +1,335 @@
+"""Measure the Weber fraction of stiffness: an adaptive staircase, and its table of trials.
+
+In each trial the participant pushes two objects and names the stiffer one. One of them is the
+reference; the other one, in random order, is stiffer by the relative increment d. The probability
+of a correct answer is
+
+    p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
+
+with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The bias
+is positive if the second interval is preferred and is the stiffer one. The Weber fraction w is the
+increment of 75 % correct answers without lapses and bias: ln(1 + w) = 0.674 sigma.
+
+The increment of a trial is the one with the least expected entropy of the posterior of w: the psi
+method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown lapse rate
+and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls with the
+square root of the number of trials; `docs/jnd.md` states the measured error.
+
+The CSV file is the only state of a session. All answers are replayed after an interruption.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.messages.files import make_write_error
+
+Floats = NDArray[np.float64]
+
+CRITERION = 0.75
+"""Fraction of correct answers, without lapses, at an increment of one Weber fraction."""
+
+INCREMENTS = np.geomspace(0.02, 1.0, 25)
+WEBER_FRACTIONS = np.geomspace(0.02, 1.0, 81)
+LAPSE_RATES = np.array([0.0, 0.01, 0.03, 0.06, 0.12])
+LAPSE_SCALE = 0.03
+"""Mean of the exponential prior of the lapse rate."""
+
+BIASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
+BIAS_SCALE = 0.25
+"""Standard deviation of the normal prior of the bias, in sigmas."""
+
+CATCH_PERIOD = 20
+"""One trial of so many has the largest increment; it shows lapses of attention."""
+
+INTERVAL_QUANTILES = (0.025, 0.975)
+
+
+class StaircaseEstimator:
+    """Posterior of Weber fraction, lapse rate and bias, and the most informative next increment."""
+
+    def __init__(self) -> None:
+        sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
+        steps = np.log1p(INCREMENTS)[:, None] / sigmas
+        # Axes: increment, Weber fraction, and all pairs of bias and lapse rate.
+        self._correct: dict[int, Floats] = {}
+        for stiffer, sign in ((1, -1.0), (2, 1.0)):
+            seen = ndtr(steps[:, :, None] + sign * BIASES)[..., None]
+            correct = 0.5 * LAPSE_RATES + (1.0 - LAPSE_RATES) * seen
+            self._correct[stiffer] = correct.reshape(*steps.shape, -1)
+        prior = np.exp(-0.5 * (BIASES[:, None] / BIAS_SCALE) ** 2 - LAPSE_RATES / LAPSE_SCALE)
+        prior *= np.gradient(LAPSE_RATES)
+        self._posterior: Floats = np.tile(prior.ravel(), (len(sigmas), 1))
+        self._posterior /= self._posterior.sum()
+
+    def add(self, increment: int, stiffer: int, correct: bool) -> None:
+        """Update by an answer to the increment of this index; stiffer: its interval, 1 or 2."""
+        likely = self._correct[stiffer][increment]
+        self._posterior = self._posterior * (likely if correct else 1.0 - likely)
+        self._posterior /= self._posterior.sum()
+
+    def choose(self, stiffer: int) -> int:
+        """Return the index of the increment with the least expected entropy of the fraction."""
+        right = np.einsum("swn,wn->sw", self._correct[stiffer], self._posterior)
+        expected = _expected_entropy(right) + _expected_entropy(self._marginal - right)
+        return int(np.argmin(expected))
+
+    @property
+    def weber_fraction(self) -> float:
+        """Return the geometric mean of the posterior."""
+        return float(np.exp(self._marginal @ np.log(WEBER_FRACTIONS)))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the central 95 % credible interval of the Weber fraction."""
+        cumulative = np.cumsum(self._marginal) - 0.5 * self._marginal
+        low, high = np.interp(INTERVAL_QUANTILES, cumulative, np.log(WEBER_FRACTIONS))
+        return math.exp(low), math.exp(high)
+
+    @property
+    def lapse_rate(self) -> float:
+        """Return the mean of the posterior."""
+        rates = np.tile(LAPSE_RATES, len(BIASES))
+        return float(self._posterior.sum(axis=0) @ rates)
+
+    @property
+    def _marginal(self) -> Floats:
+        return np.asarray(self._posterior.sum(axis=1))
+
+
+def _expected_entropy(joint: Floats) -> Floats:
+    """Return the entropy of each row's distribution times the row's sum, for rows (n, m)."""
+    total = joint.sum(axis=1, keepdims=True)
+    inner = np.log(np.maximum(joint, 1e-300)) - np.log(np.maximum(total, 1e-300))
+    return np.asarray(-(joint * inner).sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class SessionPlan:
+    """Settings of a session; an interrupted session continues only with equal ones.
+
+    participant: random code, no name. scene: name and hash of the scene's geometry. reference_pa:
+    modulus of the reference object.
+    """
+
+    participant: str
+    seed: int
+    trials: int
+    reference_pa: float
+    scene: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PairTrial:
+    """Pair of stiffnesses of a trial.
+
+    number: from 1. increment: index in INCREMENTS. stiffer: interval with the stiffer object, 1
+    or 2. moduli_pa: moduli of both intervals.
+    """
+
+    number: int
+    increment: int
+    stiffer: int
+    moduli_pa: tuple[float, float]
+    catch: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PairAnswer:
+    """Answer of the participant, and what was measured while the pair was presented.
+
+    stiffer: interval that the participant named, 1 or 2. response_s: time of the answer after the
+    end of the second interval. depths_m, forces_n: maximum of push depth and of measured force in
+    each interval; None if not measured.
+    """
+
+    stiffer: int
+    response_s: float | None = None
+    depths_m: tuple[float | None, float | None] = (None, None)
+    forces_n: tuple[float | None, float | None] = (None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRow:
+    """One line of the CSV file; an empty cell is a quantity that was not measured."""
+
+    participant: str
+    seed: int
+    scene: str
+    reference_pa: float
+    trial: int
+    catch: int
+    increment: float
+    stiffer: int
+    answer: int
+    correct: int
+    response_s: float | None
+    depth_1_mm: float | None
+    depth_2_mm: float | None
+    force_1_n: float | None
+    force_2_n: float | None
+    time_utc: str
+
+
+COLUMNS = tuple(field.name for field in fields(TrialRow))
+
+Present = Callable[[PairTrial], Awaitable[PairAnswer]]
+
+
+class StaircaseSession:
+    """Trials of one participant, with the CSV file that holds them.
+
+    Raises ExperimentError if an existing file belongs to another session or is damaged.
+    """
+
+    def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
+        """now: function that returns the present time as text, for the rows."""
+        self.plan, self.file, self._now = plan, file, now
+        self.estimator = StaircaseEstimator()
+        self.done = self.catches = self.missed_catches = 0
+        self._resume()
+
+    def next_trial(self) -> PairTrial | None:
+        """Return the next pair; None after the last trial."""
+        if self.done >= self.plan.trials:
+            return None
+        number = self.done + 1
+        catch = number % CATCH_PERIOD == CATCH_PERIOD // 2
+        stiffer = int(np.random.default_rng((self.plan.seed, number)).integers(1, 3))
+        increment = len(INCREMENTS) - 1 if catch else self.estimator.choose(stiffer)
+        reference_pa = self.plan.reference_pa
+        comparison_pa = reference_pa * (1.0 + float(INCREMENTS[increment]))
+        moduli = (comparison_pa, reference_pa) if stiffer == 1 else (reference_pa, comparison_pa)
+        return PairTrial(number, increment, stiffer, moduli, catch)
+
+    def record(self, trial: PairTrial, answer: PairAnswer) -> None:
+        """Append the answer to the file, flush it to the disk, and update the estimate."""
+        correct = answer.stiffer == trial.stiffer
+        row = TrialRow(
+            participant=self.plan.participant,
+            seed=self.plan.seed,
+            scene=self.plan.scene,
+            reference_pa=self.plan.reference_pa,
+            trial=trial.number,
+            catch=int(trial.catch),
+            increment=round(float(INCREMENTS[trial.increment]), 6),
+            stiffer=trial.stiffer,
+            answer=answer.stiffer,
+            correct=int(correct),
+            response_s=_rounded(answer.response_s),
+            depth_1_mm=_rounded(answer.depths_m[0], 1e3),
+            depth_2_mm=_rounded(answer.depths_m[1], 1e3),
+            force_1_n=_rounded(answer.forces_n[0]),
+            force_2_n=_rounded(answer.forces_n[1]),
+            time_utc=self._now(),
+        )
+        text = _csv_line(["" if one is None else one for one in asdict(row).values()])
+        try:
+            with self.file.open("ab") as file:
+                if file.tell() == 0:
+                    text = _csv_line(COLUMNS) + text
+                file.write(text.encode())
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise make_write_error(self.file, error, needed_bytes=len(text)) from error
+        self._count(trial, correct)
+
+    def _count(self, trial: PairTrial, correct: bool) -> None:
+        self.estimator.add(trial.increment, trial.stiffer, correct)
+        self.done += 1
+        self.catches += trial.catch
+        self.missed_catches += trial.catch and not correct
+
+    def _resume(self) -> None:
+        """Replay the trials of an existing file; remove a last line that is not complete."""
+        if not self.file.exists():
+            return
+        data = self.file.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            with self.file.open("r+b") as file:
+                file.truncate(len(whole))
+        try:
+            lines = list(csv.reader(io.StringIO(whole.decode())))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ExperimentError(f"{self.file}: is not a CSV file of a session: {error}") from None
+        if lines and tuple(lines[0]) != COLUMNS:
+            raise ExperimentError(
+                f"{self.file}:1: the columns are not those of a session; give another folder"
+            )
+        for number, cells in enumerate(lines[1:], start=2):
+            self._replay(f"{self.file}:{number}", dict(zip(COLUMNS, cells, strict=False)))
+
+    def _replay(self, where: str, cells: dict[str, str]) -> None:
+        trial = self.next_trial()
+        if trial is None:
+            raise ExperimentError(
+                f"{where}: the session has {self.plan.trials} trials, the file more; give --trials"
+            )
+        expected = {
+            "participant": self.plan.participant,
+            "seed": str(self.plan.seed),
+            "scene": self.plan.scene,
+            "reference_pa": str(self.plan.reference_pa),
+            "trial": str(trial.number),
+            "increment": str(round(float(INCREMENTS[trial.increment]), 6)),
+            "stiffer": str(trial.stiffer),
+        }
+        for name, value in expected.items():
+            if cells.get(name) != value:
+                raise ExperimentError(
+                    f'{where}: {name} is "{cells.get(name, "")}", but this session has "{value}"; '
+                    "continue with the options of the interrupted session, or give another folder"
+                )
+        if cells.get("answer") not in ("1", "2"):
+            raise ExperimentError(
+                f'{where}: answer is "{cells.get("answer", "")}", expected 1 or 2; remove this '
+                "line and the following ones"
+            )
+        self._count(trial, int(cells["answer"]) == trial.stiffer)
+
+    def result(self) -> dict[str, Any]:
+        """Return the estimate as a row of the command's result."""
+        low, high = self.estimator.interval
+        return {
+            "participant": self.plan.participant,
+            "seed": self.plan.seed,
+            "trials": self.done,
+            "weber_fraction": self.estimator.weber_fraction,
+            "interval_95": [low, high],
+            "lapse_rate": self.estimator.lapse_rate,
+            "missed_catches": [self.missed_catches, self.catches],
+            "csv": str(self.file),
+        }
+
+
+def _rounded(value: float | None, scale: float = 1.0) -> float | None:
+    return None if value is None else round(scale * value, 4)
+
+
+def _csv_line(cells: Sequence[object]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    return text.getvalue()
+
+
+async def run_session(
+    session: StaircaseSession, present: Present, progress: Callable[[int, int], None]
+) -> None:
+    """Present the remaining trials of a session and record each answer at once."""
+    while (trial := session.next_trial()) is not None:
+        progress(session.done, session.plan.trials)
+        session.record(trial, await present(trial))

@@ -1,0 +1,76 @@
+"""Simulate a participant of the stiffness experiment, independently of the estimator.
+
+The participant perceives the logarithm of each stiffness with normal noise, prefers one interval,
+and sometimes does not attend. The estimator knows none of these parameters and no interval bias.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+SEED_STREAM = 75
+"""Second element of the random seed; it makes the participant independent of the session."""
+
+WEBER_RANGE = (0.08, 0.3)
+"""Range of Weber fractions; published ones of stiffness are 0.07 (force cue) to 0.23."""
+
+MAX_LAPSE_RATE = 0.05
+BIAS_SIGMAS = 0.2
+"""Standard deviation of the interval bias, in standard deviations of a perceived difference."""
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """Parameters of a participant.
+
+    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to the
+    second one. lapse_rate: fraction of trials that are answered at random.
+    """
+
+    noise: float
+    bias: float
+    lapse_rate: float
+
+    @property
+    def weber_fraction(self) -> float:
+        """Return the increment of 75 % correct answers of an attentive, unbiased participant."""
+        return math.expm1(NormalDist(0.0, math.sqrt(2.0) * self.noise).inv_cdf(0.75))
+
+
+class SimulatedParticipant:
+    """Participant that compares two noisy percepts; equal seeds give equal answers.
+
+    The noise of a trial depends on its number only, so that an interrupted session continues with
+    the same answers.
+    """
+
+    def __init__(self, seed: int, perception: Perception | None = None) -> None:
+        self._seed = seed
+        self.perception = perception or draw_perception(seed)
+
+    def answer(self, trial: int, first_pa: float, second_pa: float) -> int:
+        """Return the interval, 1 or 2, that appears to be the stiffer one."""
+        random = np.random.default_rng((self._seed, SEED_STREAM, trial))
+        mind = self.perception
+        if random.random() < mind.lapse_rate:
+            return int(random.integers(1, 3))
+        first = math.log(first_pa) + mind.noise * random.standard_normal()
+        second = math.log(second_pa) + mind.noise * random.standard_normal() + mind.bias
+        return 2 if second > first else 1
+
+
+def draw_perception(seed: int) -> Perception:
+    """Draw the parameters of a participant."""
+    random = np.random.default_rng((seed, SEED_STREAM))
+    low, high = np.log(WEBER_RANGE)
+    weber = math.exp(random.uniform(low, high))
+    difference = math.log1p(weber) / NormalDist().inv_cdf(0.75)
+    return Perception(
+        noise=difference / math.sqrt(2.0),
+        bias=BIAS_SIGMAS * difference * float(random.standard_normal()),
+        lapse_rate=float(random.uniform(0.0, MAX_LAPSE_RATE)),
+    )

@@ -1,0 +1,107 @@
+"""Estimate the pull of the sheet on an arm from the arm's motor currents.
+
+A current that differs from that of the same pose without the sheet is a torque of the joint. Static
+friction of the gears adds an unknown torque of about a tenth of the rated one, so that the estimate
+is good for detecting a wrong sheet tension of some newtons, not for calibrating the sheet.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Finite, Positive
+from flexsheet.messages.types import Force, Side
+from flexsheet.nodes.arm_bridge.kinematics import forward
+
+Floats = NDArray[np.float64]
+SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+
+STEP_RAD = 1e-5
+MAX_SPEED_RAD_PER_S = 0.02
+"""Joint speed above which currents contain sliding friction and acceleration."""
+
+PERIOD_NS = 50_000_000
+
+
+class MotorForceCalibration(LimitedModel):
+    """Constants that convert motor currents to a force; measure them (docs/force.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    torque_per_percent_nm: SixPositive = Field(
+        description="torque of each joint per percent of its motor's rated current, N m"
+    )
+    unloaded_percent: Six = Field(
+        description="currents at the working pose without the sheet, percent of the rated ones"
+    )
+    friction_percent: Positive = Field(
+        default=10.0,
+        description="standard deviation of a current because of static friction, percent",
+    )
+
+
+def estimate_pull_n(
+    calibration: MotorForceCalibration,
+    joints_rad: Floats,
+    currents_percent: Floats,
+    edge_flange_m: Floats,
+    towards_base: Floats,
+) -> tuple[float, float]:
+    """Return the pull on the edge in the direction `towards_base`, and its standard deviation, N.
+
+    joints_rad, currents_percent: (6,). edge_flange_m: centre of the edge, flange frame (3,).
+    towards_base: unit vector (3,). The fit is weighted least squares over the joints.
+    """
+    at_edge = np.append(edge_flange_m, 1.0)
+    edge_m = (forward(joints_rad) @ at_edge)[:3]
+    moved = [(forward(joints_rad + step) @ at_edge)[:3] for step in STEP_RAD * np.eye(6)]
+    # The motors balance the pull: their torques are minus the transposed Jacobian times the force.
+    per_newton_nm = -(np.array(moved) - edge_m) @ towards_base / STEP_RAD
+    scale_nm = np.array(calibration.torque_per_percent_nm)
+    torques_nm = scale_nm * (currents_percent - np.array(calibration.unloaded_percent))
+    sigmas_nm = scale_nm * calibration.friction_percent
+    weight = float(np.sum((per_newton_nm / sigmas_nm) ** 2))
+    force_n = float(np.sum(per_newton_nm * torques_nm / sigmas_nm**2)) / weight
+    return force_n, weight**-0.5
+
+
+class MotorForceEstimator:
+    """Estimator of the pull of the sheet, at most 20 times per second."""
+
+    def __init__(self, calibration: MotorForceCalibration, side: Side) -> None:
+        self._calibration, self._side = calibration, side
+        self._last_ns: int | None = None
+        self._last_rad = np.zeros(6)
+
+    def update(
+        self,
+        at_ns: int,
+        joints_rad: Floats,
+        currents_percent: Floats,
+        edge_flange_m: Floats,
+        towards_base: Floats,
+    ) -> Force | None:
+        """Return the force at a time; None if it is too early for another one."""
+        before_ns, before_rad = self._last_ns, self._last_rad
+        if before_ns is not None and at_ns - before_ns < PERIOD_NS:
+            return None
+        self._last_ns, self._last_rad = at_ns, joints_rad.copy()
+        if before_ns is None:
+            return None
+        speed = np.abs(joints_rad - before_rad).max() / (1e-9 * (at_ns - before_ns))
+        resting = bool(speed <= MAX_SPEED_RAD_PER_S)
+        force_n, deviation_n = estimate_pull_n(
+            self._calibration, joints_rad, currents_percent, edge_flange_m, towards_base
+        )
+        return Force(
+            source="motor_currents",
+            axis="left_edge" if self._side == "left" else "right_edge",
+            valid=resting,
+            reason="ok" if resting else "in_motion",
+            force_n=force_n,
+            standard_deviation_n=deviation_n,
+        )
