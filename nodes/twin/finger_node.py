@@ -15,14 +15,15 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import NonNegative, Scene
-from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
+from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState, Floats
+from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
-from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.pixels import NO_POINTS, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
@@ -57,8 +58,11 @@ class TwinFingerNode(Node):
     """Move a simulated finger along its path, and render stereo images at the camera's rate."""
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
     parameters: TwinFingerParameters
     scene: Input[Scene]
+    frame: Input[Frame]
+    twin__arms: Input[TwinArms]
     twin__finger_path: Input[FingerPath]
     twin__finger: Output[TwinFinger]
     twin__stereo: Output[StereoPair]
@@ -70,6 +74,7 @@ class TwinFingerNode(Node):
     path_label = ""
     path_stroke_s: float | None = None
     missed_frames = 0
+    lit_marks: LitMarks | None = None
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
@@ -80,6 +85,10 @@ class TwinFingerNode(Node):
     def replay_refusal(cls, parameters: Any) -> str:
         return "it takes images by its own clock; the bag has the finger's motion as twin/finger"
 
+    @classmethod
+    def unused_inputs(cls, parameters: Any, scene: Scene) -> frozenset[str]:
+        return frozenset() if shows_check_marks(scene) else cls.optional_inputs
+
     async def setup(self) -> None:
         self._jitter = np.random.default_rng((self.parameters.seed, JITTER_STREAM))
         self.filming = asyncio.create_task(self._film())
@@ -88,6 +97,8 @@ class TwinFingerNode(Node):
         if self.filming is not None:
             self.filming.cancel()
             await asyncio.gather(self.filming, return_exceptions=True)
+        if self.lit_marks is not None:
+            self.lit_marks.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         truth = self.parameters.apparatus
@@ -105,12 +116,19 @@ class TwinFingerNode(Node):
             nail=None if truth is None else Nail.of(truth.finger),
             skew_s=0.0 if truth is None else truth.camera.skew_s,
         )
+        if self.lit_marks is not None:
+            self.lit_marks.close()
+        self.lit_marks = LitMarks(true_scene, truth) if shows_check_marks(true_scene) else None
         self.max_speed_m_per_s = true_scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / true_scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * true_scene.camera.exposure_s)
         self.has_scene.set()
         if first and self.twin__finger_path.message is not None:
             self._follow(self.twin__finger_path.message)
+
+    def on_frame(self, frame: Frame, header: Header) -> None:
+        if self.lit_marks is not None:
+            self.lit_marks.on_frame(frame)
 
     def _make_resting(self, rest: Floats) -> FingerMotion:
         """Make a finger that rests at `rest`, with the tremor of the apparatus."""
@@ -183,6 +201,7 @@ class TwinFingerNode(Node):
             lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position,
             exposure_s=self.exposure_ns * 1e-9,
             time_s=exposed_ns * 1e-9,
+            lit_points=self._lit_points(exposed_ns, state.position),
         )
         return StereoPair(
             device=self.camera.camera.device,
@@ -191,6 +210,13 @@ class TwinFingerNode(Node):
             left=left,
             right=right,
         )
+
+    def _lit_points(self, at_ns: int, finger: Floats) -> Floats:
+        """Return the points (n, 3) of the sheet on which projected check marks are visible."""
+        arms = self.twin__arms.message
+        if self.lit_marks is None or arms is None:
+            return NO_POINTS
+        return self.lit_marks.light(arms, finger, at_ns)
 
     def _stamp_error_ns(self) -> int:
         """Return a random sample of the true time of an exposure minus its timestamp."""
