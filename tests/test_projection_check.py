@@ -18,7 +18,7 @@ from flexsheet.messages.scene import Projector
 from flexsheet.messages.types import Frame
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.models.sheet import corners
-from flexsheet.nodes.renderer.check_marks import FINGER_STEP_M, SIDE_PX, CheckMarks, place_marks
+from flexsheet.nodes.renderer.check_marks import FINGER_STEP_M, CheckMarks, place_marks
 from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, deflected_mesh
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
@@ -37,7 +37,7 @@ assert SCENE.projector is not None
 PROJECTOR: Projector = SCENE.projector.model_copy(update={"check_marks_sheet_m": PLACES})
 STRETCH = 1.05
 PUSH_M = np.array([0.0, 0.0, -0.010])
-FRAME_S, IMAGE_S = 0.2, 0.1
+FRAME_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,12 @@ def edges(centre: Any) -> tuple[Any, Any]:
     return transform(np.eye(3), centre - half), transform(np.eye(3), centre + half)
 
 
-def believe(centre: Any, pad: Any | None) -> tuple[SheetPose, CheckMarks]:
-    """Return the renderer's sheet about a centre (3,), and its marks."""
+@cache
+def believe(
+    place: tuple[float, ...], finger: tuple[float, ...] | None
+) -> tuple[SheetPose, CheckMarks]:
+    """Return the renderer's sheet at a centre (3,) for a measured finger (3,), and its marks."""
+    centre, pad = np.array(place), None if finger is None else np.array(finger)
     pose = SheetPose(
         transform(np.eye(3), centre), corners(*edges(centre), SCENE.sheet.height_m), pad
     )
@@ -102,21 +106,21 @@ def light(seed: int, change: Change, centre: Any, pixels: Any, finger: Any | Non
 
 def observe(
     seed: int, change: Change, *, seconds: float = 10.0, pushed: bool = False, moving: bool = False,
-    reference_marks: bool = True,
+    reference_marks: bool = True, image_s: float = 0.1,
 ) -> Iterator[set[str]]:  # fmt: skip
-    """Yield the suspected causes ten times a second."""
+    """Yield the suspected causes after each image pair."""
     view = View(seed, Fault(camera_m=change.camera_m))
     check = CameraCheck(MARKS if reference_marks else np.zeros((0, 3)), None, PROJECTOR)
     true_pad = PUSH_M if pushed else None
     calibration_m = 3e-4 * np.random.default_rng((seed, 22)).standard_normal(3)
-    pad = PUSH_M + calibration_m + np.array(change.marker_m) if pushed else None
+    pad = tuple((PUSH_M + calibration_m + change.marker_m).tolist()) if pushed else None
     shown: list[tuple[float, Any]] = []
     places: dict[bytes, Any] = {}
-    for number in range(round(seconds / IMAGE_S)):
-        now_s = IMAGE_S * number
-        if number % round(FRAME_S / IMAGE_S) == 0:
+    for number in range(round(seconds / image_s)):
+        now_s = image_s * number
+        if number % round(FRAME_S / image_s) == 0:
             swing_m = 0.04 * np.sin(2.0 * np.pi * 0.25 * now_s) if moving else 0.0
-            pose, marks = believe(np.array([swing_m, 0.0, 0.0]), pad)
+            pose, marks = believe((swing_m, 0.0, 0.0), pad)
             shown.append((now_s + change.latency_s, marks.centres_px))
             check.on_frame(
                 Frame.model_construct(
@@ -175,20 +179,17 @@ def test_without_reference_marks_the_cause_is_less_specific(change: Change, caus
 
 def test_a_late_display_is_named_while_the_sheet_moves() -> None:
     assert any(
-        "display_latency" in causes
-        for causes in observe(110, Change(latency_s=0.03), seconds=10.0, moving=True)
+        "display_latency" in causes for causes in observe(110, Change(latency_s=0.03), moving=True)
     )
-    for causes in observe(110, Change(), seconds=10.0, moving=True):
-        assert causes == set()
+    assert not set().union(*observe(110, Change(), moving=True))
 
 
-@pytest.mark.parametrize("seed", [100, 101])
-@pytest.mark.parametrize("pushed", [False, True])
+@pytest.mark.parametrize(("seed", "pushed"), [(100, False), (101, True)])
 def test_calibrated_devices_raise_no_suspicion_in_ten_minutes(seed: int, pushed: bool) -> None:
-    assert not set().union(*observe(seed, Change(), seconds=600.0, pushed=pushed))
+    assert not set().union(*observe(seed, Change(), seconds=600.0, image_s=0.2, pushed=pushed))
 
 
 def test_marks_are_drawn_on_whole_pixels_at_half_resolution() -> None:
-    _, marks = believe(np.zeros(3), None)
-    assert SIDE_PX % 2 == 0
+    _, marks = believe((0.0, 0.0, 0.0), None)
+    assert marks.side_px % 2 == 0
     assert not (marks.corners_px % 2).any()

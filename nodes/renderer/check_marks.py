@@ -19,9 +19,10 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
 
-SIDE_PX = 8
-"""Side of a mark. It is even, as are the marks' corners, because a mark may be drawn at half the
-resolution (see `output.image_parts`)."""
+SIDE_M = 0.0053
+"""Side of a mark, which then has the area of a marker of 3 mm radius: the triangulator finds it as
+another marker.  Its side in pixels is even, as are the corners, because a mark may be drawn at half
+the resolution (see `output.image_parts`)."""
 
 FINGER_STEP_M = 0.001
 """Displacement of the fingertip that determines the ratio of the marks' displacements to it."""
@@ -31,21 +32,22 @@ FINGER_STEP_M = 0.001
 class CheckMarks:
     """Projected marks of one frame.
 
-    corners_px: (n, 2) left column and top row. world_m: (n, 3) centres on the sheet; NaN for a mark
-    that misses it. finger_ratio: (n,) displacement of the sheet along its normal, divided by that
-    of the fingertip.
+    side_px: side of the squares. corners_px: (n, 2) left column and top row. world_m: (n, 3)
+    centres on the sheet; NaN for a mark that misses it. finger_ratio: (n,) displacement of the
+    sheet along its normal, divided by that of the fingertip.
     """
 
+    side_px: int
     corners_px: NDArray[np.int64]
     world_m: Floats
     finger_ratio: Floats
 
     @property
     def centres_px(self) -> Floats:
-        return self.corners_px + 0.5 * (SIDE_PX - 1)
+        return self.corners_px + 0.5 * (self.side_px - 1)
 
 
-NO_MARKS = CheckMarks(np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(0))
+NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(0))
 
 
 def place_marks(
@@ -62,7 +64,8 @@ def place_marks(
     distortion = np.array(lens.distortion)
     points = np.array([(x, y, 0.0) for x, y in projector.check_marks_sheet_m])
     local = apply(inverse(world_from_projector) @ world_from_sheet, points)
-    half = 0.5 * (SIDE_PX - 1)
+    side_px = 2 * round(0.5 * SIDE_M * lens.fx_px / float(local[:, 2].mean()))
+    half = 0.5 * (side_px - 1)
     pixels = camera.project(local, matrix, distortion)
     corners = 2 * np.rint(0.5 * (pixels - half)).astype(np.int64)
     slopes = camera.normalize(corners + half, matrix, distortion)
@@ -74,7 +77,7 @@ def place_marks(
     if deeper is not None:
         moved = deeper.vertices[mesh.triangles[triangles]] - surface
         ratio = np.einsum("nk,nki,i->n", weights, moved, -world_from_sheet[:3, 2]) / FINGER_STEP_M
-    return CheckMarks(corners, world, np.nan_to_num(ratio))
+    return CheckMarks(side_px, corners, world, np.nan_to_num(ratio))
 
 
 def intersect(origin: Floats, rays: Floats, corners: Floats) -> tuple[NDArray[np.intp], Floats]:

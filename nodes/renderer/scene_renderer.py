@@ -21,7 +21,6 @@ from flexsheet.nodes.models.sheet.indentation import IndentationBasis
 from flexsheet.nodes.renderer.check_marks import (
     FINGER_STEP_M,
     NO_MARKS,
-    SIDE_PX,
     CheckMarks,
     place_marks,
 )
@@ -290,9 +289,10 @@ class SceneRenderer:
         """Draw white squares into a part of the image; the display stretches it to the whole."""
         canvas, (left, bottom, width, height) = self.canvas, part.viewport
         scale = np.array([width / canvas.width_px, height / canvas.height_px])
-        size = np.rint(SIDE_PX * scale).astype(int)
+        side_px = self.check_marks.side_px
+        size = np.rint(side_px * scale).astype(int)
         for column, row in self.check_marks.corners_px.tolist():
-            low = np.rint(scale * [column, canvas.height_px - row - SIDE_PX]).astype(int)
+            low = np.rint(scale * [column, canvas.height_px - row - side_px]).astype(int)
             if (low >= 0).all() and (low + size <= (width, height)).all():
                 square = (left + int(low[0]), bottom + int(low[1]), int(size[0]), int(size[1]))
                 canvas.target.clear(1.0, 1.0, 1.0, viewport=square)

@@ -67,6 +67,11 @@ class LitMarks:
     def close(self) -> None:
         self._worker.shutdown(cancel_futures=True)
 
+    def settle(self) -> None:
+        """Wait for the solution that is being computed."""
+        if self._solving is not None:
+            self._solving.exception()
+
     def on_frame(self, frame: Frame) -> None:
         """Add a frame that the projector shows until the next one."""
         if frame.light_ns and len(frame.marks_px):

@@ -68,8 +68,8 @@ ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 EMPTY_FRACTION = 1.2
 """Two overlapping windows are joined if the joined area is at most this multiple of their sum."""
 
-LIT_RADIUS_M, LIT_LEVEL = 0.00226, 150.0
-"""Radius of a projected mark that has the area of 8 x 8 pixels of 0.5 mm, and the grey level that
+LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
+"""Radius of a projected mark that has the area of 10 x 10 pixels of 0.5 mm, and the grey level that
 it adds to the sheet."""
 
 NO_POINTS = np.zeros((0, 3))
