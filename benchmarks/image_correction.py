@@ -5,6 +5,7 @@ python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretch
 sizes: figures 11 and 13 of the paper; error of each size as the eye sees it on the true sheet (mm).
     The tilted sheet either rolls on the cylinder (tangent, with a fixed contact line) or rotates
     about its centre. A positive tilt rotates the sheet's front upwards, as in a stroke upwards.
+rolled-sizes-json: mean and largest error of these sizes by two_pass for the rolling sheet, as JSON.
 tilts, depths, places, stretches: errors at all points that the eye sees (mean, 95 %, maximum, mm),
     and the visible fraction of the object. They vary the tilt up to 80 degrees, the depth up to 70
     mm, the contact point on upright and tilted sheets, and the stretch.
@@ -15,6 +16,7 @@ Without a name, all are measured.
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -163,6 +165,15 @@ def print_sizes(bench: CorrectionBench) -> None:
             row(depth_mm, correction, *with_mean(errors))
 
 
+def print_rolled_sizes_json(bench: CorrectionBench) -> None:
+    """Print the mean and the largest error of the sizes by two_pass, for sheets that roll, mm."""
+    errors = []
+    for degrees in (-50, -30, -10, 10, 30, 50):
+        situation = bench.situation(roll_sheet(bench.scene, -np.radians(degrees)), None)
+        errors.append(1e3 * np.abs(bench.size_errors("two_pass", *situation, tilt_sizes)))
+    print(json.dumps({"mean_mm": float(np.mean(errors)), "max_mm": float(np.max(errors))}))
+
+
 def print_tilts(bench: CorrectionBench) -> None:
     heading("tilt, °", *TILT_CORRECTIONS)
     for degrees in (*range(-80, -50, 5), *range(-50, 60, 25), *range(55, 85, 5)):
@@ -281,6 +292,7 @@ def print_frames(scene: Scene) -> None:
 
 TABLES: dict[str, Callable[[CorrectionBench], None]] = {
     "sizes": print_sizes,
+    "rolled-sizes-json": print_rolled_sizes_json,
     "tilts": print_tilts,
     "depths": print_depths,
     "places": print_places,
@@ -295,7 +307,7 @@ def main() -> None:
     parser.add_argument("--scene", default=ROOT / "launch" / "scenes" / "cylinder.yaml", type=Path)
     parser.add_argument("--stretch", default=1.05, type=float)
     options = parser.parse_args()
-    wanted = options.tables or [*TABLES, "frames"]
+    wanted = options.tables or [*(name for name in TABLES if "json" not in name), "frames"]
     scene = load_scene(options.scene)
     if "frames" in wanted:
         print_frames(scene)

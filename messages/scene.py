@@ -353,6 +353,12 @@ class Projector(Part):
     height_px: Annotated[int, Field(gt=0)]
     lens: Lens
     world_from_projector: Pose
+    check_marks_sheet_m: tuple[tuple[Finite, Finite], ...] = Field(
+        default=(),
+        max_length=8,
+        description="points (x, y) of the sheet, m, onto which bright marks are projected, so that "
+        "the stereo camera checks projector, arms and marker; none: no marks",
+    )
 
 
 class Eyes(Part):
@@ -475,6 +481,11 @@ def require_projector(scene: Scene) -> Projector:
     if scene.projector is None:
         raise MissingPartError(f'scene "{scene.name}": projector is missing, so it has no image')
     return scene.projector
+
+
+def shows_check_marks(scene: Scene) -> bool:
+    """Return whether marks are projected with which the stereo camera checks the calibrations."""
+    return scene.projector is not None and bool(scene.projector.check_marks_sheet_m)
 
 
 def require_material(scene: Scene) -> Material:

@@ -395,6 +395,19 @@ class Frame(Message):
         default=0.0,
         description="fraction of the sheet's visible area that is unlit because of folds",
     )
+    marks_px: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks", 2))] = Field(
+        default_factory=lambda: np.zeros((0, 2)),
+        description="projector pixels of the centres of the projected check marks",
+    )
+    marks_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks", 3))] = Field(
+        default_factory=lambda: np.zeros((0, 3)),
+        description="expected positions of these marks on the sheet at `predicted_to_ns`, m",
+    )
+    marks_finger_ratio: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks",))] = Field(
+        default_factory=lambda: np.zeros(0),
+        description="displacement of the sheet at these marks, along its normal, divided by that "
+        "of the fingertip; 0 without contact",
+    )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, or one (mono or packed stereo)"
     )
@@ -499,13 +512,20 @@ SuspectedCause = Literal[
     "servo_lag",
     "arm_not_following",
     "sheet_stiffness",
+    "projector_moved",
+    "arm_base_moved",
+    "camera_or_projector_moved",
+    "camera_or_arm_base_moved",
+    "display_latency",
 ]
 """Suspected cause of a deviation, in the order of the values.
 
 The stereo camera is not where the scene says; one of its two cameras has moved against the other;
 the marker is not at the assumed offset from the finger's pad; an arm lags more or less than
 configured; an arm does not execute the commanded motion; the sheet's calibrated stiffness differs
-from the scene's.
+from the scene's; the projector is not where the scene says; an arm's base or clamp is not where the
+scene says; one of two devices, which the data cannot tell apart; projected images appear later than
+assumed.
 """
 
 

@@ -195,6 +195,7 @@ def test_robustness_prints_rows_and_summary(
     assert summary["median"] == pytest.approx(0.15)
     assert summary["p95"] == pytest.approx(0.285)
     assert (summary["worst"], summary["worst_seed"]) == (pytest.approx(0.3), 3)
+    assert (summary["trials"], summary["out_of_tolerance"], summary["not_flagged"]) == (4, 1, 1)
     assert result["out_of_tolerance"] == result["out_of_tolerance_not_flagged"] == [3]
     assert result["measured"]["image_mm"] == "offline"
 

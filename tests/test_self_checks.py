@@ -215,8 +215,13 @@ def test_a_suspicion_ends_when_its_cause_ends() -> None:
 CONFIGURED_LAG_S = 0.03
 
 
-def move_arm(seed: int, seconds: float, extra_lag_s: float) -> Iterator[tuple[SelfCheck, ...]]:
-    """Yield the checks of an arm whose servo has the drawn lag and an extra one."""
+def move_arm(
+    seed: int, seconds: float, extra_lag_s: float, *, round_trip_s: float = 0.001
+) -> Iterator[tuple[SelfCheck, ...]]:
+    """Yield the checks of an arm whose servo has the drawn lag and an extra one.
+
+    round_trip_s: time until the bridge reads the answer, which the arm sends at once.
+    """
     random = np.random.default_rng((seed, 23))
     truth = sample_apparatus(SCENE, seed, calibrated=True).arms.left
     assert truth.servo_lag_s is not None
@@ -235,10 +240,10 @@ def move_arm(seed: int, seconds: float, extra_lag_s: float) -> Iterator[tuple[Se
         number += 1
         now_s += random.uniform(0.8, 1.2) / 70.0
         estimator.on_command(now_s, (size * np.sin(pace * now_s + phase)).sum(axis=0))
-        answer_s = now_s + 0.0005
-        moved = (amplitude * np.sin(pace * (answer_s - late_s) + phase - delay)).sum(axis=0)
+        read_s, answer_s = now_s + 0.0001, now_s + 0.5 * round_trip_s
+        moved = (amplitude * np.sin(pace * (read_s - late_s) + phase - delay)).sum(axis=0)
         estimator.on_measurement(answer_s, moved + 5e-6 * random.standard_normal(6))
-        results = check.update(estimator.estimate, round(1e9 * answer_s))
+        results = check.update(estimator.estimate, round_trip_s, round(1e9 * answer_s))
         if number % 35 == 0:
             yield results
 
@@ -254,6 +259,13 @@ def test_a_calibrated_arm_raises_no_suspicion_in_ten_minutes(seed: int) -> None:
     reports = list(move_arm(seed, TEN_MINUTES_S, 0.0))
     assert {one.cause for one in reports[-1]} == {"servo_lag", "arm_not_following"}
     assert not set().union(*map(suspected, reports))
+
+
+def test_late_answers_of_an_overloaded_computer_are_not_a_shorter_lag() -> None:
+    *_, last = move_arm(100, 20.0, 0.0, round_trip_s=0.024)
+    assert suspected(last) == set()
+    *_, last = move_arm(110, 10.0, 0.03, round_trip_s=0.008)
+    assert suspected(last) == {"servo_lag"}
 
 
 async def test_the_triangulator_names_a_moved_camera_from_images() -> None:

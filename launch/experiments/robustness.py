@@ -116,17 +116,22 @@ def run_robustness(
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
 
-    For a metric without values they are None.
+    For a metric without values they are None. Also count the trials with the metric, those out of
+    tolerance, and of the latter those in which no self-check suspected a cause.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:
         known = [(row[metric], row["seed"]) for row in rows if row[metric] is not None]
         values = np.array([value for value, _ in known])
         worst = max(known, default=(None, None))
+        exceeded = [row for row in rows if metric in row["out_of_tolerance"]]
         summary[metric] = {
             "median": float(np.median(values)) if known else None,
             "p95": float(np.quantile(values, 0.95)) if known else None,
             "worst": worst[0],
             "worst_seed": worst[1],
+            "trials": len(known),
+            "out_of_tolerance": len(exceeded),
+            "not_flagged": sum(not row["flagged"] for row in exceeded),
         }
     return summary

@@ -243,7 +243,10 @@ class ArmBridge(Node):
             self._lag.on_measurement(0.5e-9 * (last.sent_ns + last.measured_ns), status.joints_rad)
             if last.measured_ns - self._checked_ns >= CHECK_PERIOD_NS:
                 self._checked_ns = last.measured_ns
-                self.self_checks = self._servo_check.update(self._lag.estimate, last.measured_ns)
+                round_trip_s = (last.measured_ns - last.sent_ns) * 1e-9
+                self.self_checks = self._servo_check.update(
+                    self._lag.estimate, round_trip_s, last.measured_ns
+                )
         if self._control.mode == "follow" and (latency_s := self._latency.add(last, self._lag)):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 

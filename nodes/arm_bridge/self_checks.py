@@ -27,10 +27,19 @@ class ServoCheck:
         self._tracking = ResidualMonitor(1, threshold=TRACKING_THRESHOLD_RAD)
         self._expected_rad = 0.0
 
-    def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate of the lag; return the checks that have enough data."""
+    def update(
+        self, estimate: LagEstimate | None, round_trip_s: float, at_ns: int
+    ) -> tuple[SelfCheck, ...]:
+        """Add the newest estimate of the lag; return the checks that have enough data.
+
+        round_trip_s: time from a command to its answer. The arm reads its joints at an unknown time
+        in between, so half of it may be an error of the estimate, as on an overloaded computer.
+        """
         if estimate is not None:
-            self._lag.add(np.array([estimate.lag_s - self._configured_lag_s]), at_ns)
+            deviation_s = estimate.lag_s - self._configured_lag_s
+            error_s = 0.5 * max(round_trip_s, 0.0)
+            excess_s = deviation_s - min(max(deviation_s, -error_s), error_s)
+            self._lag.add(np.array([excess_s]), at_ns)
             self._expected_rad = estimate.expected_error_rad
             self._tracking.add(
                 np.array([max(estimate.tracking_error_rad - self._expected_rad, 0.0)]), at_ns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 
 import moderngl
@@ -17,6 +18,12 @@ from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
 from flexsheet.nodes.models.sheet.indentation import IndentationBasis
+from flexsheet.nodes.renderer.check_marks import (
+    FINGER_STEP_M,
+    NO_MARKS,
+    CheckMarks,
+    place_marks,
+)
 from flexsheet.nodes.renderer.correction import (
     NEAR_M,
     ProjectionScreen,
@@ -129,6 +136,7 @@ class SceneRenderer:
         self.canvas.set_material(self._material())
         self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
+        self.check_marks = NO_MARKS
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
         px_per_m = OVERSAMPLING * abs(float(projector_homography(scene)[0, 0]))
@@ -261,6 +269,30 @@ class SceneRenderer:
             display, draw_eye, multisampled=True, read=read, eyes=eyes, drawn=drawn
         )
 
+    def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
+        """Place the marks that check the calibrations; the next images contain them."""
+        note, pushed_point, deeper = self.note, sheet.pushed_point, None
+        if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
+            deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]
+            deeper = self.sheet_mesh(replace(sheet, pushed_point=deeper_point))
+        mesh = self.sheet_mesh(sheet)
+        self.note = note
+        projector = require_projector(self.scene)
+        self.check_marks = place_marks(projector, sheet.world_from_sheet, mesh, deeper)
+        return self.check_marks
+
+    def _draw_check_marks(self, part: ImagePart) -> None:
+        """Draw white squares into a part of the image; the display stretches it to the whole."""
+        canvas, (left, bottom, width, height) = self.canvas, part.viewport
+        scale = np.array([width / canvas.width_px, height / canvas.height_px])
+        side_px = self.check_marks.side_px
+        size = np.rint(side_px * scale).astype(int)
+        for column, row in self.check_marks.corners_px.tolist():
+            low = np.rint(scale * [column, canvas.height_px - row - side_px]).astype(int)
+            if (low >= 0).all() and (low + size <= (width, height)).all():
+                square = (left + int(low[0]), bottom + int(low[1]), int(size[0]), int(size[1]))
+                canvas.target.clear(1.0, 1.0, 1.0, viewport=square)
+
     def draw_onto(
         self,
         display: Display,
@@ -321,6 +353,7 @@ class SceneRenderer:
             # Do not wait between the eyes: a software driver then works on both at the same time.
             for eye, part in zip(eyes[first:], parts, strict=False):
                 draw_eye(eye, part)
+                self._draw_check_marks(part)
             canvas.resolve()
             drawn(number)
             if read and number == shown:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,8 +17,14 @@ from flexsheet.messages.marker_calibration import (
     refuse_other_marker,
 )
 from flexsheet.messages.methods import resolve_method
-from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Fingertip, FingertipReason, ParameterChange, StereoPair
+from flexsheet.messages.scene import Scene, shows_check_marks
+from flexsheet.messages.types import (
+    Fingertip,
+    FingertipReason,
+    Frame,
+    ParameterChange,
+    StereoPair,
+)
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
@@ -49,6 +55,10 @@ TIMEOUT_PERIODS = 2.5
 """Minimum timeout of a track in periods of the camera, so that one image pair may be missing."""
 
 
+SAME_POINT_M = 0.001
+"""Maximum distance between two positions of one marker in two searches of one image pair."""
+
+
 class Triangulator(Node):
     """Node that detects the fingertip in each stereo pair and tracks it.
 
@@ -57,10 +67,12 @@ class Triangulator(Node):
     rotation.
     """
 
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
     parameters: TriangulatorParameters
     scene: Input[Scene]
     stereo: Input[StereoPair]
+    frame: Input[Frame]
     parameter: Input[ParameterChange]
     fingertip: Output[Fingertip]
 
@@ -68,6 +80,10 @@ class Triangulator(Node):
     marker_calibration: MarkerCalibration | None = None
     geometry: StereoGeometry | None = None
     epoch, late = 0, 0
+
+    @classmethod
+    def unused_inputs(cls, parameters: Any, scene: Scene) -> frozenset[str]:
+        return frozenset() if shows_check_marks(scene) else frozenset({"frame"})
 
     async def setup(self) -> None:
         if path := self.parameters.calibration:
@@ -122,9 +138,14 @@ class Triangulator(Node):
         self._check = CameraCheck(
             np.array(p.reference_marks_world_m, dtype=np.float64),
             None if touch_point is None else np.array(touch_point),
+            scene.projector,
         )
         self._period = MeasuredPeriod(1.0 / scene.camera.rate_hz)
         self._restart(self.epoch)
+
+    def on_frame(self, frame: Frame, header: Header) -> None:
+        if self.geometry is not None:
+            self._check.on_frame(frame)
 
     def _adapt_timeout(self, source_ns: int) -> None:
         """Adapt the track's timeout to the measured camera rate, so that one pair may be lost."""
@@ -184,8 +205,11 @@ class Triangulator(Node):
         if reason == "ok" and measured is not None:
             pad = measured.point_world - self.pad_to_marker_m
             self._check.on_finger(pad, measured.reprojection_px, at_ns)
-        marks = (*detection.markers, *detection.clutter)
-        self._check.on_marks([one.point for one in marks], at_ns)
+        points = [one.point for one in (*detection.markers, *detection.clutter)]
+        if reason == "ok" and measured is not None:
+            finger = measured.point_world
+            points = [one for one in points if np.linalg.norm(one - finger) > SAME_POINT_M]
+        self._check.on_marks(points, at_ns)
         self.self_checks = self._check.results()
 
     def _restart(self, epoch: int) -> None:

@@ -15,9 +15,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.types import SelfCheck, SuspectedCause
+from flexsheet.messages.scene import Projector
+from flexsheet.messages.types import Frame, SelfCheck, SuspectedCause
 from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.triangulator.fingertip import StereoDetection
+from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
 
 Floats = NDArray[np.float64]
 
@@ -51,17 +53,36 @@ class CameraCheck:
 
     reference_marks: world positions (n, 3) m of fixed marks that look like the finger's marker.
     touch_point: world position (3,) m of the known point, or None.
+    projector: projector of the scene, which may project check marks on the sheet, or None.
     """
 
-    def __init__(self, reference_marks: Floats, touch_point: Floats | None) -> None:
+    def __init__(
+        self,
+        reference_marks: Floats,
+        touch_point: Floats | None,
+        projector: Projector | None = None,
+    ) -> None:
         self._marks, self._touch_point = reference_marks.reshape(-1, 3), touch_point
+        self._projection = ProjectionCheck(projector)
         self._reprojection = ResidualMonitor(1, threshold=REPROJECTION_THRESHOLD_PX)
         self._camera = ResidualMonitor(3, threshold=MARK_THRESHOLD_M)
         self._marker = ResidualMonitor(3, threshold=MARKER_THRESHOLD_M, memory_s=1.0, confirm_s=0.5)
         self._resting: deque[tuple[int, Floats]] = deque()
 
+    def on_frame(self, frame: Frame) -> None:
+        """Add the expected positions of projected check marks."""
+        self._projection.on_frame(frame)
+
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Check the reference marks with the positions (3,) m of all markers in an image pair."""
+        """Check the fixed and projected marks with the positions (3,) m of all bright points."""
+        self._check_reference_marks(points, at_ns)
+        self._projection.on_points(points, self._camera_shift_m, at_ns)
+
+    @property
+    def _camera_shift_m(self) -> Floats:
+        return self._camera.mean if self._camera.has_data else np.zeros(3)
+
+    def _check_reference_marks(self, points: Sequence[Floats], at_ns: int) -> None:
         if not len(self._marks) or not points:
             return
         found = np.stack(points)
@@ -75,20 +96,22 @@ class CameraCheck:
             self._camera.add(np.median(offsets[rows, nearest][seen], axis=0), at_ns)
 
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
-        """Return a detection without the reference marks, which must not compete with the finger.
+        """Return a detection without the fixed and projected marks; the finger is not among them.
 
         tracked: whether the finger was searched in a gate, so that a marker there is the finger's.
         """
-        if not len(self._marks):
+        marks = np.concatenate([self._marks, self._projection.expected_world_m])
+        if not len(marks):
             return detection
+
+        def is_mark(point: Floats) -> bool:
+            return bool((np.linalg.norm(marks - point, axis=1) <= MARK_RADIUS_M).any())
+
         markers = detection.markers
         if not tracked:
-            markers = tuple(one for one in markers if not self._is_mark(one.point))
-        clutter = tuple(one for one in detection.clutter if not self._is_mark(one.point))
+            markers = tuple(one for one in markers if not is_mark(one.point))
+        clutter = tuple(one for one in detection.clutter if not is_mark(one.point))
         return replace(detection, markers=markers, clutter=clutter)
-
-    def _is_mark(self, point: Floats) -> bool:
-        return bool((np.linalg.norm(self._marks - point, axis=1) <= MARK_RADIUS_M).any())
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
         """Add the finger pad (3,) m by its triangulated marker, with the reprojection error."""
@@ -106,11 +129,11 @@ class CameraCheck:
         offsets = np.stack([one for _, one in self._resting])
         if span_s < 0.8 * STILL_S or float(offsets.std(axis=0).max()) > STILL_M:
             return
-        shift = self._camera.mean if self._camera.has_data else np.zeros(3)
-        self._marker.add(offset - shift, at_ns)
+        self._marker.add(offset - self._camera_shift_m, at_ns)
 
     def results(self) -> tuple[SelfCheck, ...]:
         """Return the results of those checks for which there is data."""
+        by_marks = self._projection.results(camera_checked=self._camera.has_data)
         found = []
         if self._reprojection.has_data:
             found.append(
@@ -126,8 +149,10 @@ class CameraCheck:
         if self._camera.has_data:
             found.append(_distance_check("camera_moved", self._camera))
         if self._marker.has_data:
+            # The known point shows the offset in all directions, the sheet only along its normal.
             found.append(_distance_check("marker_offset", self._marker))
-        return tuple(found)
+            by_marks.pop("marker_offset", None)
+        return (*found, *by_marks.values())
 
 
 def _distance_check(cause: SuspectedCause, monitor: ResidualMonitor) -> SelfCheck:

@@ -18,16 +18,17 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import NonNegative, Scene
-from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
+from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
+from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState, Floats
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
+from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
-from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.pixels import NO_POINTS, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
@@ -73,10 +74,12 @@ class TwinFingerNode(Node):
     """Move a simulated finger along its path, and render stereo images at the camera's rate."""
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
     parameters: TwinFingerParameters
     scene: Input[Scene]
-    twin__finger_path: Input[FingerPath]
+    frame: Input[Frame]
     twin__arms: Input[TwinArms]
+    twin__finger_path: Input[FingerPath]
     twin__finger: Output[TwinFinger]
     twin__stereo: Output[StereoPair]
 
@@ -89,6 +92,7 @@ class TwinFingerNode(Node):
     missed_frames = 0
     coupled: CoupledFinger | None = None
     preparing: asyncio.Task[None] | None = None
+    lit_marks: LitMarks | None = None
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
@@ -97,7 +101,9 @@ class TwinFingerNode(Node):
 
     @classmethod
     def unused_inputs(cls, parameters: TwinFingerParameters, scene: Scene) -> frozenset[str]:
-        return frozenset({"twin__arms"} if parameters.hand == "prescribed" else ())
+        if shows_check_marks(scene):
+            return frozenset()
+        return frozenset({"frame"} if parameters.hand == "coupled" else cls.optional_inputs)
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
@@ -112,6 +118,8 @@ class TwinFingerNode(Node):
             if task is not None:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
+        if self.lit_marks is not None:
+            self.lit_marks.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         truth = self.parameters.apparatus
@@ -129,6 +137,9 @@ class TwinFingerNode(Node):
             nail=None if truth is None else Nail.of(truth.finger),
             skew_s=0.0 if truth is None else truth.camera.skew_s,
         )
+        if self.lit_marks is not None:
+            self.lit_marks.close()
+        self.lit_marks = LitMarks(true_scene, truth) if shows_check_marks(true_scene) else None
         self.max_speed_m_per_s = true_scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / true_scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * true_scene.camera.exposure_s)
@@ -174,6 +185,10 @@ class TwinFingerNode(Node):
         self.edges.add(at_s, left @ self.clamps[0], right @ self.clamps[1])
         if self.edges:
             self.coupled.advance(at_s, self.edges)
+
+    def on_frame(self, frame: Frame, header: Header) -> None:
+        if self.lit_marks is not None:
+            self.lit_marks.on_frame(frame)
 
     def _make_resting(self, rest: Floats) -> FingerMotion:
         """Make a finger that rests at `rest`, with the tremor of the apparatus."""
@@ -259,6 +274,7 @@ class TwinFingerNode(Node):
             self._track(exposed_ns),
             exposure_s=self.exposure_ns * 1e-9,
             time_s=exposed_ns * 1e-9,
+            lit_points=self._lit_points(exposed_ns, state.position),
         )
         return StereoPair(
             device=self.camera.camera.device,
@@ -274,6 +290,13 @@ class TwinFingerNode(Node):
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
         return lambda offset_s: seen.position + offset_s * seen.velocity
+
+    def _lit_points(self, at_ns: int, finger: Floats) -> Floats:
+        """Return the points (n, 3) of the sheet on which projected check marks are visible."""
+        arms = self.twin__arms.message
+        if self.lit_marks is None or arms is None:
+            return NO_POINTS
+        return self.lit_marks.light(arms, finger, at_ns)
 
     def _stamp_error_ns(self) -> int:
         """Return a random sample of the true time of an exposure minus its timestamp."""

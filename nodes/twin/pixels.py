@@ -68,6 +68,12 @@ ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 EMPTY_FRACTION = 1.2
 """Two overlapping windows are joined if the joined area is at most this multiple of their sum."""
 
+LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
+"""Radius of a projected mark that has the area of 10 x 10 pixels of 0.5 mm, and the grey level that
+it adds to the sheet."""
+
+NO_POINTS = np.zeros((0, 3))
+
 SPOTS = 61
 """Number of Gaussian spots that make up a flat marker."""
 
@@ -229,15 +235,24 @@ class TwinCamera:
         return other
 
     def picture(
-        self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
+        self,
+        position: Position,
+        *,
+        exposure_s: float,
+        marker: bool = True,
+        time_s: float = 0.0,
+        lit_points: Floats = NO_POINTS,
     ) -> tuple[Image, Image]:
         """Render the left and right image of a finger whose tip moves along `position`.
 
         marker: whether the finger wears a marker.
         time_s: simulation time at mid-exposure, which determines where moving clutter is.
+        lit_points: points (n, 3) of the sheet that the projector lights.
         """
         left, right = (
-            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, marker=marker))
+            self._exposed(
+                eye, self._draw(eye, tips, time_s + instants_s, marker=marker, lit=lit_points)
+            )
             for eye, instants_s, tips in self._views(position, exposure_s)
         )
         return left, right
@@ -297,7 +312,13 @@ class TwinCamera:
         return quantize(levels + self.sensor.noise(levels) * noise)
 
     def _draw(
-        self, eye: CameraView, tips: Floats, times_s: Floats, *, marker: bool
+        self,
+        eye: CameraView,
+        tips: Floats,
+        times_s: Floats,
+        *,
+        marker: bool,
+        lit: Floats = NO_POINTS,
     ) -> list[Window]:
         """Draw the finger and all moving objects on the camera's canvas; return drawn windows.
 
@@ -306,7 +327,9 @@ class TwinCamera:
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
         way = tips[-1] - tips[0]
-        windows = []
+        windows = [
+            self._disc(eye, point[None], LIT_RADIUS_M, LIT_LEVEL, adds=True) for point in lit
+        ]
         for limb in clutter.limbs:
             ends = np.stack([limb.start.at(time_s), limb.end.at(time_s)])
             if limb.carried:

@@ -1,0 +1,103 @@
+"""Place the projected marks with which the stereo camera checks the calibrations.
+
+A mark is a square of projector pixels with known rays. The camera must therefore see it on that ray
+if projector and camera are where the scene says, and on the sheet if the arms are, too. The sheet
+near a pushing finger follows it in a known ratio, which shows the true depth of the finger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Projector
+from flexsheet.nodes.models import camera
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
+
+Floats = NDArray[np.float64]
+
+SIDE_M = 0.0053
+"""Side of a mark, which then has the area of a marker of 3 mm radius: the triangulator finds it as
+another marker.  Its side in pixels is even, as are the corners, because a mark may be drawn at half
+the resolution (see `output.image_parts`)."""
+
+FINGER_STEP_M = 0.001
+"""Displacement of the fingertip that determines the ratio of the marks' displacements to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckMarks:
+    """Projected marks of one frame.
+
+    side_px: side of the squares. corners_px: (n, 2) left column and top row. world_m: (n, 3)
+    centres on the sheet; NaN for a mark that misses it. finger_ratio: (n,) displacement of the
+    sheet along its normal, divided by that of the fingertip.
+    """
+
+    side_px: int
+    corners_px: NDArray[np.int64]
+    world_m: Floats
+    finger_ratio: Floats
+
+    @property
+    def centres_px(self) -> Floats:
+        return self.corners_px + 0.5 * (self.side_px - 1)
+
+
+NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(0))
+
+
+def place_marks(
+    projector: Projector, world_from_sheet: Floats, mesh: SheetMesh, deeper: SheetMesh | None
+) -> CheckMarks:
+    """Place the marks of a projector on the sheet (4, 4) with its mesh.
+
+    deeper: mesh with the fingertip displaced by FINGER_STEP_M against the sheet's normal; None
+    without contact.
+    """
+    pose, lens = projector.world_from_projector, projector.lens
+    world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    matrix = camera.camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    distortion = np.array(lens.distortion)
+    points = np.array([(x, y, 0.0) for x, y in projector.check_marks_sheet_m])
+    local = apply(inverse(world_from_projector) @ world_from_sheet, points)
+    side_px = 2 * round(0.5 * SIDE_M * lens.fx_px / float(local[:, 2].mean()))
+    half = 0.5 * (side_px - 1)
+    pixels = camera.project(local, matrix, distortion)
+    corners = 2 * np.rint(0.5 * (pixels - half)).astype(np.int64)
+    slopes = camera.normalize(corners + half, matrix, distortion)
+    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ world_from_projector[:3, :3].T
+    triangles, weights = intersect(world_from_projector[:3, 3], rays, mesh.vertices[mesh.triangles])
+    surface = mesh.vertices[mesh.triangles[triangles]]
+    world = np.einsum("nk,nki->ni", weights, surface)
+    ratio = np.zeros(len(points))
+    if deeper is not None:
+        moved = deeper.vertices[mesh.triangles[triangles]] - surface
+        ratio = np.einsum("nk,nki,i->n", weights, moved, -world_from_sheet[:3, 2]) / FINGER_STEP_M
+    return CheckMarks(side_px, corners, world, np.nan_to_num(ratio))
+
+
+def intersect(origin: Floats, rays: Floats, corners: Floats) -> tuple[NDArray[np.intp], Floats]:
+    """Intersect rays (n, 3) from a point with triangles (m, 3, 3).
+
+    Return the index (n,) of the triangle that each ray hits, and barycentric weights (n, 3) of its
+    corners; NaN without a hit. Source: Moller and Trumbore 1997.
+    """
+    first, along, up = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(along, up)
+    from_first = origin - first
+    # Scalar triple products with the ray; one matrix product each for all rays and triangles.
+    volume = -rays @ normal.T
+    v = rays @ np.cross(up, from_first).T
+    w = rays @ np.cross(from_first, along).T
+    volume = np.where(np.abs(volume) < 1e-15, np.nan, volume)
+    v, w = v / volume, w / volume
+    inside = np.minimum(np.minimum(v, w), 1.0 - v - w)
+    hit = np.nanargmax(inside, axis=1)
+    rows = np.arange(len(rays))
+    v, w = v[rows, hit], w[rows, hit]
+    weights = np.column_stack([1.0 - v - w, v, w])
+    return hit, np.where(inside[rows, hit][:, None] >= -1e-9, weights, np.nan)

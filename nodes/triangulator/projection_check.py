@@ -1,0 +1,191 @@
+"""Compare the positions of projected marks on the sheet with the expected ones.
+
+A mark lies on the ray of its projector pixel, wherever the sheet is.  Its distance from this ray
+thus concerns only the projector and the camera, and its distance from the surface of the sheet only
+the arms and the camera.  Near a finger that pushes the sheet, the surface follows the true finger
+pad in a known ratio, so that an error of the measured depth of the pad is visible, too.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Projector
+from flexsheet.messages.types import Frame, SelfCheck, SuspectedCause
+from flexsheet.nodes.models.residuals import ResidualMonitor
+
+Floats = NDArray[np.float64]
+
+RAY_THRESHOLD_M = 7e-4
+"""Maximum distance of the marks from their rays (root mean square).  The standard deviation per
+axis is 0.12 mm from a calibrated camera and 0.03 mm from a calibrated projector."""
+
+SURFACE_THRESHOLD_M = 1.2e-3
+"""Maximum mean distance of the marks from the sheet's surface, about five standard deviations: of
+0.12 mm from the camera, and for each arm 0.2 mm from base and clamp and 0.2 mm from the zero
+positions of its joints (docs/apparatus.md)."""
+
+FINGER_THRESHOLD_M = 2e-3
+"""Maximum error of the finger's depth in the sheet.  Its standard deviation is 0.3 mm from the
+marker's offset, 0.12 mm from the camera, 0.25 mm from the arms and 0.2 mm from noise."""
+
+LATENCY_THRESHOLD_S = 0.01
+"""Deviation of the display latency above which it is suspected to be wrong, ten standard deviations
+of a measurement by photodiode (1 ms)."""
+
+LATENCY_MEMORY_S = 4.0
+"""Time constant of the mean latency: the few images taken while an old mark is still shown contain
+the deviation."""
+
+MATCH_RADIUS_M = 0.012
+"""Maximum distance of a detected point from the expected position of a mark."""
+
+MAX_AGE_NS = 2_000_000_000
+STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
+"""Speed of the marks on the sheet up to which positions, and from which the latency is checked."""
+
+MIN_RATIO_RANGE = 0.1
+"""Minimum range of the marks' displacement ratios with which the finger's depth is estimated."""
+
+
+class ProjectionCheck:
+    """Self-checks of projector, arms and marker by projected marks."""
+
+    def __init__(self, projector: Projector | None) -> None:
+        """Use the marks of the projector; without a projector or marks, do nothing."""
+        marks = () if projector is None else projector.check_marks_sheet_m
+        self._projector_m = (
+            np.zeros(3)
+            if projector is None
+            else np.array(projector.world_from_projector.position_m)
+        )
+        self._count = len(marks)
+        self._frames: deque[tuple[int, Floats, Floats, Floats]] = deque(maxlen=8)
+        # Each mark is a part of this residual: errors of rotation and lens cancel in their mean.
+        self._ray = ResidualMonitor(3 * len(marks), threshold=RAY_THRESHOLD_M)
+        self._surface = ResidualMonitor(1, threshold=SURFACE_THRESHOLD_M)
+        self._finger = ResidualMonitor(1, threshold=FINGER_THRESHOLD_M)
+        self._latency = ResidualMonitor(1, threshold=LATENCY_THRESHOLD_S, memory_s=LATENCY_MEMORY_S)
+
+    def on_frame(self, frame: Frame) -> None:
+        """Add the expected positions of the marks in a frame that the projector shows."""
+        if frame.light_ns and self._count and len(frame.marks_world_m) == self._count:
+            normal = frame.world_from_sheet[:3, 2]
+            expected = (frame.light_ns, frame.marks_world_m, frame.marks_finger_ratio, normal)
+            self._frames.append(expected)
+
+    @property
+    def expected_world_m(self) -> Floats:
+        """Return the newest expected positions (n, 3) of the marks."""
+        return self._frames[-1][1] if self._frames else np.zeros((0, 3))
+
+    def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
+        """Check the positions (3,) m of all bright points in an image pair.
+
+        camera_shift_m: shift (3,) of the fixed reference marks, which is that of the camera.
+        """
+        shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
+        if not shown or len(points) < 2:
+            return
+        light_ns, expected, ratios, normal = self._frames[shown[-1]]
+        if at_ns - light_ns > MAX_AGE_NS:
+            return
+        offsets = np.stack(points)[None] - expected[:, None]
+        distances = np.where(np.isfinite(offsets).all(axis=2), np.linalg.norm(offsets, axis=2), 1.0)
+        nearest = distances.argmin(axis=1)
+        rows = np.arange(self._count)
+        found = distances[rows, nearest] <= MATCH_RADIUS_M
+        if found.sum() < 2:
+            return
+        offset = offsets[rows, nearest] - camera_shift_m
+        rays = expected - self._projector_m
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        aside = offset - (offset * rays).sum(axis=1)[:, None] * rays
+        velocity = self._velocity(shown[-1])
+        if velocity is None:
+            return
+        speed = float(np.linalg.norm(velocity))
+        if speed <= STILL_M_PER_S:
+            scale = 1.0 / np.sqrt(self._count)
+            last = self._ray.mean.reshape(-1, 3)
+            self._ray.add(np.where(found[:, None], scale * aside, last).ravel(), at_ns)
+            self._add_surface((offset @ normal)[found], ratios[found], at_ns)
+        elif speed >= MOVING_M_PER_S:
+            # A frame that appears later than expected shows each mark where it was before.
+            constant = np.sqrt(self._count) * self._ray.mean.reshape(-1, 3)
+            late = -(aside - constant)[found].mean(axis=0) @ velocity / speed**2
+            self._latency.add(np.array([late]), at_ns)
+
+    def _velocity(self, number: int) -> Floats | None:
+        """Return the mean velocity (3,) of the marks across their rays; None if it is unknown."""
+        if number == 0:
+            return None
+        (before_ns, before, *_), (now_ns, now, *_) = self._frames[number - 1], self._frames[number]
+        step_s = (now_ns - before_ns) * 1e-9
+        if step_s <= 0.0 or not np.isfinite(now - before).all():
+            return None
+        velocity = (now - before).mean(axis=0) / step_s
+        ray = now.mean(axis=0) - self._projector_m
+        ray /= np.linalg.norm(ray)
+        return np.asarray(velocity - (velocity @ ray) * ray)
+
+    def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
+        """Add the heights (n,) of the marks above the expected surface of the sheet."""
+        if not ratios.any():
+            self._surface.add(np.array([heights_m.mean()]), at_ns)
+        elif len(ratios) >= 3 and float(np.ptp(ratios)) >= MIN_RATIO_RANGE:
+            # heights = height of the sheet + ratio * height of the true finger pad
+            design = np.column_stack([np.ones(len(ratios)), ratios])
+            (height_m, finger_m), *_ = np.linalg.lstsq(design, heights_m, rcond=None)
+            self._surface.add(np.array([height_m]), at_ns)
+            self._finger.add(np.array([finger_m]), at_ns)
+
+    def results(self, *, camera_checked: bool) -> dict[SuspectedCause, SelfCheck]:
+        """Return the results of those checks for which there is data, by cause.
+
+        camera_checked: whether reference marks show the shift of the camera, which separates it
+        from the projector and the arms.
+        """
+        ray, surface = self._ray, self._surface
+        found: dict[SuspectedCause, SelfCheck] = {}
+        # One cause is more likely than two: only the camera affects both residuals.
+        is_camera = ray.suspected and surface.suspected and not camera_checked
+        if ray.has_data:
+            cause: SuspectedCause = (
+                "projector_moved" if camera_checked else "camera_or_projector_moved"
+            )
+            found[cause] = _make_check(cause, "m", ray, suspected=ray.suspected and not is_camera)
+        if surface.has_data:
+            cause = "arm_base_moved" if camera_checked else "camera_or_arm_base_moved"
+            found[cause] = _make_check(
+                cause, "m", surface, suspected=surface.suspected and not is_camera
+            )
+        if is_camera:
+            found["camera_moved"] = _make_check("camera_moved", "m", ray, suspected=True)
+        if self._finger.has_data:
+            found["marker_offset"] = _make_check(
+                "marker_offset", "m", self._finger, suspected=self._finger.suspected
+            )
+        if self._latency.has_data:
+            # Images that appear too early are within the period for which a frame is shown.
+            found["display_latency"] = _make_check(
+                "display_latency", "s", self._latency, suspected=self._latency.suspected
+            )
+        return found
+
+
+def _make_check(
+    cause: SuspectedCause, unit: str, monitor: ResidualMonitor, *, suspected: bool
+) -> SelfCheck:
+    return SelfCheck(
+        cause=cause,
+        unit=unit,
+        value=monitor.deviation if unit == "m" else float(monitor.mean[0]),
+        expected=0.0,
+        threshold=monitor.threshold,
+        suspected=suspected,
+    )

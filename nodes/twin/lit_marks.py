@@ -1,0 +1,160 @@
+"""Compute where the true projector's check marks light the true sheet, for the stereo camera."""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.scene import Scene, require_projector
+from flexsheet.messages.types import Frame, TwinArms
+from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
+from flexsheet.nodes.twin.eye import TrueProjector
+from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solve
+from flexsheet.nodes.twin.projector import on_plane
+from flexsheet.nodes.twin.rig import slopes_of
+from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+
+Floats = NDArray[np.float64]
+
+CELLS = 8
+"""Number of node intervals per side of the sheet's mesh, which is solved in 0.15 s."""
+
+SOLVE_PERIOD_NS = 500_000_000
+MAX_FINGER_MOTION_M = 5e-4
+"""Period of solutions, and motion of a pushing finger since the last solution beyond which the
+marks are not drawn, because the shape of the sheet is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Heights:
+    """Heights (n,) of the sheet at the marks above the plane of its edges, for a finger (3,).
+
+    pushed: whether the finger deforms the sheet.
+    """
+
+    heights_m: Floats
+    finger_sheet_m: Floats
+    pushed: bool
+
+
+class LitMarks:
+    """Points of the true sheet that the projected marks light.
+
+    The sheet moves with the true arms. Its deflection by the finger and its weight is solved in the
+    background.
+    """
+
+    def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
+        """scene: the scene with the true devices."""
+        self._scene, self._apparatus = scene, apparatus
+        self._late_ns = (
+            0 if apparatus is None else round(1e9 * apparatus.projector.latency_offset_s)
+        )
+        projector = require_projector(scene)
+        pose = projector.world_from_projector
+        self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._frames: deque[tuple[int, Floats]] = deque(maxlen=16)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="sheet")
+        self._solving: Future[_Heights | None] | None = None
+        self._solved_ns = 0
+        self._heights: _Heights | None = None
+
+    def close(self) -> None:
+        self._worker.shutdown(cancel_futures=True)
+
+    def settle(self) -> None:
+        """Wait for the solution that is being computed."""
+        if self._solving is not None:
+            self._solving.exception()
+
+    def on_frame(self, frame: Frame) -> None:
+        """Add a frame that the projector shows until the next one."""
+        if frame.light_ns and len(frame.marks_px):
+            self._frames.append((frame.light_ns + self._late_ns, frame.marks_px))
+
+    def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
+        """Return the lit points (n, 3), world, at the time `at_ns`; empty if they are unknown."""
+        shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
+        if not shown:
+            return np.zeros((0, 3))
+        edges = self._edges(arms)
+        plane = _plane_of(*edges)
+        local = apply(inverse(plane), finger)
+        self._solve_if_due(edges, plane, finger, shown[-1], at_ns)
+        heights = self._heights
+        if heights is None or len(heights.heights_m) != len(shown[-1]):
+            return np.zeros((0, 3))
+        moved_m = float(np.linalg.norm(local - heights.finger_sheet_m))
+        if (heights.pushed or local[2] < 0.0) and moved_m > MAX_FINGER_MOTION_M:
+            return np.zeros((0, 3))
+        origin, rays = self._rays(shown[-1])
+        points = []
+        for ray, height_m in zip(rays, heights.heights_m.tolist(), strict=True):
+            raised = plane @ transform(np.eye(3), [0.0, 0.0, height_m])
+            points.append(on_plane(origin, ray, raised)[0])
+        return np.stack(points)
+
+    def _edges(self, arms: TwinArms) -> tuple[Floats, Floats]:
+        left, right = (
+            spec.flange_from_edge for spec in (self._scene.arms.left, self._scene.arms.right)
+        )
+        return (
+            arms.world_from_flange_left @ transform_from_rpy(left.position_m, left.rpy_rad),
+            arms.world_from_flange_right @ transform_from_rpy(right.position_m, right.rpy_rad),
+        )
+
+    def _rays(self, pixels: Floats) -> tuple[Floats, Floats]:
+        slopes = slopes_of(require_projector(self._scene).lens, pixels)
+        pose = self._world_from_projector
+        return pose[:3, 3], np.column_stack([slopes, np.ones(len(slopes))]) @ pose[:3, :3].T
+
+    def _solve_if_due(
+        self,
+        edges: tuple[Floats, Floats],
+        plane: Floats,
+        finger: Floats,
+        pixels: Floats,
+        at_ns: int,
+    ) -> None:
+        if self._solving is not None and self._solving.done():
+            self._heights, self._solving = self._solving.result(), None
+        if self._solving is None and at_ns - self._solved_ns >= SOLVE_PERIOD_NS:
+            self._solved_ns = at_ns
+            self._solving = self._worker.submit(self._solve, edges, plane, finger, pixels)
+
+    def _solve(
+        self, edges: tuple[Floats, Floats], plane: Floats, finger: Floats, pixels: Floats
+    ) -> _Heights | None:
+        scene = self._scene
+        try:
+            sheet: DeformedSheet = solve(
+                true_rubber(scene.sheet, self._apparatus),
+                *edges,
+                finger_tip=finger,
+                finger_radius_m=scene.finger.radius_m,
+                friction_coefficient=true_friction(self._apparatus),
+                cells=CELLS,
+            )
+        except NotConvergedError:
+            return None
+        vertices = sheet.positions.reshape(-1, 3)
+        true = TrueProjector(require_projector(scene), vertices, sheet.triangles())
+        points, lands = true.intersect_surface(pixels)
+        heights = np.where(lands, apply(inverse(plane), points)[:, 2], 0.0)
+        local = apply(inverse(plane), finger)
+        return _Heights(heights, local, bool(np.any(sheet.finger_force_n)))
+
+
+def _plane_of(left: Floats, right: Floats) -> Floats:
+    """Return the pose (4, 4) of the plane between two edges (4, 4); z points to the user."""
+    across = right[:3, 3] - left[:3, 3]
+    across = across / np.linalg.norm(across)
+    normal = np.cross(across, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    rotation = np.column_stack([across, np.cross(normal, across), normal])
+    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))
