@@ -9,6 +9,7 @@ LOCK := build/pip-tools
 # Of the tests: one more than cores, because some tests wait for other processes.
 WORKERS = $$(($$(nproc) + 1))
 SKIPPED := $(CURDIR)/build/skipped.txt
+SOURCES := flexsheet messages nodes launch benchmarks website
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
@@ -61,8 +62,10 @@ lint: $(DEV_STAMP)
 	$(BIN)/python -m tests.check_words
 	$(BIN)/mypy
 
-# The sheet's deflection shapes, which tests would otherwise compute in each of their processes.
+# Results that tests would otherwise compute in each of their processes: the sheet's deflection
+# shapes and the bytecode, which processes of nodes need too.
 cached: $(DEV_STAMP)
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q $(SOURCES)
 	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
 
 # Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
@@ -73,7 +76,7 @@ test: $(DEV_STAMP)
 	@mkdir -p build && : > $(SKIPPED)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint cached
 	@status=0; \
-	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
+	export OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED); set -x; \
 	$(BIN)/pytest -m "not alone and not long" --durations=25 --numprocesses $(WORKERS) --dist worksteal \
 		|| status=$$?; \
 	$(BIN)/pytest -m "alone and not long" --durations=15 $$(grep -l mark.alone tests/test_*.py) \
