@@ -32,6 +32,7 @@ from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES, NodeNote, describe_self_check
+from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
@@ -151,7 +152,7 @@ def evaluate_probes(
         found.append(_check_nodes(plan, probe))
         found.append(_check_rates(probe))
         found += _check_devices(plan.nodes_on(host), probe)
-        found += check_apparatus(probe, plan.nodes_on(host))
+        found += check_apparatus(probe, plan.nodes_on(host), plan.scene_message())
         found += _check_resources(probe)
     return found
 
@@ -164,7 +165,9 @@ REQUIRED_FOR_CHECKS = {
 """Name of each optional check, by the parameter that enables it."""
 
 
-def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:
+def check_apparatus(
+    probe: HostProbe, nodes: Sequence[ResolvedNode], scene: Scene | None = None
+) -> Iterator[HostFinding]:
     """Report the causes that the nodes' self-checks suspect, and the checks that are off."""
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
@@ -182,6 +185,9 @@ def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator
         for parameter, what in REQUIRED_FOR_CHECKS.items()
         if parameter in node.parameters and not node.parameters[parameter]
     ]
+    projects = scene is not None and scene.projector is not None and not shows_check_marks(scene)
+    if projects and any("reference_marks_world_m" in node.parameters for node in nodes):
+        missing.append("projector and arm bases: set `projector.check_marks_sheet_m` of the scene")
     if not suspected and (checks or missing):
         unchecked = (f"no check of {one}" for one in missing)
         text = "; ".join([f"{len(checks)} residuals as expected", *unchecked])
