@@ -27,7 +27,6 @@ from flexsheet.launch.health.compliance import (
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.types import SoftBody
-from flexsheet.nodes.models.hand_loop import compute_offset_bounds
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner import sheet_force
@@ -46,6 +45,7 @@ from flexsheet.nodes.planner.compliance import (
     render_force,
 )
 from flexsheet.nodes.planner.sheet_force import make_force_model
+from tests.hand_bounds import make_bounds_60_hz
 
 Floats = NDArray[np.float64]
 
@@ -315,7 +315,7 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
 def test_the_risk_of_the_loop_follows_from_object_and_delay(
     scale: float, delay_s: float, risk: LoopRisk | None
 ) -> None:
-    table = compute_offset_bounds(1.0 / 60.0, advance_limit=0.5)
+    table = make_bounds_60_hz()
     finding = find_loop_risk(
         SCENE, make_force_model(SCENE.sheet), soft_curve(scale), table, delay_s
     )
@@ -329,7 +329,7 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
     curve = soft_curve(0.8)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
     body = SimpleNamespace(at_rest=lambda: SimpleNamespace(force_curve=rows))
-    table = compute_offset_bounds(1.0 / 60.0, advance_limit=0.5)
+    table = make_bounds_60_hz()
     monkeypatch.setattr(compliance_check, "load_cached", lambda *_: table)
     cached = {"bodies": lambda *_: [body], "is_cached": lambda *_: True}
     for name, function in cached.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,8 @@ from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
-from flexsheet.nodes.twin.gestures import HOVER_M, minimum_jerk
-from flexsheet.nodes.twin.hand import CoupledFinger, HandImpedance, TrueSheet
+from flexsheet.nodes.twin.gestures import HOVER_M, SAMPLE_S, minimum_jerk
+from flexsheet.nodes.twin.hand import CoupledFinger, HandImpedance, TrueSheet, VoluntaryPath
 from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 
@@ -119,7 +120,11 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
     places[:, 2] += 0.25 * depth_m * (1.0 - np.cos(phase)) * (times < np.floor(times[-1]))
     _, lift = minimum_jerk((0.0, -half_m, -depth_m), [(0.8, (0.0, -half_m, HOVER_M))])
     all_places = np.concatenate([reach, places[1:], lift[1:]])
-    return _make_path(scene, "stroke", (0.004 * np.arange(len(all_places)), all_places))
+    return _make_path(
+        scene,
+        "stroke",
+        (np.linspace(0.0, SAMPLE_S * (len(all_places) - 1), len(all_places)), all_places),
+    )
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
@@ -227,6 +232,10 @@ def hand_gestures_result(
     reaction = load_or_compute_reaction(scene, None, cache_dir)
     bounds = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     depth_m = DEPTH_FRACTION * scene.working_range.push_depth_m
+
+    def make_finger(impedance: HandImpedance, path: VoluntaryPath) -> CoupledFinger:
+        return CoupledFinger(impedance, TrueSheet(scene, None, reaction), path)
+
     rows: list[dict[str, Any]] = []
     forces: dict[tuple[str, str], FeltForce] = {}
     for number, hand in enumerate(draw_hands(hands, seed)):
@@ -242,9 +251,7 @@ def hand_gestures_result(
                 scene,
                 make_path(scene, depth_m),
                 curve,
-                lambda path, given=impedance: CoupledFinger(
-                    given, TrueSheet(scene, None, reaction), path
-                ),
+                partial(make_finger, impedance),
                 bounds=bounds,
             )
             force = compute_felt_force(scene, recorded, curve)
