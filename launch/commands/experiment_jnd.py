@@ -29,7 +29,7 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from flexsheet.launch.experiments.jnd import SessionPlan
+    from flexsheet.launch.experiments.jnd import SessionPlan, StaircaseSession
     from flexsheet.messages.scene import Scene
 
 
@@ -199,7 +199,7 @@ def _measure(
     return row
 
 
-def _open(plan: SessionPlan, folder: Path) -> Any:
+def _open(plan: SessionPlan, folder: Path) -> StaircaseSession:
     from datetime import UTC, datetime
 
     from flexsheet.launch.experiments.jnd import StaircaseSession

@@ -98,10 +98,19 @@ class MeasuredForceCheck:
         if min(depths) < MIN_INDENTATION_M or max(depths) - min(depths) > QUIET_M:
             return
         push = min(near, key=lambda one: abs(one.valid_at_ns - at_ns))
-        where = {"position_m": push.position_m, "finger_radius_m": self._radius_m}
-        if self._model.invalid_reason(push.stretch_ratio, push.indentation_m, **where):
+        if self._model.invalid_reason(
+            push.stretch_ratio,
+            push.indentation_m,
+            position_m=push.position_m,
+            finger_radius_m=self._radius_m,
+        ):
             return
-        pressed = self._model.evaluate(push.stretch_ratio, np.array([push.indentation_m]), **where)
+        pressed = self._model.evaluate(
+            push.stretch_ratio,
+            np.array([push.indentation_m]),
+            position_m=push.position_m,
+            finger_radius_m=self._radius_m,
+        )
         predicted_n = float(pressed.force_n[0])
         if predicted_n > MIN_FORCE_N:
             self._monitor.add(np.array([force_n / predicted_n - 1.0]), at_ns)
