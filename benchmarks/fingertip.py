@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from benchmarks.fingertip_bound import fingertip_bound
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.tracking import Gate
 from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
@@ -103,7 +103,7 @@ def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]
         for i, shot in enumerate(taken):
             for way, gate in enumerate((Gate(shot.expected, REACH_M), None)):
                 start = time.thread_time()
-                reason, measured = detect(
+                found = detect_all(
                     shot.left,
                     shot.right,
                     geometry=geometry,
@@ -111,6 +111,7 @@ def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]
                     volume=volume,
                     gate=gate,
                 )
+                reason, measured = found.reason, found.measured
                 times[way, turn, i] = time.thread_time() - start
                 if reason == "ok" and measured is not None:
                     errors[way, i] = measured.point_world - shot.truth

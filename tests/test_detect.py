@@ -18,7 +18,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.benchmarks import DrawnDisc, noisy
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
@@ -62,13 +62,14 @@ def detect_in(
     geometry: StereoGeometry = GEOMETRY,
     **changes: object,
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    return detect(
+    found = detect_all(
         *pictures,
         geometry=geometry,
         config=config(name, **changes),
         volume=volume,
         gate=None if expected is None else Gate(expected, radius_m),
     )
+    return found.reason, found.measured
 
 
 def twin(clutter: Clutter = LAB, **sensor: float) -> TwinCamera:
@@ -116,7 +117,7 @@ def test_a_point_is_drawn_and_found_again(
         views.append(image)
         origins.append(corner)
     for expected in (None, Gate(truth + 0.002, REACH_M)):
-        reason, measured = detect(
+        found = detect_all(
             views[0],
             views[1],
             geometry=GEOMETRY,
@@ -126,6 +127,7 @@ def test_a_point_is_drawn_and_found_again(
             left_origin_px=origins[0],
             right_origin_px=origins[1],
         )
+        reason, measured = found.reason, found.measured
         assert reason == "ok"
         assert error_m(measured, truth) < 4e-4
 
@@ -182,7 +184,7 @@ def test_images_of_regions_have_their_origin() -> None:
     views = pictures(twin())
     full = detect_in(views)[1]
     cut = tuple(np.ascontiguousarray(view[180:320, 200:470]) for view in views)
-    reason, measured = detect(
+    found = detect_all(
         cut[0],
         cut[1],
         geometry=GEOMETRY,
@@ -192,6 +194,7 @@ def test_images_of_regions_have_their_origin() -> None:
         left_origin_px=(200, 180),
         right_origin_px=(200, 180),
     )
+    reason, measured = found.reason, found.measured
     assert reason == "ok"
     assert full is not None
     assert measured is not None

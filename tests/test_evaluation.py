@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.experiments import ExperimentError, robustness, sensitivity, sweep
-from flexsheet.launch.experiments.flags import read_flags
 from flexsheet.launch.experiments.follow import (
     LimitedMotion,
     bound_errors,
@@ -35,6 +34,7 @@ from flexsheet.launch.experiments.stroke_table import (
     write_radius_variant,
 )
 from flexsheet.launch.experiments.sweep import TrialError, execute_trial, run_sweep
+from flexsheet.launch.experiments.trial import read_flags
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagWriter

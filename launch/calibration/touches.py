@@ -15,7 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.finger_frame import world_from_finger
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
@@ -186,7 +186,7 @@ def _see_marker(
     """Return the detected marker position (3,) for a pad position; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
     given = TriangulatorParameters()
-    reason, measured = detect(
+    found = detect_all(
         left,
         right,
         geometry=geometry,
@@ -204,4 +204,5 @@ def _see_marker(
         volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
         gate=None,
     )
-    return measured.point_world if reason == "ok" and measured is not None else None
+    measured = found.measured
+    return measured.point_world if found.reason == "ok" and measured is not None else None

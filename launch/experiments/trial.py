@@ -15,7 +15,6 @@ from typing import Any
 
 from flexsheet.launch.commands.output import logs_on_stderr
 from flexsheet.launch.experiments import stroke
-from flexsheet.launch.experiments.flags import read_flags
 from flexsheet.launch.experiments.offline import (
     Metric,
     NodeCalibrations,
@@ -33,7 +32,9 @@ from flexsheet.launch.experiments.system_run import METRES_PER_PX, run_system
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.bag import BagReader
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.types import Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 
 Row = dict[str, Any]
@@ -69,6 +70,15 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
     if not trial.get("bag"):
         result["bag"] = None
     return {**result, "flagged": flagged}
+
+
+def read_flags(bag: Path) -> list[SuspectedCause]:
+    """Return the causes that nodes suspected, each once, in the order of first occurrence."""
+    found: dict[SuspectedCause, None] = {}
+    for _, message, _, _ in BagReader(bag, topics=["status"]):
+        if isinstance(message, Status):
+            found.update({check.cause: None for check in message.self_checks if check.suspected})
+    return list(found)
 
 
 def run_stroke_trial(trial: Mapping[str, Any]) -> Row:

@@ -148,7 +148,7 @@ class StereoDetection:
     """Detections in an image pair.
 
     reason: "ok", or why no finger was found.
-    measured: triangulated point, if any; see `detect`.
+    measured: triangulated point, if any; see `detect_all`.
     markers: candidates inside the gate, sorted by cost.
     clutter: candidates outside the gate.
     """
@@ -161,7 +161,7 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """Arguments of `detect`, where they are described."""
+    """Arguments of `detect_all`, where they are described."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -169,33 +169,6 @@ class DetectionInput:
     config: DetectorConfig
     volume: tuple[Floats, Floats]
     gate: Gate | None
-
-
-def detect(
-    left: Image,
-    right: Image,
-    *,
-    geometry: StereoGeometry,
-    config: DetectorConfig,
-    volume: tuple[Floats, Floats],
-    gate: Gate | None,
-    left_origin_px: Origin = (0, 0),
-    right_origin_px: Origin = (0, 0),
-) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Detect the marker in an image pair.
-
-    left, right: images (height, width).
-    volume: minimum and maximum corner (3,) m of the region that the finger may reach, world frame.
-    gate: region to search.  None searches both images, which must then contain one marker only.
-    left_origin_px, right_origin_px: column and row of the sensor where each image begins.
-
-    Return "ok" or the reason why no valid marker was found, and the triangulated point.  If two
-    rays meet, a point is also returned for a marker that is not valid.
-    """
-    images, origins = (left, right), (left_origin_px, right_origin_px)
-    inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
-    found = _detect_in(inputs, _search_windows(inputs))
-    return found.reason, found.measured
 
 
 def detect_all(
@@ -209,9 +182,15 @@ def detect_all(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> StereoDetection:
-    """Detect the finger's marker as `detect` does, and return all other markers with it.
+    """Detect the finger's marker in an image pair, and return all other markers with it.
 
-    If the finger is not found inside its gate, the full images are searched for other markers.
+    left, right: images (height, width).
+    volume: minimum and maximum corner (3,) m of the region that the finger may reach, world frame.
+    gate: region to search.  None searches both images, which must then contain one marker only.
+    left_origin_px, right_origin_px: column and row of the sensor where each image begins.
+
+    If two rays meet, a point is also returned for a marker that is not valid.  If the finger is not
+    found inside its gate, the full images are searched for other markers.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
