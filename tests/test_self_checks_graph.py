@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import yaml
-
 from flexsheet.launch.experiments.flags import read_flags
+
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import make_stroke_procedure, run_experiment
 from flexsheet.launch.plans.plan import load_scene

@@ -21,7 +21,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Gate
@@ -135,7 +135,7 @@ class MarkDetector:
 
     def find(self, left: Image, right: Image, *, near_world_m: Floats) -> Floats | None:
         """Return the position (3,) of the mark near an expected one; None without a clear mark."""
-        reason, measured = detect(
+        found = detect_all(
             left,
             right,
             geometry=self._geometry,
@@ -143,7 +143,9 @@ class MarkDetector:
             volume=(near_world_m - SEARCH_M, near_world_m + SEARCH_M),
             gate=Gate(near_world_m, SEARCH_M),
         )
-        return measured.point_world if reason == "ok" and measured is not None else None
+        if found.reason != "ok" or found.measured is None:
+            return None
+        return found.measured.point_world
 
 
 class EdgeMarkRecorder:
