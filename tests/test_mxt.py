@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from flexsheet.nodes.arm_bridge.mxt import (
 )
 from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault, forward
 from flexsheet.nodes.twin.mxt_controller import MxtController, MxtServer, numbers_of, pose_from
+from tests.examples import examples
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
@@ -136,7 +137,7 @@ any_bytes = st.one_of(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@examples(200)
 @given(any_bytes)
 def test_any_bytes_are_a_status_or_an_error(packet: bytes) -> None:
     with suppress(ArmLinkError):
@@ -168,7 +169,7 @@ inside = arrays(np.float64, 6, elements=st.floats(0.02, 0.98)).map(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@examples(50)
 @given(inside)
 def test_a_pose_packet_contains_the_flange_target(joints: Floats) -> None:
     numbers = np.array(struct.unpack_from("<8f", encode_pose(joints), 8), dtype=np.float64)
@@ -325,7 +326,7 @@ def test_another_master_is_ignored_until_the_first_has_ended() -> None:
     assert ask(arm, encode(COMMAND_NONE), other) is not None
 
 
-@settings(max_examples=150, deadline=None)
+@examples(75)
 @given(st.lists(any_bytes, max_size=12), st.booleans())
 def test_no_bytes_crash_the_controller_or_move_the_arm_out_of_bounds(
     packets: list[bytes], opened: bool
