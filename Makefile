@@ -63,10 +63,11 @@ lint: $(DEV_STAMP)
 	$(BIN)/mypy
 
 # Results that tests would otherwise compute in each of their processes: the sheet's deflection
-# shapes and the bytecode, which processes of nodes need too.
+# shapes, and the bytecode of the package and of the tests, whose assertions pytest rewrites.
 cached: $(DEV_STAMP)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q $(SOURCES)
 	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
+	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --collect-only -qq > /dev/null
 
 # Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
 # other processes have the machine for themselves; the others share its cores.  Both parts run, even

@@ -9,18 +9,16 @@ import asyncio
 import math
 import signal
 import sys
-from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SheetTarget
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.node import Node, NodeParameters, Output, periodic
 from flexsheet.nodes.runner import NodeConfig, run_node
+from tests.scenes import load_cylinder
 
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 LEAN_RAD, PERIOD_S = 0.3, 4.0
 
 
@@ -36,7 +34,7 @@ class Stroker(Node):
     sheet_target: Output[SheetTarget]
 
     async def setup(self) -> None:
-        self._scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+        self._scene = load_cylinder()
         self._told = False
 
     @periodic("rate_hz")

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock, SystemClock
@@ -22,16 +21,16 @@ from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.camera.node import Camera, CameraParameters
 from tests.node_harness import NodeHarness
+from tests.scenes import load_cylinder
 from tests.waiting import until
 
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 WIDTH, HEIGHT, FRAMES = 160, 120, 6
 Image = NDArray[np.uint8]
 
 
 def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
     """Load the paper's scene with a small camera and scaled optics."""
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    scene = load_cylinder()
     size = {"width_px": width_px, "height_px": height_px}
     scale = width_px / scene.camera.width_px
 

@@ -11,6 +11,7 @@ import pytest
 import structlog
 from hypothesis import settings
 
+from tests.examples import USUAL
 from tests.shared import FOLDER_VARIABLE
 
 # Node processes import test nodes ("tests.launch_nodes:Beacon") from the repository's root.
@@ -21,7 +22,9 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 
 # A deadline would assert wall-clock time, and fail on a busy machine.  The examples are the same in
 # each run, so that a failure is due to a change: `--hypothesis-profile random` draws others.
-settings.register_profile("fixed", deadline=None, derandomize=True, database=None)
+settings.register_profile(
+    "fixed", deadline=None, derandomize=True, database=None, max_examples=USUAL
+)
 settings.register_profile("random", deadline=None, print_blob=True)
 settings.register_profile("long", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("fixed")

@@ -5,19 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.wire import encode
+from tests.scenes import load_cylinder
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def cylinder() -> Scene:
     """Load the first scene of the demo."""
-    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
-    return Scene.model_validate(YAML(typ="safe").load(text))
+    return load_cylinder()
 
 
 class FixedMessages:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
@@ -17,6 +16,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
+from tests.scenes import load_values
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,7 @@ def scene_with(
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
     """Return the paper's scene with another object, by default in the world frame."""
-    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
-    values: dict[str, Any] = YAML(typ="safe").load(text)
+    values = load_values()
     values["object"] |= {
         "geometry": dict(geometry),
         "world_from_object": {"position_m": list(position_m), "rpy_rad": list(rpy_rad)},

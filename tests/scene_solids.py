@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.mesh import SolidMesh, mesh_scene
+from tests.scenes import load_values
 
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = {"plane": 0.0075}
 """Spacing of skin nodes; 0.006 for other shapes."""
 SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
@@ -45,7 +43,7 @@ def geometry(shape: str) -> dict[str, Any]:
 @cache
 def scene_solid(shape: str) -> SolidMesh:
     """Mesh the object as the solver does, with the support of the scene."""
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     body = content["object"]
     body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)

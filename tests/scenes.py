@@ -1,8 +1,25 @@
-"""Change scenes for tests."""
+"""Load and change scenes for tests."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+from flexsheet.launch.plans.documents import read_document
 from flexsheet.messages.scene import Scene
+
+CYLINDER_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+"""The paper's scene."""
+
+
+def load_values(path: Path = CYLINDER_FILE) -> dict[str, Any]:
+    """Return the values of a scene file, which is parsed once; each call returns a new copy."""
+    return read_document(path).values
+
+
+def load_cylinder() -> Scene:
+    """Return the paper's scene."""
+    return Scene.model_validate(load_values())
 
 
 def set_density(scene: Scene, density_kg_per_m3: float) -> Scene:

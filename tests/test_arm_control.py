@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, EStop, Side
 from flexsheet.nodes.arm_bridge import other_arm
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
@@ -28,11 +25,12 @@ from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy, vector_from_rotation
 from flexsheet.nodes.models.sheet import edge_poses
 from tests.arm_states import connect_control
+from tests.examples import examples
+from tests.scenes import load_cylinder
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+SCENE = load_cylinder()
 STEP_S = 1.0 / 140.0
 GUESS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 HOME = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
@@ -175,7 +173,7 @@ poses = st.builds(
 
 
 @given(one=poses, other=poses, target=poses)
-@settings(max_examples=200, deadline=None)
+@examples(100)
 def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> None:
     shares = (
         compute_sync_factor(one, other, target, left=True),
@@ -185,7 +183,7 @@ def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> 
 
 
 @given(sheet=poses, target=poses, stretch=st.floats(0.5, 1.5))
-@settings(max_examples=200, deadline=None)
+@examples(100)
 def test_arms_that_are_together_do_not_wait_wherever_they_go(
     sheet: Floats, target: Floats, stretch: float
 ) -> None:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock
@@ -28,7 +27,7 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip
-from tests.scenes import make_weightless
+from tests.scenes import load_cylinder, make_weightless
 from tests.waiting import DEADLINE_S, until
 
 pytestmark = pytest.mark.alone
@@ -41,7 +40,7 @@ SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml
 
 
 def paper_scene() -> Scene:
-    return make_weightless(Scene.model_validate(YAML(typ="safe").load(SCENE_FILE)))
+    return make_weightless(load_cylinder())
 
 
 def finger_at(position: Floats, velocity: Floats, *, valid: bool = True) -> Fingertip:

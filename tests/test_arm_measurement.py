@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -32,6 +32,7 @@ from flexsheet.nodes.arm_bridge.standstill import (
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
 from tests.arm_states import connect_control
+from tests.examples import examples
 from tests.test_arm_control import GUESS, HOME, SCENE, STEP_S, TIMEOUTS, on_time, sheet_at
 
 Floats = NDArray[np.float64]
@@ -377,7 +378,7 @@ GEOMETRY = ArmGeometry(SCENE, "left")
 LIMITS: JointLimits = GEOMETRY.joint_limits
 
 
-@settings(max_examples=200, deadline=None)
+@examples(100)
 @given(joints=joints_in_range, step=st.tuples(*[st.floats(-0.02, 0.02)] * 6))
 def test_the_edge_shifts_by_no_more_than_the_bound(joints: Floats, step: tuple[float, ...]) -> None:
     moved = joints + np.array(step)
@@ -402,7 +403,7 @@ def test_a_restart_within_its_tolerance_is_slower_than_the_tool_may_be() -> None
 any_number = st.one_of(st.floats(-4.0, 4.0), st.sampled_from([np.nan, np.inf, -np.inf, 1e300]))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(100)
 @given(joints=joints_in_range, wanted=st.tuples(*[any_number] * 6), step_s=st.floats(1e-4, 0.1))
 def test_a_bounded_step_keeps_joint_speeds_and_tool_speed(
     joints: Floats, wanted: tuple[float, ...], step_s: float

@@ -24,7 +24,7 @@ from camera_bench import (
     read_number,
     running,
 )
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexsheet.messages.scene import Scene
@@ -33,6 +33,7 @@ from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Region, Re
 from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import MAX_IMPLAUSIBLE, SLACK, Pairing, StampCheck
+from tests.examples import examples
 from tests.waiting import DEADLINE_S
 
 MS = 1_000_000
@@ -164,7 +165,7 @@ def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
     assert check.trusted
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(
     phase=st.floats(-0.49, 0.49),
     lost_left=st.sets(st.integers(0, 39)),

@@ -22,6 +22,7 @@ from flexsheet.nodes.camera.region import (
     resolve_regions,
 )
 from flexsheet.nodes.models import rigid
+from tests.examples import examples
 
 WIDE, HIGH = 640, 480
 SCENE = load_scene(WIDE, HIGH)
@@ -141,7 +142,7 @@ def test_a_wrong_region_is_rejected(region: object) -> None:
         CameraParameters.model_validate({"region": region})
 
 
-@settings(max_examples=100)
+@examples(50)
 @given(data=st.data())
 def test_a_cut_shows_the_same_pixels_of_the_sensor(data: st.DataObject) -> None:
     def inside(whole: Region) -> Region:

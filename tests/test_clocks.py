@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from flexsheet.launch.plans.documents import BadInputError
@@ -24,6 +24,7 @@ from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.clock.node import ClockNode, ClockParameters
 from flexsheet.nodes.clock.offset import OtherClock, Sample, compute_bounds, make_sample
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from tests.examples import examples
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.test_messages_wire import HEADER as SOME_HEADER
 from tests.test_security import target
@@ -70,7 +71,7 @@ delays = st.lists(
 )
 
 
-@settings(max_examples=150)
+@examples(75)
 @given(
     delays=delays,
     ours=st.builds(DriftingClock, st.just(0), st.floats(-1e-4, 1e-4)),

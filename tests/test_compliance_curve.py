@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, curve_depths
 from flexsheet.nodes.fem_solver.precompute import compute
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+SCENE = load_cylinder()
 LINEAR = 0.006
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.benchmarks import DrawnDisc, noisy
@@ -34,12 +31,12 @@ from flexsheet.nodes.twin.clutter import (
     touching_highlight,
 )
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Pictures = tuple[Image, Image]
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+SCENE = load_cylinder()
 GEOMETRY = StereoGeometry.of(SCENE.camera)
 VOLUME = (SCENE.finger.volume_min_m, SCENE.finger.volume_max_m)
 HERE = np.array([0.01, 0.0, 0.02])

@@ -32,6 +32,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
 from tests.doc_pages import ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
+from tests.scenes import load_values
 from tests.test_cli_help import parse
 
 LANGUAGES = {"python", "yaml", "bash", "sh", "console", "text"}
@@ -143,7 +144,7 @@ def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -
         file.write_text(text)
         load_apparatus(str(file), load_scene(SCENE))
     elif keys <= set(Scene.model_fields):
-        whole = YAML(typ="safe").load(SCENE.read_text()) | dict(values)
+        whole = load_values() | dict(values)
         YAML(typ="safe").dump(whole, file)
         load_scene(file)
     elif all(isinstance(one, dict) and "type" in one for one in values.values()):

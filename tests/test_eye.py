@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from benchmarks.image_correction import CorrectionBench
 from flexsheet.messages.base import Header, Message
@@ -34,16 +32,15 @@ from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.membrane import DeformedSheet
 from flexsheet.nodes.twin.true_object import TrueBody
 from tests.node_harness import NodeHarness
+from tests.scenes import load_cylinder
 
-ROOT = Path(__file__).parents[1]
 EYE = np.array([0.0, 0.0, 0.4])
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """Return the scene with a sheet that stays plane at any tilt."""
-    path = ROOT / "launch" / "scenes" / "cylinder.yaml"
-    loaded = Scene.model_validate(YAML(typ="safe").load(path.read_text()))
+    loaded = load_cylinder()
     sheet = loaded.sheet.model_copy(update={"density_kg_per_m3": 0.0})
     return loaded.model_copy(update={"sheet": sheet})
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from benchmarks import external_solvers
 from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
@@ -26,14 +25,13 @@ from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
+from tests.scenes import load_cylinder, load_values
 from tests.soft_bodies import InlineExecutor
-
-SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 
 
 def small_scene() -> Scene:
     """Return a small cylinder, for which a coarse mesh is sufficient."""
-    content = YAML(typ="safe").load(SCENE.read_text())
+    content = load_values()
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
     return Scene.model_validate(content)
@@ -121,7 +119,7 @@ def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> No
 
 
 def test_the_family_names_its_reference() -> None:
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE.read_text()))
+    scene = load_cylinder()
     assert SOFT_BODY.tolerance(scene) == 0.5
     assert "Newton" in SOFT_BODY.reference
     assert len(SOFT_BODY.methods) >= 5

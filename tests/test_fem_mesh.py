@@ -13,7 +13,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
 from benchmarks.meshing import min_dihedral_rad
@@ -53,11 +52,11 @@ from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_node
 from flexsheet.nodes.models.shapes import make_shape
 from tests.examples import examples
 from tests.linear_elasticity import solve, stiffness_matrix
+from tests.scenes import load_values
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 LIVER = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "mesh" / "liver.obj"
 EGG_AXES_M = [0.035, 0.03, 0.025]
 STRIP = {"kind": "strip", "angle_rad": 1.5}
@@ -97,7 +96,7 @@ CLOSED = ("sphere", "ellipsoid", "rounded_box", "mesh")
 
 def scene(geometry: dict[str, Any], **changes: Any) -> Scene:
     """Return the cylinder's scene with another object."""
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     body = content["object"]
     del body["support_angle_rad"]
     body.update({"geometry": geometry, "support": STRIP, **changes})
@@ -514,7 +513,7 @@ def test_supports_of_a_scene_are_checked() -> None:
         scene(SPHERE, support={"kind": "base", "height_m": 0.01, "down_world": [0, 0, 0]})
     with pytest.raises(ValueError, match="must be below"):
         scene(SPHERE, support={"kind": "box_patch", "min_m": [0, 0, 0], "max_m": [1, 0, 1]})
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     short = Scene.model_validate(content).object
     assert short.support_angle_rad == pytest.approx(np.pi / 2)
     based = scene(SPHERE, support={"kind": "base", "height_m": 0.01}).object

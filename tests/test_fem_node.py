@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -27,15 +26,14 @@ from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
+from tests.scenes import load_values
 from tests.soft_bodies import InlineExecutor
 from tests.waiting import DEADLINE_S
-
-SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 
 
 def scene(**changes: Any) -> Scene:
     """Return the cylinder scene; `changes` are applied to its object."""
-    content = YAML(typ="safe").load((SCENES / "cylinder.yaml").read_text())
+    content = load_values()
     content["object"].update(changes)
     return Scene.model_validate(content)
 

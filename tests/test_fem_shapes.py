@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -24,16 +23,16 @@ from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.precompute import compute, estimate_budget
 from flexsheet.nodes.models import rigid
 from tests.fingertips import fingertip
+from tests.scenes import load_values
 
 Floats = NDArray[np.float64]
 
-SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 BASE = {"kind": "base", "height_m": 0.01}
 
 
 def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
     """Return the demo's scene with another object, its front at the world's origin."""
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     del content["object"]["support_angle_rad"]
     content["object"] |= {
         "geometry": geometry,

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, PathJoin
@@ -33,15 +32,13 @@ from flexsheet.nodes.twin.gestures import (
     tap_fast,
 )
 from flexsheet.nodes.twin.paths import map_to_surface, recorded_path
+from tests.scenes import load_values
 
-ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]
 
 
 def values() -> dict[str, Any]:
-    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
-    loaded: dict[str, Any] = YAML(typ="safe").load(text)
-    return loaded
+    return load_values()
 
 
 SCENE = Scene.model_validate(values())

@@ -63,7 +63,14 @@ def assert_nothing_is_left(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["run ", "is ready", pytest.param("all 10 nodes are ready", marks=pytest.mark.long)]
+    "words",
+    [
+        "run ",
+        *(
+            pytest.param(words, marks=pytest.mark.long)
+            for words in ("is ready", "all 10 nodes are ready")
+        ),
+    ],
 )
 def test_ctrl_c_at_any_moment_leaves_nothing(runs_folder: Path, words: str) -> None:
     """SIGINT as the first process starts, in the middle of start-up, and when all are up."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -52,6 +52,7 @@ from flexsheet.nodes.twin.arms import forward as twin_forward
 from flexsheet.nodes.twin.arms import solve_inverse_kinematics
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import pixels_of
+from tests.examples import examples
 
 Floats = NDArray[np.float64]
 
@@ -272,7 +273,7 @@ def test_the_same_poses_give_the_same_result() -> None:
     assert (first.covariance == second.covariance).all()
 
 
-@settings(max_examples=100)
+@examples(50)
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3))
 def test_roll_pitch_yaw_there_and_back(rpy: list[float]) -> None:
     rotation = rotation_from_rpy(rpy)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ def modules(floor: str) -> Iterator[Path]:
     return (ROOT / floor).rglob("*.py")
 
 
+@cache
 def imports_of(path: Path) -> set[str]:
     """Return the dotted names of everything that a file imports, at any depth."""
     names: set[str] = set()

@@ -36,6 +36,7 @@ from flexsheet.nodes.arm_bridge.kinematics import (
 from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
 from flexsheet.nodes.twin.arms import forward as twin_forward
 from tests.arm_jacobian import jacobian
+from tests.examples import examples
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +87,7 @@ def test_forward_agrees_with_the_twins_product_of_exponentials(joints: Floats) -
     assert forward(joints) == pytest.approx(twin_forward(joints), abs=1e-12)
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(any_turn, in_range)
 def test_every_branch_gives_the_pose_by_the_twins_arm(joints: Floats, present: Floats) -> None:
     pose = twin_forward(joints)
@@ -101,7 +102,7 @@ def test_every_branch_gives_the_pose_by_the_twins_arm(joints: Floats, present: F
             assert find_branch(solution) == branch
 
 
-@settings(max_examples=100)
+@examples(50)
 @given(any_turn)
 def test_the_joints_themselves_are_on_their_branch(joints: Floats) -> None:
     away = singularities(joints)
@@ -136,7 +137,7 @@ def test_poses_out_of_reach_have_no_joints_on_any_branch() -> None:
         assert np.isnan(found[1, 1:3]).all()
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(in_range)
 def test_the_present_joints_are_found_again(joints: Floats) -> None:
     solved = inverse_kinematics(forward(joints), joints)
@@ -236,7 +237,7 @@ def _above_the_shoulder(q3: float) -> float:
     return float(-np.arctan2(out, up))
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(in_range, arrays(np.float64, 6, elements=st.floats(-0.02, 0.02)))
 def test_away_from_singularities_the_next_joints_are_exact(joints: Floats, step: Floats) -> None:
     target = np.clip(joints + step, JOINT_MIN_RAD + 1e-6, JOINT_MAX_RAD - 1e-6)
@@ -353,7 +354,7 @@ def test_where_a_branch_ends_another_is_used_or_the_range_is_named() -> None:
 weird = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(arrays(np.float64, (4, 4), elements=weird), in_range)
 def test_joints_are_in_range_or_the_error_names_it(pose: Floats, present: Floats) -> None:
     for solve in (solve_next_joints, inverse_kinematics):

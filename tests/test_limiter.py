@@ -29,6 +29,7 @@ from flexsheet.nodes.arm_bridge.limiter import (
     limit_velocity,
 )
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
+from tests.examples import examples
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +90,7 @@ def test_nothing_out_of_bounds_ever_goes_out(
         assert speed <= TOOL_SPEED * (1 + 1e-6)
 
 
-@settings(max_examples=100, deadline=None)
+@examples(50)
 @given(
     start=start_joints,
     goals=st.lists(arrays(np.float64, 6, elements=st.floats(-4.0, 4.0)), min_size=1, max_size=6),
@@ -217,7 +218,7 @@ whatever = st.one_of(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@examples(75)
 @given(
     joints=arrays(np.float64, 6, elements=st.floats(-4.0, 4.0)),
     share=arrays(np.float64, 6, elements=st.floats(-1.0, 1.0)),
@@ -285,7 +286,7 @@ def test_measured_poses_have_a_tolerance_and_commanded_ones_none() -> None:
     assert check_flange(near, far, SHEET, slack_m=0.002) is None
 
 
-@settings(max_examples=100, deadline=None)
+@examples(50)
 @given(tilt=st.tuples(*[st.floats(-3.0, 3.0)] * 3), shift=st.tuples(*[st.floats(-0.2, 0.2)] * 3))
 def test_the_turn_between_edges_is_the_angle_of_their_rotation(
     tilt: tuple[float, ...], shift: tuple[float, ...]

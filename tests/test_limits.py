@@ -78,7 +78,7 @@ UNUSUAL = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 quick = settings(max_examples=60, suppress_health_check=UNUSUAL)
 
 
-@settings(examples(25), suppress_health_check=UNUSUAL)
+@settings(examples(12), suppress_health_check=UNUSUAL)
 @given(where=st.sampled_from(SCENE_NUMBERS), value=ABSURD)
 def test_an_absurd_number_in_a_scene_is_rejected_by_its_key(
     tmp_path: Path, where: tuple[str, Key], value: float

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.triangulator import benchmarks
 from flexsheet.nodes.triangulator.benchmarks import MARKER, DrawnDisc, centre_bound_px, noisy
@@ -29,10 +26,10 @@ from flexsheet.nodes.triangulator.marker import (
     window_around,
 )
 from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 LOOKS, SENSOR = BlobFilter(), PixelNoise()
 METHODS = sorted(MARKER_METHODS)
 
@@ -276,7 +273,7 @@ def test_the_marker_family_distinguishes_the_methods(
 ) -> None:
     monkeypatch.setattr(benchmarks, "MARKER_CASES", cases)
     monkeypatch.setattr(benchmarks, "MARKER_IMAGES", 12)
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    scene = load_cylinder()
     points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
     worst = {
         name: max(point.error for point in points if point.in_range and point.method == name)
@@ -292,7 +289,7 @@ def test_the_marker_family_distinguishes_the_methods(
 def test_marker_methods_are_evaluated_with_the_nodes_noise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    scene = load_cylinder()
     believed: list[PixelNoise] = []
 
     def spy(

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, get_args
 
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from pydantic import BaseModel, Field, create_model
-from ruamel.yaml import YAML
 
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.base import Header, Message, compute_fingerprint
@@ -22,10 +20,11 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
 from flexsheet.messages.wire import PROTOCOL, WireError, count_bytes, decode, encode, get_codec
+from tests.examples import examples
 from tests.fingertips import fingertip
+from tests.scenes import load_cylinder
 
 HEADER = Header(3, 1_000, 2_000, "host-1234abcd", "triangulator", 77)
-SCENE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=0, max_value=1e12)
@@ -117,7 +116,7 @@ def frame_with_pixels(count: int) -> Frame:
 
 
 def scene() -> Scene:
-    return Scene.model_validate(YAML(typ="safe").load(SCENE))
+    return load_cylinder()
 
 
 def same(a: object, b: object) -> bool:
@@ -234,7 +233,7 @@ def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
     refused([msgpack.packb(head), *data.draw(st.lists(st.binary(max_size=100), max_size=2))])
 
 
-@settings(max_examples=300)
+@examples(150)
 @given(messages, st.data())
 def test_mutated_messages_are_rejected_or_valid(message: Message, data: st.DataObject) -> None:
     """Bytes are flipped, cut, added, exchanged or dropped: WireError, or a valid message."""

@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager, suppress
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
@@ -34,6 +34,7 @@ from flexsheet.nodes.arm_bridge.modbus import (
 )
 from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
+from tests.examples import examples
 from tests.network import TcpRelay
 from tests.waiting import DEADLINE_S
 from website import registers_page
@@ -265,7 +266,7 @@ def test_what_is_not_six_angles_is_never_sent(bad: list[float]) -> None:
 any_register = st.integers(0, 0xFFFF)
 
 
-@settings(max_examples=300)
+@examples(150)
 @given(st.lists(any_register, max_size=30) | st.lists(any_register, min_size=26, max_size=26))
 def test_any_registers_are_a_status_or_an_error(registers: list[int]) -> None:
     with suppress(ArmAnswerError):

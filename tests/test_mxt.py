@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -54,6 +54,7 @@ from flexsheet.nodes.twin.mxt_controller import (
     MxtController,
     MxtServer,
 )
+from tests.examples import examples
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
@@ -147,7 +148,7 @@ any_bytes = st.one_of(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@examples(200)
 @given(any_bytes)
 def test_any_bytes_are_a_status_or_an_error(packet: bytes) -> None:
     with suppress(ArmLinkError):
@@ -292,7 +293,7 @@ def test_another_master_is_ignored_until_the_first_has_ended() -> None:
     assert ask(arm, encode(COMMAND_NONE), other) is not None
 
 
-@settings(max_examples=150, deadline=None)
+@examples(75)
 @given(st.lists(any_bytes, max_size=12), st.booleans())
 def test_no_bytes_crash_the_controller_or_move_the_arm_out_of_bounds(
     packets: list[bytes], opened: bool

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -32,13 +30,13 @@ from flexsheet.nodes.planner.contact_state import ContactCommand, ContactLimits,
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_rubber
+from tests.examples import examples
 from tests.fingertips import fingertip
-from tests.scenes import make_weightless, set_density
+from tests.scenes import load_cylinder, load_values, make_weightless, set_density
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = make_weightless(Scene.model_validate(YAML(typ="safe").load(SCENE_FILE)))
+SCENE = make_weightless(load_cylinder())
 HEAVY_SCENE = set_density(SCENE, 1200.0)
 RADIUS = SCENE.object.geometry.radius_m
 SHAPE = CylinderShape(RADIUS, SCENE.object.geometry.length_m)
@@ -393,7 +391,7 @@ def test_behind_the_object_the_side_is_kept() -> None:
     assert max(angles) <= LIMITS.max_tilt_rad
 
 
-@settings(max_examples=200, deadline=None)
+@examples(100)
 @given(
     st.lists(
         st.tuples(st.floats(-0.08, 0.08), st.floats(-0.06, 0.06), st.floats(-0.06, 0.06)),
@@ -537,7 +535,7 @@ async def test_the_same_inputs_give_the_same_bytes() -> None:
 
 
 async def test_an_object_turned_in_the_world_is_met_from_the_users_side() -> None:
-    data = YAML(typ="safe").load(SCENE_FILE)
+    data = load_values()
     data["object"]["world_from_object"] = {
         "position_m": [0.01, 0.02, -0.05],
         "rpy_rad": [math.radians(130.0), 0.0, 0.0],
@@ -556,7 +554,7 @@ async def test_an_object_that_cannot_be_presented_is_reported_and_nothing_is_sen
     desk = await table()
     await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 3)
     sent = len(desk.sent)
-    data = YAML(typ="safe").load(SCENE_FILE)
+    data = load_values()
     data["object"]["geometry"] = {"shape": "plane", "width_m": 0.1, "height_m": 0.1}
     data["object"]["world_from_object"] = {
         "position_m": [0.0, 0.0, 0.0],

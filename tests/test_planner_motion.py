@@ -21,6 +21,7 @@ from flexsheet.nodes.models.motion import (
     follow_sheet,
 )
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
+from tests.examples import examples
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -65,7 +66,7 @@ def test_an_even_target_is_followed_without_lag() -> None:
     assert velocity == pytest.approx(rate, abs=1e-12)
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(
     st.lists(
         st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-2, 2), st.floats(-2, 2)),

@@ -14,9 +14,9 @@ from flexsheet.launch import cli
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.nodes.fem_solver import body, precompute_table, snapshots
 from flexsheet.nodes.fem_solver.mesh import cylinder
+from tests.scenes import load_values
 from tests.soft_bodies import InlineExecutor
 
-SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 SPACING_M = 0.005
 
 
@@ -37,7 +37,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(
         precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
     )
-    content = YAML(typ="safe").load(SCENE.read_text())
+    content = load_values()
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
     path = tmp_path / "small.yaml"

@@ -31,9 +31,9 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
+from tests.scenes import load_values
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
-SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 TYPES: dict[str, type[Message]] = {
     topic.message.__name__: topic.message for topic in TOPICS.values()
 }
@@ -90,7 +90,7 @@ def test_an_old_value_of_a_parameter_gets_an_error_that_names_the_new_one(
 def test_an_old_method_in_a_scene_gets_an_error_that_names_the_new_one(
     tmp_path: Path, old: str
 ) -> None:
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     content["methods"] = {"sheet_shape": old}
     file = tmp_path / "scene.yaml"
     YAML().dump(content, file)
@@ -230,7 +230,7 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
 
 
 def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path) -> None:
-    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content = load_values()
     content["methods"] = {"kinematics": "closed_form_continuous"}
     file = tmp_path / "scene.yaml"
     YAML().dump(content, file)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from pathlib import Path
 
 import moderngl
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
@@ -40,14 +38,13 @@ from tests.correction_reference import correct
 from tests.fingertips import fingertip
 from tests.node_harness import NodeHarness
 from tests.packing import pack
+from tests.scenes import load_cylinder
 
-ROOT = Path(__file__).parents[1]
 MS = 1_000_000
 
 
 def load_scene() -> Scene:
-    path = ROOT / "launch" / "scenes" / "cylinder.yaml"
-    return Scene.model_validate(YAML(typ="safe").load(path.read_text()))
+    return load_cylinder()
 
 
 @pytest.fixture(scope="module")

@@ -33,6 +33,8 @@ SCENES = [
     for path in sorted((Path(__file__).parents[1] / "launch" / "scenes").glob("*.yaml"))
     if load_scene(path).projector is not None
 ]
+SAME_OBJECTS = ("demanding", "light-touch", "palpation")
+"""Scenes with the object of another scene, and another working range, tolerances or methods."""
 SHIFT_M = np.array([0.004, 0.006, -0.008])
 
 
@@ -71,7 +73,15 @@ def context() -> moderngl.Context:
     return headless_context()
 
 
-@pytest.fixture(scope="module", params=SCENES, ids=lambda path: path.stem)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(
+            path, id=path.stem, marks=pytest.mark.long if path.stem in SAME_OBJECTS else ()
+        )
+        for path in SCENES
+    ],
+)
 def case(request: pytest.FixtureRequest, context: moderngl.Context) -> Case:
     scene = load_scene(request.param)
     stage = SceneRenderer(scene, context, spacing_m=0.003)

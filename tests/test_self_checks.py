@@ -254,7 +254,7 @@ def test_a_lag_that_is_20_ms_longer_is_named_within_ten_seconds(seed: int) -> No
     assert suspected(last) == {"servo_lag"}
 
 
-@pytest.mark.parametrize("seed", [100, 101])
+@pytest.mark.parametrize("seed", [100, pytest.param(101, marks=pytest.mark.long)])
 def test_a_calibrated_arm_raises_no_suspicion_in_ten_minutes(seed: int) -> None:
     reports = list(move_arm(seed, TEN_MINUTES_S, 0.0))
     assert {one.cause for one in reports[-1]} == {"servo_lag", "arm_not_following"}

@@ -18,15 +18,15 @@ from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, require_cy
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.wire import decode, encode
 from flexsheet.nodes.models.shapes import GEOMETRIES, MeshError, SmoothMeshShape, make_shape
+from tests.scenes import load_values
 
 ROOT = Path(__file__).resolve().parent.parent
-SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 LIVER = ROOT.parent / "shared" / "data" / "mesh" / "liver.obj"
 HEADER = Header(1, 1_000, 2_000, "host-1234abcd", "launch", 1)
 
 
 def scene_file(folder: Path, geometry: dict[str, Any]) -> Path:
-    values = YAML(typ="safe").load(SCENE_FILE.read_text())
+    values = load_values()
     values["object"]["geometry"] = geometry
     path = folder / "scene.yaml"
     with path.open("w") as file:

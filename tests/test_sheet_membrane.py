@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ from flexsheet.nodes.models.sheet.membrane import (
     stress_and_tangent,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
+from tests.examples import examples
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +167,7 @@ def test_a_missing_equilibrium_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
 strains = st.tuples(st.floats(0.5, 1.9), st.floats(0.5, 1.9), st.floats(-0.3, 0.3))
 
 
-@settings(max_examples=200)
+@examples(100)
 @given(strains, st.sampled_from([(1.0, 0.0), (0.7, 0.3)]))
 def test_stress_and_tangent_are_derivatives_of_the_energy(
     strain: tuple[float, float, float], constants: tuple[float, float]

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from benchmarks.tracking_bench import Observer, bench_scene, twin_camera
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.triangulator.skew import compensate_skew
 from flexsheet.nodes.triangulator.triangulation import (
@@ -22,10 +18,10 @@ from flexsheet.nodes.triangulator.triangulation import (
     measure,
 )
 from flexsheet.nodes.twin.clutter import CLUTTER
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+SCENE = load_cylinder()
 GEOMETRY = StereoGeometry.of(SCENE.camera)
 NOISE_PX2 = 1e-4 * np.eye(2)
 

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
-from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]
 
-SCENE_FILE = FilePath(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+SCENE = load_cylinder()
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(max_speed_m_per_s=1.5)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
 from flexsheet.messages.calibration import Board, StereoCalibration
@@ -28,15 +25,15 @@ from flexsheet.nodes.triangulator.triangulation import (
     project_with_jacobian,
     undistort_pixel,
 )
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 METHODS = sorted(TRIANGULATION_METHODS)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    return load_cylinder()
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.calibration import Board, StereoCalibration, save_calibration
@@ -25,17 +24,17 @@ from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameter
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from tests.node_harness import NodeHarness
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 LAUNCH = Path(__file__).resolve().parent.parent / "launch"
-SCENE_FILE = LAUNCH / "scenes" / "cylinder.yaml"
 FRAME_NS = round(1e9 / 60)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    return load_cylinder()
 
 
 @pytest.fixture(scope="module")

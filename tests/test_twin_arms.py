@@ -12,11 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import transform_from_rpy
@@ -40,10 +38,10 @@ from flexsheet.nodes.twin.arms import (
 )
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.mxt_controller import MxtServer
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
-SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 
 
 def test_home_pose_by_hand() -> None:
@@ -217,7 +215,7 @@ def test_a_stopped_arm_stays_on_its_path(how: str) -> None:
 
 
 async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+    scene = load_cylinder()
     clock, sent = VirtualClock(), []
 
     def send(topic: Topic, message: Message, header: Header) -> None:
@@ -251,7 +249,7 @@ async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
 
 async def switch_on(joints_file: Path) -> TwinArmsNode:
     """Start the node with a scene."""
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+    scene = load_cylinder()
     parameters = TwinArmsParameters(left_port=0, right_port=0, joints_file=str(joints_file))
     node = TwinArmsNode(parameters, name="twin", clock=VirtualClock(), send=lambda *_: None)
     await node.setup()
@@ -360,7 +358,7 @@ def test_stopping_forgets_what_was_still_to_be_done() -> None:
 
 
 async def test_the_node_can_use_the_real_time_control() -> None:
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+    scene = load_cylinder()
     node = TwinArmsNode(
         TwinArmsParameters(left_port=0, right_port=0, protocol="mxt"),
         name="twin",

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 from scipy.special import erf, ndtr
 
@@ -36,8 +33,9 @@ from flexsheet.nodes.twin.clutter import (
 )
 from flexsheet.nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
 from flexsheet.nodes.twin.rig import make_true_camera, pixels_of, slopes_of
+from tests.examples import examples
+from tests.scenes import load_cylinder
 
-ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]
 
 CHESSBOARD = Board(columns=9, rows=6, square_m=0.025)
@@ -48,8 +46,7 @@ CHARUCO = Board(
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
-    return Scene.model_validate(YAML(typ="safe").load(text))
+    return load_cylinder()
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +87,7 @@ def test_a_rig_differs_from_its_data_sheet_as_devices_do(sheet: StereoCamera, de
 
 
 @given(u=st.floats(-0.85, 0.85), v=st.floats(-0.6, 0.6))
-@settings(max_examples=100, deadline=None)
+@examples(50)
 def test_rays_lead_back_to_their_pixels_and_opencv_agrees(
     rig: StereoCamera, u: float, v: float
 ) -> None:

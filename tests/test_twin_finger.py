@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from ruamel.yaml import YAML
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock, VirtualClock
@@ -25,6 +24,7 @@ from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameter
 from flexsheet.nodes.twin.paths import recorded_path
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from tests.scenes import load_cylinder
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -33,8 +33,7 @@ Floats = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
-    return Scene.model_validate(YAML(typ="safe").load(text))
+    return load_cylinder()
 
 
 @pytest.fixture(scope="module")
