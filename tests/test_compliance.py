@@ -50,6 +50,7 @@ from tests.hand_bounds import make_bounds_60_hz
 Floats = NDArray[np.float64]
 
 DEMO = Path(__file__).parent.parent / "launch" / "demo.yaml"
+RIGID = DEMO.parent / "scenes" / "rigid-plane.yaml"
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)
 SHEET = SCENE.sheet
@@ -339,7 +340,7 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
     assert found is not None
     assert found == LoopFinding(LoopRisk.OSCILLATION, FINGERTIP_AGE_S + 0.2, found.error_ratio)
     assert check_graph(load_graph(DEMO)) is None
-    assert check_graph(load_graph(DEMO, settings=[*late, "scene=scenes/rigid-plane.yaml"])) is None
+    assert check_graph(load_graph(DEMO, settings=[*late, f"scene={RIGID}"])) is None
     shown = CliRunner().invoke(app, ["launch", str(DEMO), "--dry-run", "--set", *late])
     assert "can oscillate at a delay of 212 ms" in " ".join(shown.stderr.split())
     monkeypatch.setattr(compliance_check.SoftBodyFactory, "is_cached", lambda *_: False)

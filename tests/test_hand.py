@@ -256,6 +256,13 @@ def test_chatter_is_what_a_gesture_does_not_consist_of() -> None:
     assert result["mean_error_n"] == pytest.approx((3 * 0.2 + 0.05) / 6)
 
 
+def test_beside_the_end_of_the_object_no_force_is_wanted() -> None:
+    positions = np.tile([0.05, 0.0, -0.005], (4, 1))
+    positions[2:, 0] = 0.07
+    felt = compute_felt_force(SCENE, make_recording(np.zeros(4), positions, ["contact"] * 4), CURVE)
+    np.testing.assert_allclose(felt.wanted_n, [0.2, 0.2, 0.0, 0.0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", HAND_GESTURES)
 def test_a_gesture_touches_as_often_as_it_says_and_ends_in_the_air(name: str) -> None:
     make_path, touches = HAND_GESTURES[name]

@@ -169,12 +169,16 @@ def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) ->
     """Compute the forces of a run; curve: force of the object over depth (m, 2)."""
     shape = make_shape(dict(scene.object.geometry))
     points = apply(inverse(object_pose(scene)), recorded.positions_m)
-    depths_m = -shape.closest(points).height_m
+    nearest = shape.closest(points)
+    # Beside the object's end there is no object, at any depth.
+    depths_m = np.where(nearest.on_edge, 0.0, -nearest.height_m)
     times_s, felt_n = recorded.steps[:, 0], recorded.steps[:, 2]
     at_steps_m = np.interp(times_s, recorded.times_s, depths_m)
     wanted = PchipInterpolator(curve[:, 0], curve[:, 1])
     wanted_n = np.asarray(wanted(np.clip(at_steps_m, 0.0, curve[-1, 0])))
-    return FeltForce(times_s - SETTLING_S, at_steps_m, felt_n, wanted_n)
+    shown = times_s >= SETTLING_S
+    times_s = times_s - SETTLING_S
+    return FeltForce(times_s[shown], at_steps_m[shown], felt_n[shown], wanted_n[shown])
 
 
 def evaluate_touch(recorded: TouchRecording, force: FeltForce, touches: int) -> dict[str, Any]:

@@ -367,14 +367,14 @@ def touch_in_simulated_time(
     curve: Floats,
     make_finger: Callable[[VoluntaryPath], CoupledFinger],
     *,
-    bounds: OffsetBoundsTable | None,
+    bounds: OffsetBoundsTable,
     apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
     """Simulate a hand that touches the sheet and is pushed by it, along a voluntary path.
 
     curve: force of the object over depth, (m, 2) in m and N. bounds: the planner's bounds on the
-    sheet's offset; None to remove them.
+    sheet's offset.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -382,8 +382,6 @@ def touch_in_simulated_time(
         scene, make_force_model(scene.sheet), "force_curve", bounds=bounds
     )
     compliance.update(make_soft_body(curve), in_contact=False)
-    if bounds is None:
-        compliance.filter_s = 0.0
     loop = SimulatedLoop(scene, truth, given, compliance)
     finger = make_finger(lambda at_s: voluntary.at(at_s - SETTLING_S))
     finger.log, edges = [], EdgeTrack()
