@@ -131,8 +131,9 @@ class SceneRenderer:
         meshed = isinstance(geometry, Mesh)
         self._near = cKDTree(self._surface.rest_world_m) if meshed else None
         first_pass = samples
-        if samples is None:
-            samples, first_pass = SAMPLES, 0 if is_software(context) else SAMPLES
+        if first_pass is None:
+            first_pass = 0 if is_software(context) else SAMPLES
+        samples = SAMPLES if samples is None else samples
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
         self.canvas.set_mesh(
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
