@@ -30,7 +30,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Display
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
-from flexsheet.nodes.renderer.gl import NoOpenGLError, headless_context
+from flexsheet.nodes.renderer.gl import SOFTWARE_DRIVERS, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
@@ -38,7 +38,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SCENE, DEMO = ROOT / "launch" / "scenes" / "cylinder.yaml", ROOT / "launch" / "demo.yaml"
 NAME = "correction-frames"
 NO_GPU_CODE = 3
-SOFTWARE = ("llvmpipe", "softpipe", "swrast")
 WARM_UP = 20
 
 
@@ -140,7 +139,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="folder of the charts")
     given = parser.parse_args()
     driver = find_driver()
-    if not driver or (not given.software and driver.startswith(SOFTWARE)):
+    if not driver or (not given.software and driver.startswith(SOFTWARE_DRIVERS)):
         found = f"OpenGL uses {driver}" if driver else "OpenGL is not available"
         print(
             f"no graphics card: {found}; nothing was measured (--software: measure anyway)",

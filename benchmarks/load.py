@@ -35,7 +35,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from benchmarks.soak import start_busy_process
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, run_experiment
@@ -291,6 +291,8 @@ def measure_factor(
             print(f"{name} {level:g} {FACTORS[name].unit}", file=sys.stderr, flush=True)
             try:
                 rows[row_name] = run(name, level, seconds)
+            except ExperimentInterruptedError:
+                raise
             except (ExperimentError, AssertionError) as error:
                 rows[row_name] = {"error": str(error)[:600]}
             rows[row_name] |= {"load": describe_load()}

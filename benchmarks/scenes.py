@@ -40,6 +40,7 @@ SMALLEST = "rigid-plane"
 LAUNCH_FILES = {SMALLEST: DEMO_FILE.with_name("rigid.yaml")}
 GESTURE = "circle"
 APPROACH_S = 3.0
+POLL_S = 0.01
 
 
 def write_launch_file(folder: Path, scene: str) -> Path:
@@ -68,16 +69,28 @@ async def measure_start_s(plan: ResolvedGraph) -> float:
         return time.monotonic() - begun_s
 
 
+async def wait_ready(graph: RunningGraph, processes: dict[str, list[str]]) -> dict[str, float]:
+    """Wait until all nodes are ready; return the processor time that each process took, s."""
+    used: dict[str, float] = {}
+    ready = asyncio.create_task(graph.wait_ready())
+    while len(used) < len(processes) and not (ready.done() and ready.exception()):
+        for name in processes.keys() - used.keys():
+            if all(map(graph.is_ready, processes[name])):
+                used |= read_cpu_s({name: graph.pids[processes[name][0]]})
+        await asyncio.sleep(POLL_S)
+    await ready
+    return used
+
+
 async def measure(plan: ResolvedGraph, seconds: float) -> dict[str, Any]:
     """Return start-up time, and processor time and memory by process during the gesture."""
     scene = require_scene(plan)
     processes = {one.name: [node.name for node in one.nodes] for one in plan.processes_on(None)}
     begun_s = time.monotonic()
     async with RunningGraph(plan) as graph:
-        await graph.wait_ready()
+        start_cpu_s = await wait_ready(graph, processes)
         start_s = time.monotonic() - begun_s
         pids = {name: graph.pids[nodes[0]] for name, nodes in processes.items()}
-        start_cpu_s = read_cpu_s(pids)
         async with Driver(plan, graph.run) as driver:
             await driver.wait_ready()
             driver.move_finger(gesture_path(GESTURE, scene))
@@ -143,6 +156,15 @@ def format_markdown(rows: list[dict[str, Any]]) -> str:
             f"| {', '.join(row['omitted']) or '-'} |"
         )
     return "\n".join(lines)
+
+
+def render(path: Path) -> str:
+    """Return the table of a recorded measurement, with its machine and command, in Markdown."""
+    recorded = json.loads(path.read_text())
+    return (
+        f"{format_markdown(recorded['results']['scenes'])}\n\n"
+        f"{recorded['machine']}, load {recorded['load']:.1f}; `{recorded['command']}`."
+    )
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Appearance, Scene
 from flexsheet.messages.types import Display, StereoMode
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
-from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.gl import SAMPLES, DrawStyle, headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose
 from tests.drawing import dent, follow, sheet_at
@@ -69,7 +69,8 @@ def draw(
     """Render a deformed object with both its marks."""
     sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
     dented = display.correction == "two_pass" and sheet.pushed_point is not None
-    stage = SceneRenderer(scene, context, spacing_m=0.004, basis=few_dents() if dented else None)
+    basis = few_dents() if dented else None
+    stage = SceneRenderer(scene, context, spacing_m=0.004, samples=SAMPLES, basis=basis)
     follow(stage, dent(stage, 0.014, (0.008, -0.006)))
     marked = display.marks and display.pattern == "object"
     look = DrawStyle(

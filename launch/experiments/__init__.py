@@ -20,6 +20,13 @@ class ExperimentError(FlexsheetError, RuntimeError):
     remedy = "Try `launch/demo.yaml` first. A bag must be a recording of the same experiment."
 
 
+class ExperimentInterruptedError(ExperimentError):
+    """Raised if SIGINT or SIGTERM ended an experiment; its nodes are stopped."""
+
+    code = "experiment-interrupted"
+    remedy = "Start the experiment again; a sweep continues with the trials that are missing."
+
+
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
     """Return the entry of a bag with a label. Raises ExperimentError if it is missing.
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
@@ -122,17 +122,17 @@ def run_experiment(
     except ExperimentError as error:
         if bag is None or not bag.exists():
             raise
-        raise ExperimentError(f"{error}\nrecording until the error: {bag}") from error
+        raise type(error)(f"{error}\nrecording until the error: {bag}") from error
 
 
 async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
-    """Await `work`. On SIGINT or SIGTERM, cancel it and raise ExperimentError."""
+    """Await `work`. On SIGINT or SIGTERM, cancel it and raise ExperimentInterruptedError."""
     task = asyncio.create_task(work)
     with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
         try:
             await task
         except asyncio.CancelledError:
-            raise ExperimentError("interrupted; all nodes are stopped") from None
+            raise ExperimentInterruptedError("interrupted; all nodes are stopped") from None
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:

@@ -29,6 +29,7 @@ Image = NDArray[np.uint8]
 
 FAR_M = 5.0
 SAMPLES = 4
+SOFTWARE_DRIVERS = ("llvmpipe", "softpipe", "swrast")
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = ("grid", "checker", "white")
@@ -459,6 +460,11 @@ def limit_driver_threads() -> None:
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
+
+
+def is_software(context: moderngl.Context) -> bool:
+    """Return whether the driver draws by the processor instead of a graphics card."""
+    return str(context.info["GL_RENDERER"]).startswith(SOFTWARE_DRIVERS)
 
 
 def headless_context() -> moderngl.Context:

@@ -11,7 +11,6 @@ from flexsheet.messages.methods import Correction, SheetShapeMethod
 from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.messages.types import StereoMode
 from flexsheet.nodes.node import NodeParameters
-from flexsheet.nodes.renderer.gl import SAMPLES
 
 
 class RendererParameters(NodeParameters):
@@ -54,11 +53,12 @@ class RendererParameters(NodeParameters):
         description="Distance, m, between vertices of the drawn object; it need not be smaller "
         "than that of the soft body's skin.",
     )
-    samples: int = Field(
-        default=SAMPLES,
+    samples: int | None = Field(
+        default=None,
         ge=0,
         le=16,
-        description="Samples per pixel (antialiasing); fewer are faster without a GPU.",
+        description="Samples per pixel (antialiasing); fewer are faster without a GPU. null: 4; "
+        "two_pass without a GPU: none, at a higher resolution.",
     )
     correction: Correction | Literal["auto"] = Field(
         default="auto",

@@ -57,7 +57,10 @@ class ScreenRectangle:
 
 @dataclass(frozen=True, slots=True)
 class EyePicture:
-    """Framebuffers of the first pass: a multisampled one, and one with the averaged image."""
+    """Framebuffers of the first pass: the drawn one, and one with the averaged image.
+
+    They are the same without multisampling.
+    """
 
     samples: moderngl.Framebuffer
     resolved: moderngl.Framebuffer
@@ -68,6 +71,9 @@ class EyePicture:
         """Allocate framebuffers for an image of a size (width, height), px."""
         image = context.texture(size, 4)
         image.repeat_x = image.repeat_y = False
+        if not samples:
+            single = context.framebuffer([image], context.depth_renderbuffer(size))
+            return EyePicture(single, single, image)
         multisampled = context.framebuffer(
             context.renderbuffer(size, 4, samples=samples),
             context.depth_renderbuffer(size, samples=samples),
@@ -76,7 +82,7 @@ class EyePicture:
 
     def release(self) -> None:
         """Release the framebuffers."""
-        for frame in (self.samples, self.resolved):
+        for frame in {self.samples, self.resolved}:
             for attachment in (*frame.color_attachments, frame.depth_attachment):
                 if attachment is not None:
                     attachment.release()
@@ -87,7 +93,10 @@ class TwoPassProjector:
     """Renderer of the two-pass method, with framebuffers of the first pass and sheet buffers."""
 
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
-        """Prepare the shaders; samples: samples per pixel, limited by the driver's maximum."""
+        """Prepare the shaders.
+
+        samples: samples per pixel of the first pass, limited by the driver's maximum; 0: one.
+        """
         self._context, self._samples = context, min(samples, context.max_samples)
         self._pictures: dict[tuple[int, int], EyePicture] = {}
         self._programs = Programs(context, "sheet")
@@ -118,7 +127,8 @@ class TwoPassProjector:
         )
         picture.samples.clear(0.0, 0.0, 0.0, 1.0)
         canvas.draw_into(picture.samples, seen, look)
-        self._context.copy_framebuffer(picture.resolved, picture.samples)
+        if picture.resolved is not picture.samples:
+            self._context.copy_framebuffer(picture.resolved, picture.samples)
         program, uniforms = self._programs.get(LENS=view.lens is not None, GREY=view.grey)
         array = self._sheet_array(sheet, program)
         set_view(uniforms, view)
