@@ -143,9 +143,12 @@ class FemSolver(Node):
         loop = asyncio.get_running_loop()
         stop = self._stop
 
-        def adopt(quick: body.SceneBody) -> None:
+        async def adopt(quick: body.SceneBody) -> None:
             if not stop.is_set():
                 self._set_bodies([quick, linear])
+
+        def on_quick(quick: body.SceneBody) -> None:
+            asyncio.run_coroutine_threadsafe(adopt(quick), loop).result()
 
         try:
             best = await asyncio.to_thread(
@@ -153,7 +156,7 @@ class FemSolver(Node):
                 scene,
                 linear,
                 partial(self._progress, stop),
-                partial(loop.call_soon_threadsafe, adopt),
+                on_quick,
             )
         except precompute.Interrupted:
             self.note = "nonlinear table interrupted; the next start continues it"
