@@ -207,7 +207,9 @@ def _compute_table(
     )
     fine_job = snapshots.make_fine_job(mesh_spec, samples[0], **given)
     fine_jobs = [] if fine_job is None else [fine_job]
-    stages = [(samples, snapshots.DEPTHS_M, "push")]
+    stages: list[tuple[list[snapshots.SamplePoint], tuple[float, ...], str]] = [
+        (samples, snapshots.DEPTHS_M, "push")
+    ]
     if on_quick is not None:
         stages.insert(0, (samples[: snapshots.QUICK_COUNT], snapshots.QUICK_DEPTHS_M, "quick"))
     pushes = len(fine_jobs) + sum(len(stage[0]) for stage in stages)
@@ -218,7 +220,8 @@ def _compute_table(
         f"computing the nonlinear table of the soft body ({need.text()})",
         f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
     )
-    done, fine = 0, None
+    done = 0
+    fine: tuple[snapshots.SamplePoint, snapshots.Snapshot] | None = None
 
     def report(steps: int) -> None:
         progress(done + steps, total, need)

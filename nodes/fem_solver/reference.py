@@ -11,6 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,7 +190,7 @@ class LocalTable:
             0
         ]
         self._samples = [corrected, *(samples[k] for k in near if samples[k] is not corrected)]
-        given = {
+        given: dict[str, Any] = {
             "poisson_ratio": body.spec.poisson_ratio,
             "finger_radius_m": scene.finger.radius_m,
         }
