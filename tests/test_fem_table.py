@@ -53,6 +53,7 @@ def coarse() -> Iterator[None]:
     """Return a specification with few samples, few depths and a coarse mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
+        patch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
         patch.setattr(snapshots, "SPACING_RATIO", 1.0)
         patch.setattr(snapshots, "STATIONS", (0.0, 0.6))
         patch.setattr(snapshots, "ANGLE_STEP_RAD", 0.5)
