@@ -5,11 +5,12 @@
 The stored result is the independent reference of `flexsheet experiment compliance`. It uses the
 material law of the scene's object and a rigid, frictionless sphere, but no code of flexsheet's soft
 body: felupe's 27-node hexahedra on a mesh of `benchmarks.hexahedra`, its assembly and material, and
-the solver Pardiso. Each depth is solved on two meshes; the difference, and that of a stiffer
-contact, is the stated uncertainty. All lengths are in finger radii, forces in Young's modulus times
-the square of the finger radius. felupe (GPL) and pypardiso are tools for development, not
-dependencies: `pip install felupe pypardiso`. A run takes 10 to 40 minutes of one core; solved
-curves in FILE are kept, so that an interrupted run continues.
+the solver Pardiso. `combine_runs` describes how the meshes give the force and its uncertainty. All
+lengths are in finger radii, forces in Young's modulus times the square of the finger radius.
+
+felupe (GPL) and pypardiso are tools for development, not dependencies: `pip install felupe
+pypardiso`. A run takes 10 to 40 minutes of one core. Solved curves in FILE are kept, so that an
+interrupted run continues.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ PENALTY, STIFFER = 1000.0, 4000.0
 """Stiffness of the contact (pressure per penetration), in Young's modulus per finger radius; the
 second value, to estimate the effect of the first."""
 DEPTHS = tuple(depth / 7.0 for depth in (0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 13.0, 16.0))
-SCALES = (2.0, 1.4)
-"""Scales of the two meshes, the coarse one first."""
+SCALES = (3.0, 2.0, 1.4)
+"""Scales of the meshes, the coarsest first."""
 ORDER = 2.0
+INTERRUPTED = "interrupted"
 CURVE_KEYS = (
     "radius",
     "length",
@@ -143,9 +145,8 @@ class FelupeBody:
             scale=push.scale,
         )
         nu = push.poisson_ratio
-        self._law = felupe.NeoHookeCompressible(
-            mu=0.5 / (1.0 + nu), lmbda=nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-        )
+        shear, bulk = 0.5 / (1.0 + nu), 1.0 / (3.0 * (1.0 - 2.0 * nu))
+        self._law = felupe.NeoHookeCompressible(mu=shear, lmbda=bulk - 2.0 / 3.0 * shear)
         grid = felupe.Mesh(self.mesh.points, self.mesh.cells, "hexahedron27")
         self._region = felupe.RegionTriQuadraticHexahedron(grid)
         if self._region.dV.min() <= 0.0:
@@ -257,10 +258,10 @@ def reference_pushes(scene: Scene) -> list[Push]:
         raise SystemExit("the force reference needs a cylinder on a strip; choose another scene")
     finger = scene.finger.radius_m
     places = [(along / finger, around / geometry.radius_m) for along, around in POSITIONS_M]
-    runs = [(places[0], SCALES[1], PENALTY)]
-    runs += [(place, SCALES[0], PENALTY) for place in places]
+    runs = [(places[0], scale, PENALTY) for scale in SCALES]
+    runs += [(place, SCALES[0], PENALTY) for place in places[1:]]
+    runs += [(places[0], SCALES[1], STIFFER)]
     runs += [(place, SCALES[1], PENALTY) for place in places[1:]]
-    runs += [(places[0], SCALES[0], STIFFER)]
     return [
         Push(
             radius=geometry.radius_m / finger,
@@ -276,38 +277,39 @@ def reference_pushes(scene: Scene) -> list[Push]:
     ]
 
 
-def solve_runs(pushes: Sequence[Push], output: Path) -> list[dict[str, Any]]:
-    """Return the force curves of the pushes, from the file or solved and written there."""
-    known = json.loads(output.read_text())["runs"] if output.exists() else []
-    runs = []
+def solve_runs(pushes: Sequence[Push], output: Path) -> None:
+    """Solve the pushes whose complete force curves the file lacks; store each solved depth."""
+    runs = json.loads(output.read_text())["runs"] if output.exists() else []
     for push in pushes:
         inputs = asdict(push)
-        run = next((one for one in known if one["inputs"] == inputs), None)
-        if run is None:
-            body, start_s = FelupeBody(push), time.process_time()
-            forces = []
-            for force in body.solve(DEPTHS):
-                forces.append(force)
-                print(
-                    f"{push}, {len(body.mesh.points)} nodes: force {force:.5f} at depth "
-                    f"{DEPTHS[len(forces) - 1]:.3f}, {time.process_time() - start_s:.0f} s"
-                )
-            run = {
-                "inputs": inputs,
-                "nodes": len(body.mesh.points),
-                "forces": forces,
-                "cpu_s": round(time.process_time() - start_s, 1),
-            }
-        runs.append(run)
-        later = [one for one in known if one["inputs"] not in [done["inputs"] for done in runs]]
-        write_result([*runs, *later], output)
-    return runs
+        if any(run["inputs"] == inputs and run["end"] != INTERRUPTED for run in runs):
+            continue
+        body, start_s = FelupeBody(push), time.process_time()
+        run: dict[str, Any] = {
+            "inputs": inputs,
+            "nodes": len(body.mesh.points),
+            "forces": [],
+            "end": INTERRUPTED,
+        }
+        others = [one for one in runs if one["inputs"] != inputs]
+        for force in body.solve(DEPTHS):
+            run["forces"].append(round(force, 6))
+            run["cpu_s"] = round(time.process_time() - start_s)
+            if len(run["forces"]) == len(DEPTHS):
+                run["end"] = "complete"
+            write_result([*others, run], output)
+            print(f"{push}, {run['nodes']} nodes: {run['forces']}, {run['cpu_s']} s")
+        if len(run["forces"]) < len(DEPTHS):
+            run["end"] = "Newton's method did not converge at the next depth"
+        runs = [*others, run]
+        write_result(runs, output)
 
 
 def write_result(runs: list[dict[str, Any]], output: Path) -> None:
     """Write the runs and the curves that follow from them."""
     result = {
         "command": "python -m benchmarks.force_reference",
+        "method": "NeoHookeCompressible, 27-node hexahedra, penalty contact of a rigid sphere",
         "units": "lengths in finger radii, forces in Young's modulus times squared finger radius",
         "versions": {name: version(name) for name in ("felupe", "pypardiso", "numpy", "scipy")},
         "curves": combine_runs(runs),
@@ -317,56 +319,54 @@ def write_result(runs: list[dict[str, Any]], output: Path) -> None:
 
 
 def combine_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the force curve of each position that was solved on the coarse mesh.
+    """Return a force curve for each position that was solved.
 
-    Where both meshes were solved, the force is extrapolated with the order `ORDER` of convergence;
-    the uncertainty is the difference from the finer mesh. At other positions, the ratio of
-    the extrapolated to the coarse force is taken from the first position, since the elements at the
-    finger are the same; the uncertainty is the whole correction. The effect of a stiffer contact,
-    where it was computed, is added as a square.
+    At the first position, the force is extrapolated from the two finest meshes with the order
+    `ORDER` of convergence; the uncertainty is the difference from the finest one. Deeper than the
+    finest mesh was solved, the ratio to the second one at the last common depth is used; the
+    uncertainty is the whole correction. At the other positions, the force on a coarser mesh is
+    multiplied by the ratio of extrapolated to coarse force at the first position, since the
+    elements at the finger are the same; a quarter of the correction is added to the uncertainty.
+    The effect of a stiffer contact, where it was computed, is added too (all as squares).
     """
 
-    def find(place: dict[str, Any], scale: float, penalty: float) -> Floats | None:
+    def find(place: dict[str, Any], scale: float, penalty: float = PENALTY) -> Floats:
         wanted = {**place, "scale": scale, "penalty": penalty}
         found = (run["forces"] for run in runs if run["inputs"] == wanted)
-        return next(map(np.array, found), None)
+        return np.array(next(found, []))
 
     places = [{key: run["inputs"][key] for key in CURVE_KEYS} for run in runs]
-    places = [place for number, place in enumerate(places) if place not in places[:number]]
-    curves: list[dict[str, Any]] = []
-    transferred: Floats | None = None
-    contact = np.zeros(len(DEPTHS))
-    for place in places:
-        coarse, fine = (find(place, scale, PENALTY) for scale in SCALES)
-        if coarse is None or (fine is None and transferred is None):
-            continue
-        if fine is not None:
-            count = min(len(coarse), len(fine))
-            step = (coarse[:count] - fine[:count]) / ((SCALES[0] / SCALES[1]) ** ORDER - 1.0)
-            force, spread = fine[:count] - step, np.abs(step) / fine[:count]
-            if transferred is None:
-                transferred = force / coarse[:count]
-        else:
-            assert transferred is not None
-            count = min(len(coarse), len(transferred))
-            force, spread = coarse[:count] * transferred[:count], np.abs(1.0 - transferred[:count])
-        stiff = find(place, SCALES[0], STIFFER)
-        if stiff is not None:
-            shared = min(len(stiff), len(coarse))
-            contact[:shared] = stiff[:shared] / coarse[:shared] - 1.0
-        curves.append(
-            {
-                **place,
-                "depths": list(DEPTHS[:count]),
-                "forces": [round(float(one), 5) for one in force],
-                "uncertainty_ratio": [
-                    round(float(one), 4) for one in np.hypot(spread, contact[:count])
-                ],
-                "meshes": 1 if fine is None else 2,
-                "end": "complete" if count == len(DEPTHS) else "Newton's method did not converge",
-            }
-        )
+    first, *others = [place for number, place in enumerate(places) if place not in places[:number]]
+    coarse, fine = find(first, SCALES[1]), find(first, SCALES[2])
+    common = min(len(coarse), len(fine))
+    if not common:
+        return []
+    step = (coarse[:common] - fine[:common]) / ((SCALES[1] / SCALES[2]) ** ORDER - 1.0)
+    ratio = np.full(len(coarse), (fine[common - 1] - step[-1]) / coarse[common - 1])
+    ratio[:common] = (fine[:common] - step) / coarse[:common]
+    best, spread = coarse * ratio, np.abs(1.0 - ratio)
+    spread[:common] = np.abs(step) / fine[:common]
+    stiff = find(first, SCALES[1], STIFFER)[: len(coarse)]
+    contact = np.append(stiff / coarse[: len(stiff)] - 1.0, np.zeros(len(coarse) - len(stiff)))
+    spread = np.hypot(spread, contact)
+    curves = [_make_curve(first, best, spread)]
+    for place in others:
+        scale = max(SCALES, key=lambda scale: (len(find(place, scale)), -scale))
+        here, there = find(place, scale), find(first, scale)
+        count = min(len(here), len(there), len(best))
+        transfer = best[:count] / there[:count]
+        doubt = np.hypot(spread[:count], 0.25 * (transfer - 1.0))
+        curves.append(_make_curve(place, here[:count] * transfer, doubt))
     return curves
+
+
+def _make_curve(place: dict[str, Any], forces: Floats, uncertainty: Floats) -> dict[str, Any]:
+    return {
+        **place,
+        "depths": [round(depth, 6) for depth in DEPTHS[: len(forces)]],
+        "forces": [round(float(one), 5) for one in forces],
+        "uncertainty_ratio": [round(float(one), 4) for one in uncertainty],
+    }
 
 
 def main() -> None:

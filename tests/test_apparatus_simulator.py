@@ -401,10 +401,11 @@ def test_the_presented_force_is_that_of_the_true_sheet() -> None:
         edges=recorded.edges,
         curve_times_ns=recorded.curve_times_ns,
         curves=recorded.curves,
+        methods=recorded.methods,
         apparatus=given,
     )
     felt = ForceReference(stiff).evaluate(0, press)
-    assert felt.rendered_n == pytest.approx(1.2 * plain.rendered_n, rel=1e-3)
+    assert felt.felt_n == pytest.approx(1.2 * plain.felt_n, rel=1e-3)
     assert felt.wanted_n == plain.wanted_n
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.compliance import (
-    DEPTH_RATIOS,
+    DEPTHS_M,
     EVALUATED_S,
     HOLD_S,
+    POSITIONS_M,
     ComplianceRecording,
     ForceReference,
     ForceSample,
@@ -22,6 +24,7 @@ from flexsheet.launch.experiments.compliance import (
     make_presses,
     read_bag,
 )
+from flexsheet.launch.experiments.force_reference import ReferenceForce, find_reference_curve
 from flexsheet.launch.experiments.pictures import draw_compliance
 from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_scene
@@ -60,6 +63,7 @@ def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceReco
         edges=(rows[0], rows[1]),
         curve_times_ns=[0],
         curves=[CURVE],
+        methods=["linear"],
     )
 
 
@@ -77,7 +81,7 @@ def test_the_simulated_sheet_gives_the_rendered_force(
     alone = simulate_force(
         SCENE.sheet, STRETCH, depth_m - normal_offset_m, (float(press.surface[0]), 0.0), 0.007
     )
-    assert felt.rendered_n == pytest.approx(alone, rel=0.02)
+    assert felt.felt_n == pytest.approx(alone, rel=0.02)
 
 
 def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
@@ -89,8 +93,47 @@ def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
 
 
 def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
-    assert ForceSample(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
-    assert ForceSample(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0).error_ratio == pytest.approx(0.5)
+    assert ForceSample(0.01, 2.0, 2.2, 0.0, "linear").error_ratio == pytest.approx(0.1)
+    light = ForceSample(0.0001, 0.0, 0.5 * FORCE_JND_FLOOR_N, 0.0, "linear")
+    assert light.error_ratio == pytest.approx(0.5)
+
+
+def test_the_felt_force_is_judged_by_the_independent_reference() -> None:
+    sample = ForceSample(0.01, 1.25, 1.1, 0.0, "linear", ReferenceForce(1.0, 0.01))
+    assert sample.error_ratio == pytest.approx(0.1)
+    assert sample.model_error_ratio == pytest.approx(0.25)
+
+
+def test_the_reference_is_found_for_scaled_scenes_and_its_positions_only(tmp_path: Path) -> None:
+    geometry, finger = SCENE.object.geometry, SCENE.finger.radius_m
+    curve = {
+        "radius": geometry.radius_m / finger,
+        "length": geometry.length_m / finger,
+        "support_angle_rad": SCENE.object.support_angle_rad,
+        "poisson_ratio": SCENE.object.material.poisson_ratio,
+        "along": 0.0,
+        "angle_rad": 0.0,
+        "depths": [0.1, 0.5, 1.0, 2.0],
+        "forces": [0.1**1.5, 0.5**1.5, 1.0, 2.0**1.5],
+        "uncertainty_ratio": [0.04, 0.02, 0.01, 0.01],
+    }
+    file = tmp_path / "reference.json"
+    file.write_text(json.dumps({"curves": [curve]}))
+    found = find_reference_curve(SCENE, 0.0, 0.0, file)
+    assert found is not None
+    force = found.force(0.75 * finger)
+    assert force is not None
+    assert force.force_n == pytest.approx(4000.0 * finger**2 * 0.75**1.5, rel=1e-6)
+    assert force.uncertainty_ratio == pytest.approx(0.015)
+    assert found.force(2.1 * finger) is None
+    assert find_reference_curve(SCENE, 0.01, 0.0, file) is None
+
+
+def test_the_stored_reference_covers_every_position_of_the_demo() -> None:
+    for along_m, around_m in POSITIONS_M:
+        curve = find_reference_curve(SCENE, along_m, around_m)
+        assert curve is not None
+        assert all(curve.force(depth) is not None for depth in DEPTHS_M)
 
 
 def test_every_position_is_pressed_at_every_depth_and_evaluated_at_rest() -> None:
@@ -98,7 +141,7 @@ def test_every_position_is_pressed_at_every_depth_and_evaluated_at_rest() -> Non
     deepest_m = SCENE.working_range.push_depth_m
     for press in at_places:
         depths = [hold.depth_m for hold in press.holds]
-        assert depths == pytest.approx(deepest_m * np.array(DEPTH_RATIOS))
+        assert depths == pytest.approx([*DEPTHS_M, deepest_m])
         for hold in press.holds:
             assert hold.end_s - hold.begin_s == pytest.approx(EVALUATED_S)
             times = np.array([hold.end_s - HOLD_S, hold.begin_s, hold.end_s])
@@ -124,13 +167,19 @@ def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
 
 def test_the_image_shows_each_position(tmp_path: Path) -> None:
     rows = [
-        {"place": place, "depth_mm": depth, "wanted_n": 0.05 * depth, "rendered_n": 0.052 * depth}
+        {
+            "at": place,
+            "depth_mm": depth,
+            "reference_n": 0.05 * depth if depth < 16.0 else None,
+            "wanted_n": 0.051 * depth,
+            "felt_n": 0.052 * depth,
+        }
         for place in ("at 0, 0 mm", "at 25, 0 mm")
         for depth in (5.0, 20.0)
     ]
     moving = {
         "speed_mm_per_s": 50.0,
-        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "rendered_n": 0.2}],
+        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "felt_n": 0.2}],
     }
     picture = tmp_path / "compliance.png"
     draw_compliance({"rows": rows, "moving": moving, "noticed_percent": [15, 22]}, picture)

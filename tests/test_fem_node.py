@@ -22,7 +22,7 @@ from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.fem_solver import precompute, precompute_table, snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.mesh import cylinder
-from flexsheet.nodes.fem_solver.node import FemSolver
+from flexsheet.nodes.fem_solver.node import BLEND_S, FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
@@ -69,7 +69,9 @@ class Bench(NodeHarness[FemSolver, VirtualClock]):
     """Solver that receives fingertips from the test."""
 
     def __init__(self, **parameters: Any) -> None:
-        given = FemSolverParameters(skin_spacing_m=0.007, **parameters)
+        given = FemSolverParameters(
+            **{"skin_spacing_m": 0.007, "compute_table": False, **parameters}
+        )
         super().__init__(FemSolver, given, VirtualClock(), name="fem_solver")
 
     @property
@@ -316,6 +318,9 @@ async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:
 @pytest.fixture
 def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.006))
+    monkeypatch.setattr(snapshots, "QUICK_DEPTHS_M", (0.003, 0.006))
+    monkeypatch.setattr(snapshots, "FINE_DEPTHS_M", (0.003,))
+    monkeypatch.setattr(snapshots, "FINE_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
@@ -335,13 +340,22 @@ async def test_the_table_is_made_while_the_linear_method_answers(
     tip = fingertip((0.0, 0.0, -0.003))
     first = await bench.push(tip)
     assert first.method == "linear"
-    while first.method == "linear":
+    methods, forces = ["linear"], [first.force_world_n[2]]
+    while methods[-1] != "nonlinear_table":
         assert bench.node.errors == 0, bench.node.last_error
         await asyncio.sleep(0.05)
-        first = await bench.push(tip)
-    assert first.method == "nonlinear_table"
+        now = await bench.push(tip)
+        if now.method != methods[-1]:
+            # the clock stands still, so that a new method begins with the force of the old one
+            assert now.force_world_n[2] == pytest.approx(forces[-1], rel=1e-6)
+            methods.append(now.method)
+            assert now.method in bench.node.note
+            assert "force within" in bench.node.note
+    assert methods == ["linear", "quick_table", "nonlinear_table"]
+    bench.node.clock.move_to(bench.node.clock.now_ns() + round(1e9 * BLEND_S))
+    first = await bench.push(tip)
     assert first.in_range
-    assert "nonlinear_table" in bench.node.note
+    assert first.force_world_n[2] < 0.95 * forces[0]
     await bench.node.close()
     # from now on it is there from the start, and for who leaves the choice to the node
     again = Bench(cache_dir=tmp_path)

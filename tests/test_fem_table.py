@@ -11,6 +11,7 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from hashlib import sha256
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -56,6 +57,7 @@ def coarse() -> Iterator[None]:
     """Return a specification with few samples, few depths and a coarse mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
+        patch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
         patch.setattr(snapshots, "SPACING_RATIO", 1.0)
         patch.setattr(snapshots, "STATIONS", (0.0, 0.6))
         patch.setattr(snapshots, "ANGLE_STEP_RAD", 0.5)
@@ -134,8 +136,17 @@ def test_away_from_the_finger_it_is_what_newton_finds(
     assert (
         np.linalg.norm(answer.displacement - moved, axis=1)[away].max() < 0.6e-3
     )  # elements of 10 mm
-    force = MODULUS * wanted.force_n[DEPTHS.index(0.003)] @ there.normal
-    assert answer.force_n @ there.normal == pytest.approx(force, rel=0.1)
+    fine_job = snapshots.make_fine_job(
+        SPEC.body.mesh, sample, poisson_ratio=0.45, finger_radius_m=FINGER
+    )
+    assert fine_job is not None
+    fine = solve_snapshot(replace(fine_job, depths_m=(0.003,)))
+    coarse_n = MODULUS * wanted.force_n[DEPTHS.index(0.003)] @ there.normal
+    fine_n = MODULUS * fine.force_n[0] @ there.normal
+    # extrapolated from two meshes, one half as fine as the other
+    assert answer.force_n @ there.normal == pytest.approx(
+        fine_n - (coarse_n - fine_n) / 3.0, rel=0.1
+    )
     assert answer.in_range
 
 

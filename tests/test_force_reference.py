@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -15,9 +19,22 @@ from benchmarks.force_reference import (
     combine_runs,
 )
 from benchmarks.hexahedra import OFFSETS, HexMesh, cylinder_hexahedra
+from flexsheet.launch.experiments.compliance import POSITIONS_M
+from flexsheet.launch.experiments.force_reference import find_reference_curve
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.snapshots import (
+    SamplePoint,
+    make_fine_job,
+    make_snapshot_job,
+    solve_snapshot,
+)
+from flexsheet.nodes.fem_solver.table import compute_force_factors
 
 Floats = NDArray[np.float64]
 RADIUS, LENGTH, SUPPORT_RAD = 5.0, 17.0, 1.6
+SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 
 
 def make_mesh(along: float, angle_rad: float, scale: float = 4.0) -> HexMesh:
@@ -85,9 +102,54 @@ def test_curves_are_extrapolated_and_transferred_to_positions_with_one_mesh() ->
         inputs = {**place, "scale": scale, "penalty": PENALTY}
         return {"inputs": inputs, "forces": forces.tolist()}
 
-    runs = [run(0.0, SCALES[0], 1.0), run(0.0, SCALES[1], 1.0), run(3.0, SCALES[0], 2.0)]
+    runs = [run(0.0, scale, 1.0) for scale in SCALES]
+    runs.append(run(3.0, SCALES[0], 2.0))
     both, one = combine_runs(runs)
     assert both["forces"] == pytest.approx(exact, abs=1e-5)
     assert one["forces"] == pytest.approx(2.0 * exact, abs=2e-5)
-    assert (both["meshes"], one["meshes"]) == (2, 1)
     assert max(both["uncertainty_ratio"]) < min(one["uncertainty_ratio"])
+    runs[2]["forces"] = runs[2]["forces"][:3]  # type: ignore[index]
+    deeper = combine_runs(runs)[0]
+    assert deeper["forces"] == pytest.approx(exact, abs=1e-5)
+    assert min(deeper["uncertainty_ratio"][3:]) > max(deeper["uncertainty_ratio"][:3])
+
+
+@pytest.mark.long
+def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
+    """Solve the pushes as a table does, at the positions and up to depths of the reference."""
+    scene, depths = load_scene(SCENE_FILE), (0.0015, 0.003, 0.005, 0.010, 0.015)
+    assert scene.object.material is not None
+    modulus, radius = scene.object.material.young_modulus_pa, scene.object.geometry.radius_m
+    spec = make_soft_body_spec(scene, 0.0045).mesh
+    solid = build_mesh(spec)
+    given: dict[str, Any] = {"poisson_ratio": 0.45, "finger_radius_m": scene.finger.radius_m}
+    forces, samples = [], []
+    for along, around in POSITIONS_M:
+        normal = np.array([0.0, np.sin(around / radius), np.cos(around / radius)])
+        sample = SamplePoint(radius * normal + [along, 0.0, 0.0], normal)
+        solved = solve_snapshot(make_snapshot_job(spec, solid, sample, depths_m=depths, **given))
+        forces.append(solved.force_n)
+        samples.append(sample)
+    fine_job = make_fine_job(spec, samples[0], **given)
+    assert fine_job is not None
+    none = np.zeros((len(depths), 1, 3), dtype=np.float32)
+    interpolator = SimpleNamespace(interpolate=lambda sample, rest: (none, forces[0], 5.0))
+    linear = SimpleNamespace(
+        respond=lambda query: SimpleNamespace(displacement=none[0], force_n=samples[0].normal)
+    )
+    factors = compute_force_factors(
+        (samples[0], solve_snapshot(fine_job)),
+        cast(Any, SimpleNamespace(rest=np.zeros((1, 3)))),
+        cast(Any, linear),
+        cast(Any, interpolator),
+        np.array([0.0, 0.0007, *depths]),
+    )[2:]
+    for place, sample, force in zip(POSITIONS_M, samples, forces, strict=True):
+        curve = find_reference_curve(scene, *place)
+        assert curve is not None
+        for depth, factor, one in zip(depths, factors, force, strict=True):
+            reference = curve.force(depth)
+            assert reference is not None
+            assert modulus * factor * one @ sample.normal == pytest.approx(
+                reference.force_n, rel=0.03
+            ), (place, depth)

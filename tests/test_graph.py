@@ -49,13 +49,14 @@ def processes_of_run(run_id: str) -> list[psutil.Process]:
 
 
 def on_ports(plan_ports: tuple[int, int]) -> list[str]:
-    """Return settings that put the simulated arms on this test's ports."""
+    """Return settings that put the simulated arms on this test's ports and compute no table."""
     left, right = plan_ports
     return [
         f"twin_arms.left_port={left}",
         f"twin_arms.right_port={right}",
         f"arm_left_bridge.port={left}",
         f"arm_right_bridge.port={right}",
+        "fem_solver.compute_table=false",
     ]
 
 

@@ -321,13 +321,33 @@ def compliance(
     if as_json:
         print_json({**result, "figure": str(image)})
         return
-    columns = ["position", "depth, mm", "object, N", "rendered, N", "error, %", "offset, mm"]
-    columns += ["measured, N"] if "measured_n" in result["rows"][0] else []
+    columns = {
+        "position": "at",
+        "depth, mm": "depth_mm",
+        "reference, N": "reference_n",
+        "wanted, N": "wanted_n",
+        "felt, N": "felt_n",
+        "error, %": "error_percent",
+        "model's, %": "model_error_percent",
+        "model": "method",
+        "offset, mm": "normal_offset_mm",
+    }
+    columns |= {"measured, N": "measured_n"} if "measured_n" in result["rows"][0] else {}
     cells = [
-        [f"{cell:.2f}" if isinstance(cell, float) else cell or "-" for cell in row.values()]
+        [
+            cell if isinstance(cell, str) else "–" if cell is None else f"{cell:.2f}"
+            for cell in (row[key] for key in columns.values())
+        ]
         for row in result["rows"]
     ]
-    print_table(columns, cells)
+    print_table(list(columns), cells)
+    words.print(f"errors are relative to {result['reference']}")
+    for place in result["against_reference"]:
+        words.print(
+            f"{place['at']}: median {place['median_percent']:.1f} %, max "
+            f"{place['worst_percent']:.1f} %; the soft body alone max "
+            f"{place['model_worst_percent']:.1f} %"
+        )
     moving = result["moving"]
     words.print(
         f"force error in motion at {moving['speed_mm_per_s']:g} mm/s: "

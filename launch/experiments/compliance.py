@@ -1,9 +1,10 @@
 """Compare the force of the simulated sheet on the finger with the force of the virtual object.
 
 The finger pushes at a few positions and rests at several depths; then it moves in and out without a
-stop. The rendered force is computed by the simulator's membrane model, from the true edges of the
-sheet and the true fingertip. The object's force is read from the published force curve, at the
-finger's true depth.
+stop. The felt force is computed by the simulator's membrane model, from the true edges of the sheet
+and the true fingertip. The wanted force is read from the published force curve, at the finger's
+true depth. Errors are relative to the stored solution of an independent solver
+(`force_reference`), or to the wanted force where the file contains no solution.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ from scipy.interpolate import PchipInterpolator
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.force_reference import (
+    ReferenceForce,
+    ReferenceForceCurve,
+    find_reference_curve,
+)
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.apparatus import Apparatus
@@ -45,8 +51,8 @@ Times = NDArray[np.int64]
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
 """Pushed positions: distance along the object, and arc length around it from its front, m."""
 
-DEPTH_RATIOS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Depths at which the finger rests, as fractions of the scene's push depth."""
+DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
+"""Depths at which the finger rests, in addition to the scene's push depth, which limits them."""
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
@@ -80,12 +86,14 @@ class RestInterval:
 class Press:
     """Finger path of one push.
 
-    place: name of the pushed position. surface, normal: point (3,) and normal (3,) of the
-    undeformed object there, world frame. holds: evaluated rests; empty if the finger does not rest.
+    place: name of the pushed position. place_m: distance along the object and arc length around it
+    from its front. surface, normal: point (3,) and normal (3,) of the undeformed object there,
+    world frame. holds: evaluated rests; empty if the finger does not rest.
     """
 
     path: FingerPath
     place: str
+    place_m: tuple[float, float]
     surface: Floats
     normal: Floats
     holds: tuple[RestInterval, ...]
@@ -93,9 +101,10 @@ class Press:
 
 def make_presses(scene: Scene) -> list[Press]:
     """Make all pushes of the experiment for a scene."""
-    depths = scene.working_range.push_depth_m * np.array(DEPTH_RATIOS)
+    deepest_m = scene.working_range.push_depth_m
+    depths = np.append([depth for depth in DEPTHS_M if depth < deepest_m], deepest_m)
     resting = [_make_resting_press(scene, along, around, depths) for along, around in POSITIONS_M]
-    return [*resting, _make_moving_press(scene, float(depths[-1]))]
+    return [*resting, _make_moving_press(scene, deepest_m)]
 
 
 def _make_resting_press(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Press:
@@ -136,7 +145,7 @@ def _make_press(
         wander_m=0.0,
         tremor_m=0.0,
     )
-    return Press(path, place, surface, normal, holds)
+    return Press(path, place, place_m, surface, normal, holds)
 
 
 def make_compliance_procedure(progress: Progress) -> Procedure:
@@ -156,6 +165,7 @@ class ComplianceRecording:
 
     windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
     as rows (16,). curves: object force over depth, (m, 2) each, published at `curve_times_ns`.
+    methods: the soft body's method that computed each curve.
     forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
     """
 
@@ -165,6 +175,7 @@ class ComplianceRecording:
     edges: tuple[SampledMotion, SampledMotion]
     curve_times_ns: list[int]
     curves: list[Floats]
+    methods: list[str]
     apparatus: Apparatus | None = None
     forces: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
@@ -176,7 +187,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
     finger: list[tuple[int, Floats]] = []
     windows: dict[str, tuple[int, int]] = {}
     flanges: tuple[list[tuple[int, Floats]], list[tuple[int, Floats]]] = ([], [])
-    curves: list[tuple[int, Floats]] = []
+    curves: list[tuple[int, Floats, str]] = []
     forces: list[tuple[float, float]] = []
     topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body", "force"]
     for _, message, header, _ in BagReader(bag, topics=topics):
@@ -193,7 +204,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
                 flanges[0].append((header.source_ns, message.world_from_flange_left.ravel()))
                 flanges[1].append((header.source_ns, message.world_from_flange_right.ravel()))
             case SoftBody() if len(message.force_curve) > 0:
-                curves.append((header.source_ns, message.force_curve))
+                curves.append((header.source_ns, message.force_curve, message.method))
             case Force() if message.valid and message.axis == "sheet_normal":
                 forces.append((header.source_ns, message.force_n))
             case _:
@@ -210,8 +221,9 @@ def read_bag(bag: Path) -> ComplianceRecording:
         finger=make_motion(finger, "twin/finger"),
         windows_ns=windows,
         edges=(make_motion(flanges[0], "twin/arms"), make_motion(flanges[1], "twin/arms")),
-        curve_times_ns=[time for time, _ in curves],
-        curves=[curve for _, curve in curves],
+        curve_times_ns=[time for time, _, _ in curves],
+        curves=[curve for _, curve, _ in curves],
+        methods=[method for _, _, method in curves],
         forces=np.array(forces).reshape(-1, 2),
     )
 
@@ -220,19 +232,34 @@ def read_bag(bag: Path) -> ComplianceRecording:
 class ForceSample:
     """Forces at one time.
 
-    depth_m: true finger depth. wanted_n, rendered_n: force of the object and of the sheet.
-    normal_offset_m: depth of the sheet's centre below the undeformed surface.
+    depth_m: true finger depth. wanted_n, felt_n: published force of the object, and force of the
+    sheet. normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method
+    of the soft body. reference: independent force of the object, if it is known.
     """
 
     depth_m: float
     wanted_n: float
-    rendered_n: float
+    felt_n: float
     normal_offset_m: float
+    method: str
+    reference: ReferenceForce | None = None
 
     @property
     def error_ratio(self) -> float:
-        """Return the relative force error; divisors are at least FORCE_JND_FLOOR_N."""
-        return (self.rendered_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
+        """Return the relative error of the felt force; divisors are at least FORCE_JND_FLOOR_N."""
+        expected_n = self.wanted_n if self.reference is None else self.reference.force_n
+        return _relative_error(self.felt_n, expected_n)
+
+    @property
+    def model_error_ratio(self) -> float | None:
+        """Return the relative error of the wanted force; None without a reference."""
+        if self.reference is None:
+            return None
+        return _relative_error(self.wanted_n, self.reference.force_n)
+
+
+def _relative_error(force_n: float, expected_n: float) -> float:
+    return (force_n - expected_n) / max(expected_n, FORCE_JND_FLOOR_N)
 
 
 class ForceReference:
@@ -248,18 +275,25 @@ class ForceReference:
         self._rubber = true_rubber(scene.sheet, recorded.apparatus)
         self._friction = true_friction(recorded.apparatus)
         self._ratios: dict[str, tuple[Times, Floats]] = {}
+        self._curves: dict[str, ReferenceForceCurve | None] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
         """Return the forces at a time; the depth is measured from the pushed surface point."""
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
+        if press.place not in self._curves:
+            self._curves[press.place] = find_reference_curve(self._recorded.scene, *press.place_m)
+        curve = self._curves[press.place]
+        number = max(0, bisect_right(self._recorded.curve_times_ns, at_ns) - 1)
         pressed_n = self._solve_n(left, right, tip, press)
         middle = 0.5 * (left[:3, 3] + right[:3, 3])
         return ForceSample(
             depth_m=depth_m,
-            wanted_n=self._interpolate_curve_n(at_ns, depth_m),
-            rendered_n=pressed_n * self._history_ratio(at_ns, press),
+            wanted_n=_interpolate_curve_n(self._recorded.curves[number], depth_m),
+            felt_n=pressed_n * self._history_ratio(at_ns, press),
             normal_offset_m=float((press.surface - middle) @ press.normal),
+            method=self._recorded.methods[number],
+            reference=None if curve is None else curve.force(depth_m),
         )
 
     def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
@@ -323,11 +357,10 @@ class ForceReference:
         felt_n = apply_history(history, np.asarray(times * 1e-9, dtype=np.float64), elastic_n)
         return times, np.where(elastic_n > 0.0, felt_n / np.maximum(elastic_n, 1e-9), 1.0)
 
-    def _interpolate_curve_n(self, at_ns: int, depth_m: float) -> float:
-        number = max(0, bisect_right(self._recorded.curve_times_ns, at_ns) - 1)
-        rows = self._recorded.curves[number]
-        curve = PchipInterpolator(rows[:, 0], rows[:, 1])
-        return float(curve(np.clip(depth_m, 0.0, rows[-1, 0])))
+
+def _interpolate_curve_n(rows: Floats, depth_m: float) -> float:
+    curve = PchipInterpolator(rows[:, 0], rows[:, 1])
+    return float(curve(np.clip(depth_m, 0.0, rows[-1, 0])))
 
 
 def _sheet_normal(left: Floats, right: Floats) -> Floats:
@@ -360,11 +393,17 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
             resting.append(row)
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
-    errors = np.array([row["error_percent"] for row in resting])
+    errors = np.abs([row["error_percent"] for row in resting])
+    judged = [row for row in resting if row["reference_n"] is not None]
     errors_moving = 100.0 * np.array([one.error_ratio for one in moving])
     return {
         "rows": resting,
-        "worst_percent": float(np.abs(errors).max()),
+        "reference": "independent finite elements (benchmarks.force_reference)"
+        if judged
+        else "the soft body's own force, because no independent solution fits the scene",
+        "median_percent": float(np.median(errors)),
+        "worst_percent": float(errors.max()),
+        "against_reference": _summarize_judged(judged),
         "target_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {
@@ -373,7 +412,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
                 {
                     "depth_mm": 1e3 * one.depth_m,
                     "wanted_n": one.wanted_n,
-                    "rendered_n": one.rendered_n,
+                    "felt_n": one.felt_n,
                 }
                 for one in moving
             ],
@@ -400,16 +439,45 @@ def _evaluate_moving(
 ) -> Iterator[ForceSample]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
         sample = reference.evaluate(at_ns, press)
-        if max(sample.wanted_n, sample.rendered_n) >= FORCE_JND_FLOOR_N:
+        if max(sample.wanted_n, sample.felt_n) >= FORCE_JND_FLOOR_N:
             yield sample
 
 
+def _summarize_judged(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return median and maximum error (%) of each position, over rows with a reference."""
+    result = []
+    for place in dict.fromkeys(row["at"] for row in rows):
+        felt, model = (
+            np.abs([row[key] for row in rows if row["at"] == place])
+            for key in ("error_percent", "model_error_percent")
+        )
+        result.append(
+            {
+                "at": place,
+                "median_percent": float(np.median(felt)),
+                "worst_percent": float(felt.max()),
+                "model_worst_percent": float(model.max()),
+            }
+        )
+    return result
+
+
 def _make_row(press: Press, hold: RestInterval, samples: Sequence[ForceSample]) -> dict[str, Any]:
+    references = [one.reference for one in samples if one.reference is not None]
+    models = [one.model_error_ratio for one in samples if one.model_error_ratio is not None]
+    known = len(references) == len(samples)
     return {
-        "place": press.place,
+        "at": press.place,
         "depth_mm": 1e3 * hold.depth_m,
+        "reference_n": float(np.mean([one.force_n for one in references])) if known else None,
         "wanted_n": float(np.mean([one.wanted_n for one in samples])),
-        "rendered_n": float(np.mean([one.rendered_n for one in samples])),
+        "felt_n": float(np.mean([one.felt_n for one in samples])),
         "error_percent": 100.0 * float(np.mean([one.error_ratio for one in samples])),
+        "model_error_percent": 100.0 * float(np.mean(models)) if known else None,
+        "reference_uncertainty_percent": 100.0
+        * float(np.mean([one.uncertainty_ratio for one in references]))
+        if known
+        else None,
+        "method": samples[-1].method,
         "normal_offset_mm": 1e3 * float(np.mean([one.normal_offset_m for one in samples])),
     }

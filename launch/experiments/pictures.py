@@ -126,17 +126,17 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Draw the object's and the rendered force over depth, one panel per position.
+    """Draw the object's and the felt force over depth, one panel per position.
 
     Bands show the just-noticeable difference (JND) of forces.
     """
-    positions = list(dict.fromkeys(row["place"] for row in result["rows"]))
+    positions = list(dict.fromkeys(row["at"] for row in result["rows"]))
     figure = Figure(figsize=(4.2 * len(positions), 4.4), layout="constrained")
     panels = figure.subplots(1, len(positions), squeeze=False, sharey=True)[0]
     jnd, bare_jnd = (0.01 * percent for percent in result["noticed_percent"])
     moving = result["moving"]["rows"]
     for panel, position in zip(panels, positions, strict=True):
-        rows = [row for row in result["rows"] if row["place"] == position]
+        rows = [row for row in result["rows"] if row["at"] == position]
         depths = np.array([0.0, *(row["depth_mm"] for row in rows)])
         forces = np.array([0.0, *(row["wanted_n"] for row in rows)])
         for ratio, alpha in ((bare_jnd, 0.12), (jnd, 0.18)):
@@ -153,14 +153,22 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
         if position == positions[0]:
             panel.plot(
                 [row["depth_mm"] for row in moving],
-                [row["rendered_n"] for row in moving],
+                [row["felt_n"] for row in moving],
                 ".",
                 color="0.5",
                 markersize=3,
-                label=f"rendered, moving at {result['moving']['speed_mm_per_s']:.0f} mm/s",
+                label=f"felt, moving at {result['moving']['speed_mm_per_s']:.0f} mm/s",
             )
-        rendered = [row["rendered_n"] for row in rows]
-        panel.plot(depths[1:], rendered, "o", color="C1", label="rendered, at rest")
+        judged = [row for row in rows if row["reference_n"] is not None]
+        panel.plot(
+            [row["depth_mm"] for row in judged],
+            [row["reference_n"] for row in judged],
+            "x",
+            color="0.2",
+            label="independent reference",
+        )
+        felt = [row["felt_n"] for row in rows]
+        panel.plot(depths[1:], felt, "o", color="C1", label="felt, at rest")
         panel.set_title(position)
         panel.set_xlabel("finger depth, mm")
         panel.grid(visible=True, alpha=0.2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene, require_material
+from flexsheet.messages.scene import Cylinder, Scene, require_material
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.fem_solver.closest_contact import (
     ContactAnchor,
@@ -26,6 +26,12 @@ from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
+
+QUICK_TABLE = "quick_table"
+"""Name of the method that uses the first table, of few snapshots."""
+LINEAR_ERROR_RATIO, QUICK_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO = 0.25, 0.1, 0.03, 0.15
+"""Stated relative errors of the force above a depth of 1 mm: of the linear method, of the quick
+table, and of the table with and without the correction by a fine push (docs/soft-body.md)."""
 
 
 def make_soft_body_spec(
@@ -70,7 +76,7 @@ class SceneBody:
     method: method that computes the response. front (3,): surface point nearest to the user, mesh
     frame. rest (s, 3): undeformed skin nodes, mesh frame. linear_depth_m: maximum depth of the
     linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; with
-    0 the finger slides without friction.
+    0 the finger slides without friction. force_error_ratio: stated relative error of the force.
     """
 
     method: SoftBodyMethod
@@ -82,6 +88,7 @@ class SceneBody:
     skin: Skin
     linear_depth_m: float
     friction_ratio: float
+    force_error_ratio: float
 
     def respond(
         self, point_world: Floats, anchor: ContactAnchor | None
@@ -188,21 +195,49 @@ def build_scene_body(
         skin=skin,
         linear_depth_m=linear_depth_m,
         friction_ratio=friction_ratio,
+        force_error_ratio=LINEAR_ERROR_RATIO,
     )
 
 
-def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table) -> SceneBody:
-    """Return a copy of the body that uses the nonlinear table as its method."""
+def attach_table(
+    body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table, *, quick: bool = False
+) -> SceneBody:
+    """Return a copy of the body that uses the nonlinear table as its method.
+
+    quick: whether the table is the first one, of few snapshots.
+    """
     method = TableSoftBody(
         model.response,
         model.response.rest[model.bounds],
         table,
+        name=QUICK_TABLE if quick else "nonlinear_table",
         young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         push_depth_m=scene.working_range.push_depth_m,
         linear_depth_m=body.linear_depth_m,
     )
-    return replace(body, method=method)
+    corrected = isinstance(body.spec.mesh.geometry, Cylinder)
+    error = QUICK_ERROR_RATIO if quick else TABLE_ERROR_RATIO if corrected else UNCORRECTED_RATIO
+    return replace(body, method=method, force_error_ratio=error)
+
+
+def blend_responses(old: Response, new: Response, weight: float) -> Response:
+    """Return the weighted mean of two responses; weight: that of the new one, 0 to 1.
+
+    The other fields and the depths of the force curve are those of the new one.
+    """
+    depths = new.force_curve[:, 0]
+    before = np.interp(depths, old.force_curve[:, 0], old.force_curve[:, 1])
+    curve = np.column_stack([depths, before + weight * (new.force_curve[:, 1] - before)])
+    part = np.float32(weight)
+    return replace(
+        new,
+        displacement=old.displacement + part * (new.displacement - old.displacement),
+        force_n=old.force_n + weight * (new.force_n - old.force_n),
+        stiffness_n_per_m=old.stiffness_n_per_m
+        + weight * (new.stiffness_n_per_m - old.stiffness_n_per_m),
+        force_curve=curve,
+    )
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:

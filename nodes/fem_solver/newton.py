@@ -230,14 +230,16 @@ class NeoHookeanBody:
         friction: Friction = "none",
         tolerance: float = TOLERANCE,
         min_step_fraction: float = MIN_STEP_FRACTION,
+        max_step_ratio: float = MAX_STEP_RATIO,
         factor_dtype: type[np.floating[Any]] = np.float64,
     ) -> None:
         """Prepare the solver.
 
         fixed (n,): whether each node is fixed. faces (f, 6): six-node triangles that the finger can
-        touch, outward. tolerance, min_step_fraction: see `TOLERANCE` and `MIN_STEP_FRACTION`.
-        factor_dtype: precision of the factors of the tangent stiffness; it affects only the search
-        direction. Raises the errors of `NeoHookeanSolid`.
+        touch, outward. tolerance, min_step_fraction, max_step_ratio: see `TOLERANCE`,
+        `MIN_STEP_FRACTION` and `MAX_STEP_RATIO`. factor_dtype: precision of the factors of the
+        tangent stiffness; it affects only the search direction. Raises the errors of
+        `NeoHookeanSolid`.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -247,6 +249,7 @@ class NeoHookeanBody:
         )
         self.fixed, self.friction = fixed, friction
         self.tolerance, self.min_step_fraction = tolerance, min_step_fraction
+        self.max_step_ratio = max_step_ratio
         self.factor_dtype = factor_dtype
         self._order = NestedDissection(nodes, elements, fixed)
         self._hull = boundary_faces(elements)[:, SUBTRIANGLES].reshape(-1, 3)
@@ -275,7 +278,7 @@ class NeoHookeanBody:
                 position = centre
             done, fraction = 0.0, 1.0
             start_position, path = position, centre - position
-            max_step_m = MAX_STEP_RATIO * self.obstacle.radius_m
+            max_step_m = self.max_step_ratio * self.obstacle.radius_m
             step_count = max(1, int(np.ceil(np.linalg.norm(path) / max_step_m)))
             while done < 1.0 - 1e-12 and not failed:
                 step = min(fraction / step_count, 1.0 - done)

@@ -24,11 +24,14 @@ from flexsheet.nodes.fem_solver.soft_body_factory import (
     SoftBodyFactory,
     choose_method,
 )
+from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.node import Input, Node, Output
 
 T = TypeVar("T")
 
 POLL_S = 0.05
+BLEND_S = 5.0
+"""Time in which the response changes from that of one method to that of a better one."""
 
 
 class FemSolver(Node):
@@ -55,12 +58,14 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = Event()
+        self._bodies: dict[str, body.SceneBody] = {}
         folder = self.parameters.cache_dir or cache.default_cache_dir()
         self._factory = SoftBodyFactory(
             SKIN_SPACING_M, folder, **self.parameters.model_dump(include=FACTORY_PARAMETERS)
         )
         self._table_task: asyncio.Task[None] | None = None
         self._eta = EtaEstimator()
+        self._replaced: list[tuple[body.SceneBody, int]] = []
         self._set_bodies([])
         self._reset_contact()
         self.note = "waiting for a scene"
@@ -73,13 +78,23 @@ class FemSolver(Node):
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
         """Set the soft bodies that compute responses, one per method, the best first.
 
-        The list is empty until a scene has arrived.
+        The list is empty until a scene has arrived. If the bodies replace others of the same scene,
+        the responses change gradually.
         """
+        if bodies and self._bodies:
+            self._replaced.append((self._bodies[self._fallback.name], self.clock.now_ns()))
+        else:
+            self._replaced = []
         self._bodies = {one.method.name: one for one in bodies}
         if bodies:
             self._fallback = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
-            nodes = len(bodies[0].skin.vertices_world_m)
-            self.note = f"soft body ready, {self._fallback.name}, {nodes} skin nodes"
+            self.note = f"soft body ready, {self._describe(bodies[0])}"
+
+    def _describe(self, current: body.SceneBody) -> str:
+        """Return the method that answers, with its stated error, for the node's status."""
+        nodes = len(current.skin.vertices_world_m)
+        percent = 100.0 * current.force_error_ratio
+        return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
 
     async def close(self) -> None:
         self._stop.set()
@@ -100,9 +115,8 @@ class FemSolver(Node):
             return
         p, factory = self.parameters, self._factory
         method, factory.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
-        choice = scene.methods.soft_body
-        if p.compute_table and method == "auto" and choice is not None:
-            method = choice.method
+        if p.compute_table and method == "auto":
+            method = "nonlinear_table"
         try:
             bodies = await run_unless_superseded(
                 partial(factory.bodies, scene, method),
@@ -124,11 +138,26 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background and use it when it is finished.
 
-        In the meantime, the linear method computes the responses.
+        In the meantime, the linear method computes the responses, and then a quick table.
         """
+        loop = asyncio.get_running_loop()
+        stop = self._stop
+
+        async def adopt(quick: body.SceneBody) -> None:
+            if not stop.is_set():
+                self._set_bodies([quick, linear])
+
+        def on_quick(quick: body.SceneBody) -> None:
+            asyncio.run_coroutine_threadsafe(adopt(quick), loop).result()
+
         try:
-            progress = partial(self._progress, self._stop)
-            best = await asyncio.to_thread(self._factory.build_table, scene, linear, progress)
+            best = await asyncio.to_thread(
+                self._factory.build_table,
+                scene,
+                linear,
+                partial(self._progress, stop),
+                on_quick,
+            )
         except precompute.Interrupted:
             self.note = "nonlinear table interrupted; the next start continues it"
         except Exception as error:
@@ -140,7 +169,8 @@ class FemSolver(Node):
         if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
-        self.note = f"precomputing the soft body: {eta} ({need.text()})"
+        now = "".join(f"; now {self._describe(one)}" for one in [*self._bodies.values()][:1])
+        self.note = f"precomputing the soft body: {eta} ({need.text()}){now}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:
@@ -149,13 +179,16 @@ class FemSolver(Node):
         if fingertip.valid:
             start_ns = self.clock.now_ns()
             point = body.predict_position(fingertip, self.parameters.prediction_horizon_s)
-            response, self._anchor = current.respond(point, self._anchor)
-            self._last, self._last_ns = response, header.source_ns
+            anchor = self._anchor
+            response, self._anchor = current.respond(point, anchor)
             if self._fallback.record((self.clock.now_ns() - start_ns) * 1e-9):
                 late = f", {current.method.name} was late" if self._fallback.is_fallback else ""
-                self.note = f"soft body by {self._fallback.name}{late}"
+                chosen = self._bodies[self._fallback.name]
+                self.note = f"soft body by {self._describe(chosen)}{late}"
+            response = self._blend_in(response, lambda old: old.respond(point, anchor)[0])
+            self._last, self._last_ns = response, header.source_ns
         elif self._last is None:
-            response = current.at_rest()
+            response = self._blend_in(current.at_rest(), body.SceneBody.at_rest)
         else:
             response = body.fade_response(
                 self._last,
@@ -165,6 +198,21 @@ class FemSolver(Node):
             )
         message = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
         self.soft_body.publish(message, source_ns=header.source_ns)
+
+    def _blend_in(
+        self, response: Response, respond: Callable[[body.SceneBody], Response]
+    ) -> Response:
+        """Return the response, blended with those of bodies that were replaced recently."""
+        now_ns = self.clock.now_ns()
+        fractions = [(now_ns - at_ns) / 1e9 / BLEND_S for _, at_ns in self._replaced]
+        while fractions and fractions[0] >= 1.0:
+            del self._replaced[0], fractions[0]
+        if not fractions:
+            return response
+        shown, *newer = [respond(replaced) for replaced, _ in self._replaced]
+        for fraction, one in zip(fractions, [*newer, response], strict=True):
+            shown = body.blend_responses(shown, one, smoothstep(fraction))
+        return shown
 
 
 async def run_unless_superseded(

@@ -16,8 +16,8 @@ class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
         description="Method that computes the deformation. auto: the method that the scene "
-        "specifies; otherwise the nonlinear table if it is cached, or linear. nonlinear_table: if "
-        "the table is not cached, it is computed in the background, which takes minutes.",
+        "specifies, or else nonlinear_table. nonlinear_table: if the table is not cached, it is "
+        "computed in the background: a quick one in about a minute, then the whole.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
@@ -25,9 +25,9 @@ class FemSolverParameters(NodeParameters):
         "the scene specifies, or 0.003.",
     )
     compute_table: bool = Field(
-        default=False,
-        description="Whether the nonlinear table is computed in the background if the scene "
-        "specifies it and it is not cached.",
+        default=True,
+        description="Whether a missing nonlinear table is computed in the background with the "
+        "method auto. false: the linear method is used until the table is in the cache.",
     )
     linear_depth_m: Positive = Field(
         default=0.006,

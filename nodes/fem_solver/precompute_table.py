@@ -10,7 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -39,7 +39,7 @@ from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolato
 from flexsheet.nodes.fem_solver.table import Table, fill_table, table_bytes
 from flexsheet.nodes.models.shapes import make_shape
 
-VERSION = 3
+VERSION = 4
 """Version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
 """Number of progress steps that a snapshot, and a node of the table, count for."""
@@ -155,19 +155,23 @@ def compute_table(
     progress: Progress,
     *,
     workers: int = 1,
+    on_quick: Callable[[Table], None] | None = None,
 ) -> Table:
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: how many workers of the executor run on this
-    machine. Raises MemoryError, before any snapshot is solved, if this machine has too little
-    memory for them, and the errors of `cached` and `solve_all`.
+    machine. on_quick: called with a first table of few snapshots (`snapshots.QUICK_COUNT`), which
+    is ready much earlier; None omits it. Raises MemoryError, before any snapshot is solved, if this
+    machine has too little memory for them, and the errors of `cached` and `solve_all`.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
     return cached(
         entry,
         cache_dir,
-        lambda: _compute_table(spec, model, checkpoints, executor, progress, workers=workers),
+        lambda: _compute_table(
+            spec, model, checkpoints, executor, progress, workers=workers, on_quick=on_quick
+        ),
     )
 
 
@@ -179,52 +183,82 @@ def _compute_table(
     progress: Progress,
     *,
     workers: int,
+    on_quick: Callable[[Table], None] | None,
 ) -> Table:
     mesh_spec, response = spec.body.mesh, model.response
     mesh = build_mesh(mesh_spec)
     mirrors = snapshots.find_mirror_planes(mesh)
-    samples = snapshots.choose_sample_points(mesh_spec, mesh, mirrors, spec.finger_radius_m)
+    user = np.array(mesh_spec.towards_user)
+    samples = snapshots.order_by_spread(
+        snapshots.choose_sample_points(mesh_spec, mesh, mirrors, spec.finger_radius_m),
+        mirrors,
+        user,
+    )
     table = table_bytes(len(response.contact_nodes), len(response.rest), len(snapshots.DEPTHS_M))
     need = TableBudget(
         len(samples), len(response.contact_nodes), 2 * table + workers * SNAPSHOT_BYTES
     )
-    total = SNAPSHOT_STEPS * len(samples) + NODE_STEPS * len(response.contact_nodes)
+    given = {"poisson_ratio": spec.body.poisson_ratio, "finger_radius_m": spec.finger_radius_m}
+    linear = unit_linear_body(
+        response,
+        make_shape(dict(mesh_spec.geometry)),
+        response.rest[model.bounds],
+        spec.finger_radius_m,
+    )
+    fine_job = snapshots.make_fine_job(mesh_spec, samples[0], **given)
+    fine_jobs = [] if fine_job is None else [fine_job]
+    stages: list[tuple[list[snapshots.SamplePoint], tuple[float, ...], str]] = [
+        (samples, snapshots.DEPTHS_M, "push")
+    ]
+    if on_quick is not None:
+        stages.insert(0, (samples[: snapshots.QUICK_COUNT], snapshots.QUICK_DEPTHS_M, "quick"))
+    pushes = len(fine_jobs) + sum(len(stage[0]) for stage in stages)
+    total = SNAPSHOT_STEPS * pushes + NODE_STEPS * len(stages) * len(response.contact_nodes)
     progress(0, total, need)
     precompute.require_memory(
         need.bytes,
         f"computing the nonlinear table of the soft body ({need.text()})",
         f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
     )
-    jobs = [
-        snapshots.make_snapshot_job(
-            mesh_spec,
-            mesh,
-            sample,
-            poisson_ratio=spec.body.poisson_ratio,
-            finger_radius_m=spec.finger_radius_m,
+    done = 0
+    fine: tuple[snapshots.SamplePoint, snapshots.Snapshot] | None = None
+
+    def report(steps: int) -> None:
+        progress(done + steps, total, need)
+
+    for some, depths_m, name in stages:
+        jobs = [
+            snapshots.make_snapshot_job(mesh_spec, mesh, sample, depths_m=depths_m, **given)
+            for sample in some
+        ]
+        solved = solve_all(
+            [*fine_jobs, *jobs],
+            executor,
+            checkpoints,
+            lambda count: report(SNAPSHOT_STEPS * count),
+            names=[
+                *("fine" for _ in fine_jobs),
+                *(f"{name}-{number:04d}" for number in range(len(jobs))),
+            ],
         )
-        for sample in samples
-    ]
-    solved = solve_all(
-        jobs, executor, checkpoints, lambda count: progress(SNAPSHOT_STEPS * count, total, need)
-    )
-    interpolator = SnapshotInterpolator(
-        place_snapshots(samples, solved, mirrors),
-        np.array(mesh_spec.towards_user),
-        spec.finger_radius_m,
-    )
-    return fill_table(
-        response,
-        model.triangles,
-        unit_linear_body(
+        done += SNAPSHOT_STEPS * len(solved)
+        if fine_jobs:
+            fine, fine_jobs = (samples[0], solved.pop(0)), []
+        interpolator = SnapshotInterpolator(
+            place_snapshots(some, solved, mirrors), user, spec.finger_radius_m
+        )
+        result = fill_table(
             response,
-            make_shape(dict(mesh_spec.geometry)),
-            response.rest[model.bounds],
-            spec.finger_radius_m,
-        ),
-        interpolator,
-        lambda done, _: progress(SNAPSHOT_STEPS * len(samples) + done, total, need),
-    )
+            model.triangles,
+            linear,
+            interpolator,
+            lambda node, _: report(node),
+            fine=fine,
+        )
+        done += NODE_STEPS * len(response.contact_nodes)
+        if name == "quick" and on_quick is not None:
+            on_quick(result)
+    return result
 
 
 def solve_all(
@@ -232,16 +266,19 @@ def solve_all(
     executor: Executor,
     checkpoints: CheckpointStore,
     on_progress: Callable[[int], None],
+    *,
+    names: Sequence[str] = (),
 ) -> list[snapshots.Snapshot]:
     """Return the snapshots of the jobs, loaded from `checkpoints` or solved and stored there.
 
     on_progress: called with the number of finished snapshots; it may raise an exception to cancel
-    the pending jobs. Raises LostWorkersError if the executor loses its workers, and the errors of
-    the jobs.
+    the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so on. Raises
+    LostWorkersError if the executor loses its workers, and the errors of the jobs.
     """
+    names = names or [f"push-{number:04d}" for number in range(len(jobs))]
     solved: dict[int, snapshots.Snapshot] = {}
     for number in range(len(jobs)):
-        part = checkpoints.load(f"push-{number:04d}")
+        part = checkpoints.load(names[number])
         if part is not None:
             solved[number] = snapshots.decode_snapshot(part)
     on_progress(len(solved))
@@ -263,7 +300,7 @@ def solve_all(
                         "lost; restart them and repeat the command, which continues from the "
                         "finished snapshots"
                     ) from error
-                checkpoints.save(f"push-{number:04d}", encode_fields(snapshot))
+                checkpoints.save(names[number], encode_fields(snapshot))
                 solved[number] = snapshot
             on_progress(len(solved))
     finally:

@@ -11,6 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ from flexsheet.nodes.methods import Progress
 
 Floats = NDArray[np.float64]
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,17 +184,19 @@ class LocalTable:
         _, first = np.unique(np.round(points, 7), axis=0, return_index=True)
         distances = np.linalg.norm(touchable[self._near][:, None] - points[None, first], axis=2)
         closest = np.argsort(distances, axis=1)[:, : NEIGHBOURS + 1]
-        self._samples = [samples[k] for k in np.unique(first[closest] // len(self._mirrors))]
-        self.jobs = [
-            snapshots.make_snapshot_job(
-                spec,
-                mesh,
-                one,
-                poisson_ratio=body.spec.poisson_ratio,
-                finger_radius_m=scene.finger.radius_m,
-            )
-            for one in self._samples
+        near = np.unique(first[closest] // len(self._mirrors))
+        # The forces of a table are corrected by a push at its first sample point.
+        corrected = snapshots.order_by_spread(samples, self._mirrors, np.array(spec.towards_user))[
+            0
         ]
+        self._samples = [corrected, *(samples[k] for k in near if samples[k] is not corrected)]
+        given: dict[str, Any] = {
+            "poisson_ratio": body.spec.poisson_ratio,
+            "finger_radius_m": scene.finger.radius_m,
+        }
+        self.jobs = [snapshots.make_snapshot_job(spec, mesh, one, **given) for one in self._samples]
+        fine_job = snapshots.make_fine_job(spec, corrected, **given)
+        self.jobs += [] if fine_job is None else [fine_job]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
         """Build the table from the snapshots of `jobs` and return the body with it."""
@@ -201,8 +204,10 @@ class LocalTable:
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius
         )
+        count = len(self._samples)
+        fine = (self._samples[0], solved[count]) if len(solved) > count else None
         interpolator = SnapshotInterpolator(
-            place_snapshots(self._samples, solved, self._mirrors),
+            place_snapshots(self._samples, solved[:count], self._mirrors),
             np.array(self._body.spec.mesh.towards_user),
             radius,
         )
@@ -211,7 +216,9 @@ class LocalTable:
             contact_nodes=response.contact_nodes[self._near],
             normals=response.normals[self._near],
         )
-        part = fill_table(near, self._model.triangles, linear, interpolator, lambda *_: None)
+        part = fill_table(
+            near, self._model.triangles, linear, interpolator, lambda *_: None, fine=fine
+        )
         count = len(response.contact_nodes)
         table = Table(
             depths_m=part.depths_m,

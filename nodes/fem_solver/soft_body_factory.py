@@ -17,6 +17,7 @@ from flexsheet.messages.methods import SoftBodyMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
+from flexsheet.nodes.fem_solver.table import Table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
 """Soft-body method, or `auto`: the nonlinear table if it is cached, otherwise linear."""
@@ -128,14 +129,23 @@ class SoftBodyFactory:
         )
 
     def build_table(
-        self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress
+        self,
+        scene: Scene,
+        linear: body.SceneBody,
+        progress: precompute_table.Progress,
+        on_quick: Callable[[body.SceneBody], None] | None = None,
     ) -> body.SceneBody:
         """Compute and cache the nonlinear table, and return the body that uses it.
 
-        linear: body with the linear method. Raises the errors of `compute_table` and
-        `connect_workers`.
+        linear: body with the linear method. on_quick: called with a body that uses a first table of
+        few snapshots; None omits it. Raises the errors of `compute_table` and `connect_workers`.
         """
         model = self._load_model(linear.spec, progress)
+
+        def adopt(table: Table) -> None:
+            assert on_quick is not None
+            on_quick(body.attach_table(linear, scene, model, table, quick=True))
+
         with self._executor() as (executor, workers):
             table = precompute_table.compute_table(
                 body.make_table_spec(scene, linear.spec),
@@ -144,6 +154,7 @@ class SoftBodyFactory:
                 executor,
                 progress,
                 workers=workers,
+                on_quick=None if on_quick is None else adopt,
             )
         return body.attach_table(linear, scene, model, table)
 

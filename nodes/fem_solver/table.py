@@ -35,7 +35,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     triangle_shape_functions_at,
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator
-from flexsheet.nodes.fem_solver.snapshots import SamplePoint
+from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SamplePoint, Snapshot
 from flexsheet.nodes.models.interpolation import smoothstep
 
 Floats = NDArray[np.float64]
@@ -55,6 +55,8 @@ FADE_RATIO = 2.0
 """Distance past the end of the touchable skin over which the displacement fades to zero, in finger
 radii."""
 CANDIDATE_FACES = 4
+MESH_ORDER = 2.0
+"""Order of convergence of the force with the element size."""
 Progress = Callable[[int, int], None]
 """Callback with the number of nodes done and their total."""
 
@@ -88,17 +90,23 @@ def fill_table(
     linear: LinearSoftBody,
     interpolator: SnapshotInterpolator,
     on_progress: Progress,
+    *,
+    fine: tuple[SamplePoint, Snapshot] | None = None,
 ) -> Table:
     """Compute the table of a body.
 
     triangles (t, 3): triangles of its skin. linear: linear method for the same response and a
     modulus of 1 Pa; its linear range must contain all blended depths. on_progress: called with the
-    number of nodes done and their total; it may raise an exception to stop.
+    number of nodes done and their total; it may raise an exception to stop. fine: push on a fine
+    mesh, by which all forces are corrected, see `compute_force_factors`.
     """
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
     points, normals = response.rest[response.contact_nodes], response.normals
     count = len(points)
 
+    factors = np.ones(len(depths))
+    if fine is not None:
+        factors = compute_force_factors(fine, response, linear, interpolator, depths)
     fields = np.empty((count, len(depths) - 1, response.rest.size), dtype=np.float32)
     force, reach = np.empty((count, len(depths), 3)), np.empty(count)
     for number in range(count):
@@ -106,11 +114,46 @@ def fill_table(
         moved, force[number], reach[number] = _fill_levels(
             sample, response, linear, interpolator, depths
         )
+        force[number] *= factors[:, None]
         fields[number] = moved[1:]
         sound = count_valid_levels(response.rest, moved.reshape(len(depths), -1, 3), triangles)
         reach[number] = min(reach[number], float(depths[sound - 1]))
         on_progress(number + 1, count)
     return Table(depths, fields, force, reach)
+
+
+def compute_force_factors(
+    fine: tuple[SamplePoint, Snapshot],
+    response: SkinResponse,
+    linear: LinearSoftBody,
+    interpolator: SnapshotInterpolator,
+    depths: Floats,
+) -> Floats:
+    """Return the factors (L,) that correct the table's forces at its depths (L,).
+
+    The table's meshes are too coarse for small contacts, so that its forces are too large. The
+    excess depends mainly on the depth: contact and mesh are similar everywhere. Each factor is the
+    true force, divided by the table's own force at the same point. The true force is extrapolated
+    from the meshes of the table and of the fine push (Richardson, order 2); where the table blends
+    with the linear method, it is that of the fine push. Beyond the depths of the fine push, the
+    factor is constant.
+    """
+    sample, push = fine
+    solved_m = push.depths_m[: push.reached]
+    factors = np.ones(len(depths))
+    if not len(solved_m):
+        return factors
+    _, force, _ = _fill_levels(sample, response, linear, interpolator, depths)
+    coarse_n, fine_n = force @ sample.normal, push.force_n[: push.reached] @ sample.normal
+    within = (depths > 0.0) & (depths <= solved_m[-1] * (1.0 + 1e-9))
+    # Hertz: the force over depth^1.5 hardly changes, so that it is interpolated most precisely.
+    hertz = np.interp(depths[within], solved_m, fine_n / solved_m**1.5)
+    true_n = hertz * depths[within] ** 1.5
+    excess_n = np.where(depths[within] >= BLEND_M[1], coarse_n[within] - true_n, 0.0)
+    true_n -= excess_n / (FINE_RATIO**-MESH_ORDER - 1.0)
+    factors[within] = true_n / coarse_n[within]
+    factors[depths > solved_m[-1] * (1.0 + 1e-9)] = factors[within][-1] if within.any() else 1.0
+    return factors
 
 
 def _fill_levels(
@@ -217,14 +260,13 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 class TableSoftBody:
     """Soft-body method (`SoftBodyMethod`) that interpolates in a nonlinear table."""
 
-    name = "nonlinear_table"
-
     def __init__(
         self,
         response: SkinResponse,
         bounds: Floats,
         table: Table,
         *,
+        name: str = "nonlinear_table",
         young_modulus_pa: float,
         finger_radius_m: float,
         push_depth_m: float,
@@ -235,6 +277,7 @@ class TableSoftBody:
         bounds (b, 3): positions of skin nodes that must not be touched. push_depth_m: depth at
         which the force curve ends. linear_depth_m: depth at which the stiffness is evaluated.
         """
+        self.name = name
         from scipy.linalg.blas import sgemv
         from scipy.spatial import cKDTree
 

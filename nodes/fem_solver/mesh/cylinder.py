@@ -44,12 +44,13 @@ class Focus:
     """Point on the curved side around which the mesh is fine.
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
-    have the requested size.
+    have the requested size. growth: increase of the size beyond; None for `FOCUS_GROWTH`.
     """
 
     x_m: float
     angle_rad: float
     near_m: float
+    growth: float | None = None
 
 
 def cylinder_mesh(
@@ -128,7 +129,8 @@ class _Sizes:
         return self._sizes_at_distance(np.abs(x - self.focus.x_m), self.focus)
 
     def _sizes_at_distance(self, distance_m: Floats, focus: Focus) -> Floats:
-        grown = self.element_m + FOCUS_GROWTH * np.maximum(distance_m - focus.near_m, 0.0)
+        growth = FOCUS_GROWTH if focus.growth is None else focus.growth
+        grown = self.element_m + growth * np.maximum(distance_m - focus.near_m, 0.0)
         result: Floats = np.minimum(grown, max(MAX_SIZE_RATIO * self.radius_m, self.element_m))
         return result
 

@@ -1,0 +1,114 @@
+"""Test the parts of the soft body's quick start: order of pushes, force correction, transitions."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flexsheet.nodes.fem_solver.body import blend_responses
+from flexsheet.nodes.fem_solver.contact import Response
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.snapshots import (
+    FINE_RATIO,
+    QUICK_COUNT,
+    SamplePoint,
+    Snapshot,
+    choose_sample_points,
+    find_mirror_planes,
+    make_fine_job,
+    make_snapshot_job,
+    order_by_spread,
+)
+from flexsheet.nodes.fem_solver.table import compute_force_factors
+from tests.soft_bodies import cylinder_spec
+
+Floats = NDArray[np.float64]
+FINGER = 0.007
+MESH = cylinder_spec(0.03, 0.1, touch_angle_rad=1.4, skin_spacing_m=0.007).mesh
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_the_first_pushes_cover_the_touchable_skin() -> None:
+    solid = build_mesh(MESH)
+    mirrors = find_mirror_planes(solid)
+    samples = choose_sample_points(MESH, solid, mirrors, FINGER)
+    ordered = order_by_spread(samples, mirrors, UP)
+    assert sorted(map(id, ordered)) == sorted(map(id, samples))
+    assert ordered[0].point == pytest.approx([0.0, 0.0, 0.03])
+    points = np.array([one.point for one in samples])
+
+    def gap(chosen: list[SamplePoint]) -> float:
+        images = [one.point * signs for one in chosen for signs in mirrors]
+        away = np.linalg.norm(points[:, None] - np.array(images), axis=2)
+        return float(away.min(axis=1).max())
+
+    assert gap(ordered[:QUICK_COUNT]) < 0.7 * gap(samples[:QUICK_COUNT])
+
+
+def test_the_fine_push_has_smaller_elements_at_the_same_point() -> None:
+    solid = build_mesh(MESH)
+    sample = SamplePoint(0.03 * UP, UP)
+    given: dict[str, Any] = {"poisson_ratio": 0.45, "finger_radius_m": FINGER}
+    fine = make_fine_job(MESH, sample, **given)
+    assert fine is not None
+    usual = make_snapshot_job(MESH, solid, sample, **given)
+
+    def spacing(job: Any) -> float:
+        away = np.sort(np.linalg.norm(job.nodes[np.unique(job.faces)] - sample.point, axis=1))
+        return float(away[1])
+
+    assert spacing(fine) < 1.2 * FINE_RATIO * spacing(usual)
+
+
+def test_forces_are_corrected_to_those_of_an_infinitely_fine_mesh() -> None:
+    """The table's excess is 12 % in proportion to the square of the element size."""
+    depths = np.array([0.0, 0.0007, 0.0015, 0.005, 0.010, 0.020])
+    exact = 1e-3 * (depths / 0.01) ** 1.5
+    sample = SamplePoint(0.03 * UP, UP)
+    snapshots = exact[2:, None] * UP * 1.12
+    interpolator = SimpleNamespace(
+        interpolate=lambda sample, rest: (np.zeros((4, 1, 3), dtype=np.float32), snapshots, 4.0)
+    )
+    linear = SimpleNamespace(
+        respond=lambda query: SimpleNamespace(
+            displacement=np.zeros((1, 3), dtype=np.float32), force_n=1.3 * exact[1] * UP
+        )
+    )
+    solved = np.array([0.0007, 0.0015, 0.005, 0.010])
+    excess = np.where(solved < 0.001, 0.0, 0.12 * FINE_RATIO**2)
+    push = Snapshot(
+        rest=np.zeros((1, 3)),
+        faces=np.zeros((0, 6), dtype=np.int64),
+        depths_m=solved,
+        moved=np.zeros((4, 1, 3), dtype=np.float32),
+        force_n=(1.0 + excess)[:, None] * exact[1:5, None] * UP,
+        reached=4,
+    )
+    response = SimpleNamespace(rest=np.zeros((1, 3)))
+    factors = compute_force_factors(
+        (sample, push), cast(Any, response), cast(Any, linear), cast(Any, interpolator), depths
+    )
+    assert factors == pytest.approx([1.0, 1 / 1.3, 1 / 1.12, 1 / 1.12, 1 / 1.12, 1 / 1.12])
+
+
+def response(force: float, stiffness: float, depths: Floats) -> Response:
+    curve = np.column_stack([depths, force * depths])
+    moved = np.full((2, 3), force, dtype=np.float32)
+    return Response(moved, np.array([0.0, 0.0, force]), stiffness, curve, 0.004, True)
+
+
+def test_a_transition_has_no_step_in_force_or_shape() -> None:
+    old = response(1.0, 10.0, np.linspace(0.0, 0.01, 5))
+    new = response(2.0, 30.0, np.linspace(0.0, 0.01, 9))
+    start, half, end = (blend_responses(old, new, weight) for weight in (0.0, 0.5, 1.0))
+    assert (start.displacement == old.displacement).all()
+    assert (start.force_n == old.force_n).all()
+    assert start.force_curve[:, 1] == pytest.approx(new.force_curve[:, 0])
+    assert half.force_n == pytest.approx([0.0, 0.0, 1.5])
+    assert half.stiffness_n_per_m == pytest.approx(20.0)
+    assert half.displacement == pytest.approx(1.5)
+    assert end.force_curve == pytest.approx(new.force_curve)
