@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.jnd import (
     COLUMNS,
     INCREMENTS,
@@ -26,10 +29,17 @@ from flexsheet.launch.experiments.jnd import (
 )
 from flexsheet.launch.experiments.jnd_operator import PairPresenter, replace_modulus
 from flexsheet.launch.experiments.simulated_participant import Perception, SimulatedParticipant
-from flexsheet.messages.base import Message
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.runs import Run
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.launch.running.tools import read_topic
+from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Force
+from flexsheet.messages.types import Force, Skin
+from tests.arm_states import arm_state
+from tests.test_compliance_controller import soft_body
 from tests.test_planner import SCENE
+from tests.waiting import DEADLINE_S
 
 PLAN = SessionPlan("k7x2", seed=3, trials=30, reference_pa=2000.0, scene="abc")
 
@@ -243,3 +253,67 @@ def test_wrong_options_are_refused(tmp_path: Path, options: list[str], text: str
 
 def test_the_increments_stay_within_twice_the_reference() -> None:
     assert math.isclose(float(INCREMENTS[-1]), 1.0)
+
+
+async def test_the_scene_of_a_running_graph_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The paths of sockets must be short.
+    folder = tempfile.mkdtemp(prefix="fs-", dir="/tmp")
+    monkeypatch.setenv("FLEXSHEET_RUNS", folder)
+    file = tmp_path / "graph.yaml"
+    file.write_text("scene: cylinder\nnodes:\n  beacon: {type: 'tests.launch_nodes:Beacon'}\n")
+    async with RunningGraph(load_graph(file)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        scenes = read_topic(graph, "scene")
+        first, first_header = await anext(scenes)
+        changed = replace_modulus(SCENE, 1234.0)
+        source_ns = graph.publish_scene(changed)
+        second, header = await anext(scenes)
+        await scenes.aclose()
+        late, _ = await anext(read_topic(graph, "scene", 1))
+    assert isinstance(first, Scene)
+    assert first.object.material == SCENE.object.material
+    assert (header.sequence, header.source_ns) == (first_header.sequence + 1, source_ns)
+    for scene in (second, late):
+        assert isinstance(scene, Scene)
+        assert scene.object.material == changed.object.material
+    shutil.rmtree(folder)
+
+
+async def test_a_changed_scene_counts_when_its_soft_body_answers() -> None:
+    published: list[Scene] = []
+
+    def publish(scene: Scene) -> int:
+        published.append(scene)
+        return 5_000
+
+    plan = load_graph(Path(__file__).parent.parent / "launch" / "demo.yaml")
+    driver = Driver(plan, Run("unused", Path("unused")), publish_scene=publish)
+
+    def receive(topic: str, message: Message, source_ns: int) -> None:
+        driver._make_handler(topic)(message, Header(1, source_ns, source_ns, "clock", "n", 1))
+
+    for side in ("left", "right"):
+        receive(f"arm_{side}", arm_state(side), 1)
+    body = soft_body()
+    receive("soft_body", body, 2)
+    change = asyncio.create_task(driver.change_scene(SCENE))
+    await asyncio.sleep(0)
+    skin = Skin(
+        mesh_id="m",
+        vertices_world_m=np.zeros((0, 3), np.float32),
+        triangles=np.zeros((0, 3), np.int32),
+    )
+    receive("skin", skin, 4_999)
+    receive("soft_body", body, 4_999)
+    await asyncio.sleep(0)
+    assert not change.done()
+    receive("skin", skin, 5_000)
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert not change.done()
+    receive("soft_body", body, 5_001)
+    async with asyncio.timeout(DEADLINE_S):
+        await change
+    assert published == [SCENE]
