@@ -21,6 +21,7 @@ from flexsheet.nodes.models.sheet import corners
 from flexsheet.nodes.renderer.check_marks import FINGER_STEP_M, CheckMarks, place_marks
 from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, deflected_mesh
+from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.membrane import solve
@@ -193,3 +194,25 @@ def test_marks_are_drawn_on_whole_pixels_at_half_resolution() -> None:
     _, marks = believe((0.0, 0.0, 0.0), None)
     assert marks.side_px % 2 == 0
     assert not (marks.corners_px % 2).any()
+
+
+def test_another_bright_point_and_a_mark_beside_the_sheet_are_ignored() -> None:
+    check = ProjectionCheck(PROJECTOR)
+    world = np.array([(x, y, 0.0) for x, y in PLACES])
+    world[-1] = np.nan
+    points = [*world[:-1]]
+    points[0] = points[0] + [0.008, 0.0, 0.0]
+    for number in range(60):
+        light_ns = 1 + round(1e9 * FRAME_S * number)
+        check.on_frame(
+            Frame.model_construct(
+                light_ns=light_ns,
+                world_from_sheet=np.eye(4),
+                marks_world_m=world,
+                marks_finger_ratio=np.zeros(len(world)),
+            )
+        )
+        check.on_points(points, np.zeros(3), light_ns + 1)
+    results = check.results(camera_checked=True)
+    assert set(results) == {"projector_moved", "arm_base_moved"}
+    assert results["projector_moved"].value == pytest.approx(0.0, abs=1e-9)

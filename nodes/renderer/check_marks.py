@@ -44,7 +44,7 @@ class CheckMarks:
 
     @property
     def centres_px(self) -> Floats:
-        return self.corners_px + 0.5 * (self.side_px - 1)
+        return np.asarray(self.corners_px + 0.5 * (self.side_px - 1), dtype=np.float64)
 
 
 NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(0))
@@ -68,7 +68,8 @@ def place_marks(
     half = 0.5 * (side_px - 1)
     pixels = camera.project(local, matrix, distortion)
     corners = 2 * np.rint(0.5 * (pixels - half)).astype(np.int64)
-    slopes = camera.normalize(corners + half, matrix, distortion)
+    centres = np.asarray(corners + half, dtype=np.float64)
+    slopes = camera.normalize(centres, matrix, distortion)
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ world_from_projector[:3, :3].T
     triangles, weights = intersect(world_from_projector[:3, 3], rays, mesh.vertices[mesh.triangles])
     surface = mesh.vertices[mesh.triangles[triangles]]

@@ -44,6 +44,9 @@ the deviation."""
 MATCH_RADIUS_M = 0.012
 """Maximum distance of a detected point from the expected position of a mark."""
 
+MAX_SPREAD_M = 0.004
+"""Maximum deviation of a mark from the median of all, beyond which it is another bright point."""
+
 MAX_AGE_NS = 2_000_000_000
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """Speed of the marks on the sheet up to which positions, and from which the latency is checked."""
@@ -105,8 +108,9 @@ class ProjectionCheck:
         rays = expected - self._projector_m
         rays /= np.linalg.norm(rays, axis=1)[:, None]
         aside = offset - (offset * rays).sum(axis=1)[:, None] * rays
+        found &= np.linalg.norm(aside - np.median(aside[found], axis=0), axis=1) <= MAX_SPREAD_M
         velocity = self._velocity(shown[-1])
-        if velocity is None:
+        if velocity is None or found.sum() < 2:
             return
         speed = float(np.linalg.norm(velocity))
         if speed <= STILL_M_PER_S:
@@ -126,10 +130,11 @@ class ProjectionCheck:
             return None
         (before_ns, before, *_), (now_ns, now, *_) = self._frames[number - 1], self._frames[number]
         step_s = (now_ns - before_ns) * 1e-9
-        if step_s <= 0.0 or not np.isfinite(now - before).all():
+        on_sheet = np.isfinite(now - before).all(axis=1)
+        if step_s <= 0.0 or not on_sheet.any():
             return None
-        velocity = (now - before).mean(axis=0) / step_s
-        ray = now.mean(axis=0) - self._projector_m
+        velocity = (now - before)[on_sheet].mean(axis=0) / step_s
+        ray = now[on_sheet].mean(axis=0) - self._projector_m
         ray /= np.linalg.norm(ray)
         return np.asarray(velocity - (velocity @ ray) * ray)
 
@@ -158,33 +163,30 @@ class ProjectionCheck:
             cause: SuspectedCause = (
                 "projector_moved" if camera_checked else "camera_or_projector_moved"
             )
-            found[cause] = _make_check(cause, "m", ray, suspected=ray.suspected and not is_camera)
+            found[cause] = _make_check(cause, ray, suspected=ray.suspected and not is_camera)
         if surface.has_data:
             cause = "arm_base_moved" if camera_checked else "camera_or_arm_base_moved"
             found[cause] = _make_check(
-                cause, "m", surface, suspected=surface.suspected and not is_camera
+                cause, surface, suspected=surface.suspected and not is_camera
             )
         if is_camera:
-            found["camera_moved"] = _make_check("camera_moved", "m", ray, suspected=True)
+            found["camera_moved"] = _make_check("camera_moved", ray, suspected=True)
         if self._finger.has_data:
             found["marker_offset"] = _make_check(
-                "marker_offset", "m", self._finger, suspected=self._finger.suspected
+                "marker_offset", self._finger, suspected=self._finger.suspected
             )
         if self._latency.has_data:
-            # Images that appear too early are within the period for which a frame is shown.
             found["display_latency"] = _make_check(
-                "display_latency", "s", self._latency, suspected=self._latency.suspected
+                "display_latency", self._latency, suspected=self._latency.suspected
             )
         return found
 
 
-def _make_check(
-    cause: SuspectedCause, unit: str, monitor: ResidualMonitor, *, suspected: bool
-) -> SelfCheck:
+def _make_check(cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool) -> SelfCheck:
     return SelfCheck(
         cause=cause,
-        unit=unit,
-        value=monitor.deviation if unit == "m" else float(monitor.mean[0]),
+        unit="s" if cause == "display_latency" else "m",
+        value=float(monitor.mean[0]) if cause == "display_latency" else monitor.deviation,
         expected=0.0,
         threshold=monitor.threshold,
         suspected=suspected,
