@@ -42,7 +42,7 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, meas
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
-from flexsheet.nodes.twin.force_history import ForceHistory, apply_history
+from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.membrane import NotConvergedError, solve
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
@@ -61,10 +61,6 @@ STROKE_RATIOS = (0.0, 0.5, 1.0)
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
 """Depths of the pushes whose forces are compared. They are limited to half and to all of the push
 depth of the scene."""
-
-MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
-which the finger reverses, to the evaluated force."""
 
 MIN_FORCE_N = 0.1
 """Minimum denominator of relative force errors. Relative errors of smaller forces are not felt."""
@@ -494,20 +490,6 @@ class OfflineEvaluator:
         points = np.full((size, size, 3), np.nan)
         points[hit] = rays.origin + directions[hit] / hits.inverse_range[hit][:, None]
         return (rays.origin + directions)[..., :2], points
-
-
-def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the rubber's force to that of an elastic sheet, for in and out.
-
-    The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
-    """
-    history = ForceHistory.of(apparatus)
-    if history is None:
-        return np.ones(2)
-    elastic = np.concatenate([np.linspace(0.0, TURNING_RATIO, 51), np.linspace(1.0, 0.0, 41)])
-    times_s = MOVING_IN_S * np.concatenate([elastic[:51], 2.0 * TURNING_RATIO - elastic[51:]])
-    forces = apply_history(history, times_s, elastic)
-    return np.array([np.interp(1.0, elastic[:51], forces[:51]), forces[51]])
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:

@@ -69,18 +69,23 @@ class ArmPair:
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
         self._guesses = [START_GUESS_RAD, START_GUESS_RAD]
 
+    def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+        """Return the joint angles (6,) of both arms, rad, for commanded poses `edges` (4, 4)."""
+        for side, edge in enumerate(edges):
+            self._guesses[side] = self._believed[side].solve_joints(edge, self._guesses[side])
+        return self._guesses[0], self._guesses[1]
+
     def hold(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
 
         The pull of the sheet displaces the flanges. Backlash and servo lag are not included.
         """
-        flanges = []
-        for side, edge in enumerate(edges):
-            joints_rad = self._believed[side].solve_joints(edge, self._guesses[side])
-            self._guesses[side] = joints_rad
-            true_rad = joints_rad + self._offsets_rad[side]
-            flanges.append(self._true[side].world_from_base @ forward(true_rad))
-        left, right = flanges
+        left, right = (
+            arm.world_from_base @ forward(joints_rad + offsets_rad)
+            for arm, joints_rad, offsets_rad in zip(
+                self._true, self.solve_joints(edges), self._offsets_rad, strict=True
+            )
+        )
         clamps = [arm.flange_from_edge for arm in self._true]
         if self._pull is not None:
             left, right = self._pull.displace(left, right, clamps[0], clamps[1])
