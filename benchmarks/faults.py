@@ -272,7 +272,12 @@ def table(cases: list[dict[str, Any]]) -> str:
 async def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--only", default="", metavar="WORD", help="part of the faults' names")
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="WORD",
+        help="part of the names of the faults or, with --random, of the kinds of faults",
+    )
     parser.add_argument("--light", action="store_true", help="without soft body and renderer")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges, s")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges, s")

@@ -26,7 +26,7 @@ import signal
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -88,9 +88,11 @@ class Fault:
         return f"{what}, {self.node}" if self.node else what
 
 
-def draw_fault(rng: random.Random, nodes: dict[str, list[str]]) -> Fault:
+def draw_fault(
+    rng: random.Random, nodes: dict[str, list[str]], kinds: Sequence[FaultKind] = tuple(FaultKind)
+) -> Fault:
     """Draw a fault; nodes: names by host."""
-    kind = rng.choice(list(FaultKind))
+    kind = rng.choice(kinds)
     host = "main" if kind is FaultKind.DISK_FULL else rng.choice(HOSTS)
     of_a_node = kind in (FaultKind.NODE_KILLED, FaultKind.NODE_SUSPENDED)
     node = rng.choice(nodes[host]) if of_a_node else None
@@ -248,6 +250,16 @@ def missing_outside_faults(lost: list[Gap], results: list[Result]) -> list[Gap]:
     ]
 
 
+def missing_by_fault(lost: list[Gap], results: list[Result]) -> dict[str, float]:
+    """Return the longest gap in the main host's bag after each fault, s, the longest first."""
+    longest: dict[str, float] = {}
+    for gap in lost:
+        earlier = [one for one in results if one.during_ns[0] - MARGIN_NS <= gap.from_ns]
+        name = max(earlier, key=lambda one: one.during_ns[0]).trouble if earlier else "start"
+        longest[name] = max(longest.get(name, 0.0), gap.seconds)
+    return dict(sorted(longest.items(), key=lambda item: -item[1]))
+
+
 def moves_under_estop(arm: Arm) -> float:
     """Return the maximum rotation of a joint, rad, while the bridge reported an e-stop."""
     spans = [(begin + STOPPED_NS, end) for begin, end in arm.spans("estop")]
@@ -269,6 +281,7 @@ async def restore(lab: Lab) -> None:
 async def run_random(given: argparse.Namespace) -> int:
     """Draw faults for `given.minutes` and print a report; return 1 if there are violations."""
     rng = random.Random(given.seed)
+    kinds = [kind for kind in FaultKind if given.only in kind.value]
     load = os.getloadavg()
     results: list[Result] = []
     counts: dict[str, int] = defaultdict(int)
@@ -285,7 +298,7 @@ async def run_random(given: argparse.Namespace) -> int:
         end_s = time.monotonic() + 60.0 * given.minutes
         while time.monotonic() < end_s:
             next_s = time.monotonic() + given.every
-            fault = draw_fault(rng, nodes)
+            fault = draw_fault(rng, nodes, kinds)
             result = await attempt(lab, fault)
             results.append(result)
             counts[fault.kind.value] += 1
@@ -356,6 +369,7 @@ def evaluate(lab: Lab, results: list[Result], watch: ProcessMonitor) -> dict[str
         "stopped_s": percentiles(stopped),
         "back_s": percentiles(back),
         "missing_s": percentiles([gap.seconds for gap in lost]),
+        "missing_by_fault": missing_by_fault(lost, results),
         "longest_sheet_mm": 1e3 * longest_m,
         "largest_joint_speed_ratio": max(speeds),
         "violations": violations,

@@ -44,6 +44,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "calibrate": (
         "calibrate",
         "calibrate_arms",
+        "calibrate_edges",
         "calibrate_marker",
         "calibrate_projector",
         "calibrate_sheet",

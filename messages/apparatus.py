@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.scene import (
     Arms,
+    ArmSpec,
     Eyes,
     Finger,
     Finite,
@@ -27,17 +28,15 @@ from flexsheet.messages.scene import (
     Projector,
     Scene,
     SheetSpec,
+    Small,
+    SmallSix,
     StereoCamera,
 )
 
 Pair = tuple[Finite, Finite]
 Triple = tuple[Finite, Finite, Finite]
 Share = Annotated[float, Field(ge=0, lt=1)]
-Small = Annotated[float, Field(ge=-0.5, le=0.5)]
-"""Relative deviation or small angle; a value outside this range indicates a mistake in the file."""
-
 SmallTriple = tuple[Small, Small, Small]
-SmallSix = tuple[Small, Small, Small, Small, Small, Small]
 NearOne = Annotated[float, Field(ge=0.5, le=2.0)]
 
 ZERO_3 = (0.0, 0.0, 0.0)
@@ -119,6 +118,14 @@ class ArmTruth(Part):
     backlash_rad: Annotated[float, Field(ge=0, le=0.1)] | None = Field(
         default=None, description="backlash of each joint's gear; null: the simulator's parameter"
     )
+
+    @classmethod
+    def of(cls, arm: ArmSpec) -> Self:
+        """Return an arm without deviations from the scene's arm."""
+        return cls(
+            joint_offsets_rad=arm.joint_offsets_rad,
+            flange_compliance_m_per_n=arm.flange_compliance_m_per_n,
+        )
 
 
 class ArmsTruth(Part):
@@ -293,4 +300,5 @@ def nominal_apparatus(scene: Scene) -> Apparatus:
         scene_id=identify_scene(scene),
         origin="nominal",
         nominal=devices_of(scene),
+        arms=ArmsTruth(left=ArmTruth.of(scene.arms.left), right=ArmTruth.of(scene.arms.right)),
     )

@@ -22,6 +22,10 @@ from flexsheet.messages.methods import Methods
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Small = Annotated[float, Field(ge=-0.5, le=0.5)]
+"""Relative deviation or small angle; a value outside this range indicates a mistake in the file."""
+
+SmallSix = tuple[Small, Small, Small, Small, Small, Small]
 
 
 class Part(MessagePart, LimitedModel):
@@ -282,6 +286,15 @@ class ArmSpec(Part):
     world_from_base: Pose
     flange_from_edge: Pose = Field(
         description="pose of the clamped edge's centre in the flange frame; axes as the sheet frame"
+    )
+    joint_offsets_rad: SmallSix = Field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        description="true joint angles minus the angles that the encoders report",
+    )
+    flange_compliance_m_per_n: Annotated[float, Field(ge=0, le=1e-2)] = Field(
+        default=0.0,
+        description="displacement of the flange per newton of the sheet's tension, for which the "
+        "arm's commands are corrected",
     )
 
 

@@ -19,10 +19,8 @@ from flexsheet.launch.calibration.commission import (
     StepName,
     StepResult,
 )
-from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
-from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
 from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
 from flexsheet.launch.commands.calibrate_marker import make_calibration as fit_marker
@@ -32,14 +30,12 @@ from flexsheet.launch.commands.commission_steps import (
     INSTRUCTIONS,
     Laboratory,
     open_laboratory,
-    read_joints,
 )
 from flexsheet.launch.experiments.trial import run_robustness_trial
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
 from flexsheet.messages.calibration import load_calibration
-from flexsheet.nodes.arm_bridge.kinematics import forward
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -253,55 +249,6 @@ def test_light_meets_a_bent_sheet_where_it_is() -> None:
     assert found[1][both] == pytest.approx(expected[1][both], abs=0.02)
 
 
-# The edges of the sheet
-
-
-def observe_sheet(given: Apparatus, poses: int = 5) -> tuple[list[Any], list[Floats]]:
-    """Return the edges that the scene predicts, and noisy points of the true sheet."""
-    random, sheet = np.random.default_rng(7), SimulatedSheet(SCENE, given)
-    edges, points = [], []
-    for pose in twin_projector.sheet_poses(poses):
-        joints, _, surface = sheet.hold(pose, 1.05 * SCENE.sheet.width_m)
-        edges.append(
-            tuple(
-                matrix(arm.world_from_base) @ forward(one) @ matrix(arm.flange_from_edge)
-                for arm, one in zip((SCENE.arms.left, SCENE.arms.right), joints, strict=True)
-            )
-        )
-        points.append(surface + random.normal(0.0, 5e-5, surface.shape))
-    return edges, points
-
-
-def test_the_edges_are_found_from_points_of_the_true_sheet() -> None:
-    in_flange = matrix(SCENE.arms.left.flange_from_edge)[:3, :3]
-    given = changed(
-        "arms",
-        left={
-            "edge_position_offset_m": (in_flange @ [0.0, 0.0, 6e-4]).tolist(),
-            "edge_rotation_offset_rad": (in_flange @ [2e-3, 0.0, 0.0]).tolist(),
-        },
-    )
-    edges, points = observe_sheet(given)
-    fit = fit_edges(edges, points, SCENE.sheet)
-    found = np.array([*fit.shifts_m, *fit.rotations_rad])
-    # The sags of the membrane and of the parabola differ by some hundredths of a millimetre.
-    model = np.array([3e-5, 3e-5, 3e-4, 3e-4])
-    error = np.abs(found - [6e-4, 0.0, 2e-3, 0.0])
-    assert (error < 3.0 * np.array(fit.standard_deviations) + model).all()
-    assert fit.held_out_rms_m < 0.3 * fit.before_rms_m
-    assert fit.corrections[0][2, 3] == fit.shifts_m[0]
-
-
-def test_points_of_other_arms_or_too_few_poses_are_refused() -> None:
-    flat = np.column_stack([*np.random.default_rng(1).uniform(-0.1, 0.1, (2, 60)), np.zeros(60)])
-    pair = tuple(transform(np.eye(3), [side * 0.126, 0.0, 0.0]) for side in (-1.0, 1.0))
-    with pytest.raises(EdgeFitError, match="2 poses with 60, 60 points; at least 3 poses"):
-        fit_edges([pair, pair], [flat, flat], SCENE.sheet)
-    shifted = [flat + np.array([0.0, 0.0, z]) for z in (-0.01, 0.0, 0.01)]
-    with pytest.raises(EdgeFitError, match="mm rms from the sheet between the arms"):
-        fit_edges([pair] * 3, shifted, SCENE.sheet)
-
-
 # State, order and results
 
 
@@ -345,7 +292,7 @@ def test_a_commissioning_resumes_and_a_repeated_step_invalidates_later_ones(
 
     lab.run(StepName.CAMERA, step)
     lab.skip(StepName.ARMS, "the arms come next week")
-    lab.run(StepName.SHEET, lambda _: result())
+    lab.run(StepName.EDGES, lambda _: result())
     again = open_lab(tmp_path)
     assert again.pending() == list(StepName)[3:]
     assert again.state == lab.state
@@ -406,25 +353,6 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, wor
         open_lab(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("left_j1_rad\n0.1\n", "row 2, column left_j2_rad: expected a number, found None"),
-        (
-            ",".join(f"{side}_j{n}_rad" for side in ("left", "right") for n in range(1, 7))
-            + "\n"
-            + ",".join(["0.1"] * 11 + ["nan"]),
-            "row 2, column right_j6_rad: expected a number, found 'nan'",
-        ),
-    ],
-)
-def test_bad_joint_angles_are_refused(tmp_path: Path, text: str, words: str) -> None:
-    file = tmp_path / "joints.csv"
-    file.write_text(text)
-    with pytest.raises(CommissionError, match=words):
-        read_joints(file)
-
-
 def test_an_unknown_apparatus_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not a random sample"):
         open_laboratory(tmp_path / "lab", DEMO, None, "seed:x")
@@ -481,8 +409,8 @@ def test_the_command_runs_skips_repeats_and_checks(
     invoke(*folder, "--check")
     assert quick_steps == [StepName.VERIFICATION]
     quick_steps.clear()
-    invoke(*folder, "--step", "edges")
-    assert quick_steps == [StepName.EDGES, StepName.MARKER, StepName.VERIFICATION]
+    invoke(*folder, "--step", "edges", "--step", "marker")
+    assert quick_steps == list(StepName)[2:]
 
 
 def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> None:

@@ -41,16 +41,16 @@ class StepName(StrEnum):
     """Steps of a commissioning, in their order.
 
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
-    sheet: force model of the sheet. projector: pose and lens. edges: clamped edges of the sheet on
-    the flanges. marker: position of the marker on the finger. verification: a stroke with the
-    result.
+    edges: clamped edges of the sheet on the flanges, joint offsets and compliance of the flanges.
+    sheet: force model of the sheet. projector: pose and lens. marker: position of the marker on the
+    finger. verification: a stroke with the result.
     """
 
     CAMERA = "camera"
     ARMS = "arms"
+    EDGES = "edges"
     SHEET = "sheet"
     PROJECTOR = "projector"
-    EDGES = "edges"
     MARKER = "marker"
     VERIFICATION = "verification"
 

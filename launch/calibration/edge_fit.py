@@ -1,10 +1,15 @@
-"""Fit the clamped edges of the sheet on the flanges to measured points of the sheet.
+"""Fit where each arm holds its edge of the sheet, from marks on the clamps that the camera sees.
 
-Both arms hold the sheet in several poses. The measured joints give the poses of the edges as the
-calibration of the arms predicts them. The sheet between them is a ruled surface that its weight
-bends. The fit finds, for each arm, the displacement of the edge along the sheet's normal and its
-rotation about the sheet's x axis. The points do not determine the other components, which only
-displace the sheet in its own plane. The result makes arms and camera consistent at the sheet.
+A mark at m in the frame of the clamped edge is measured at
+
+world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
+
+where q are the reported joint angles and f is the force of the stretched sheet on the edge. Unknown
+are the errors b of the base and e of the edge (rotation vector and translation), the joint offsets
+d and the compliance c of the flange. The marks alone do not separate them, but only their sum
+matters in the measured working range. Therefore each unknown has a normal prior, and the maximum
+of the posterior is taken. The finger is measured by the same camera, so errors of the camera's pose
+and lenses cancel.
 """
 
 from __future__ import annotations
@@ -14,136 +19,234 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.scene import SheetSpec
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
-from flexsheet.nodes.models.sheet.tension import compute_sag_m
-from flexsheet.nodes.planner.sheet_force import make_rubber
+from flexsheet.messages.scene import ArmSpec, Pose, Scene, SheetSpec
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.kinematics import forward
+from flexsheet.nodes.models.rigid import (
+    apply,
+    rotation_from_vector,
+    rpy_from_rotation,
+    transform,
+    transform_from_rpy,
+)
+from flexsheet.nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
-Edges = tuple[Floats, Floats]
 
-MIN_POSES, MIN_POINTS = 3, 50
-"""Minimum number of poses of the sheet, and of points on each."""
+BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
+"""Positions of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
 
-MAX_RMS_M = 2e-3
-"""Maximum root mean square of the residuals of poses that belong to the same arms."""
+PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
+"""Standard deviations of the unknowns before the measurement: rad, m, and m/N."""
+
+PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
+MAX_COMPLIANCE_M_PER_N = 1e-2
+
+INITIAL_SIGMA_M, MIN_SIGMA_M = 2e-4, 1e-6
+"""Standard deviation of a coordinate of a mark: initial value and lower bound of the estimate."""
+
+OUTLIER_SIGMAS = 3.0
+"""Deviation above which a coordinate's influence no longer grows (Huber 1964)."""
+
+MIN_POSES = 8
+MAX_RESIDUAL_M = 1e-3
+"""Maximum root mean square of the residuals; a larger one indicates wrong marks or joints."""
 
 
 class EdgeFitError(FlexsheetError, ValueError):
-    """Raised for points that do not determine the edges of the sheet."""
+    """Raised for marks that do not determine where an arm holds its edge."""
 
     code = "edge-fit"
-    remedy = "Capture the patterns again, and record the joint angles of both arms in each pose."
+    remedy = (
+        "Measure three marks on each clamp in at least eight poses that differ in position, "
+        "rotation and stretch of the sheet."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeMark:
+    """Mark on a clamp: its arm, its position (3,) in the frame of the edge and in the world, m."""
+
+    side: Side
+    mark_edge_m: Floats
+    position_world_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class HeldPose:
+    """Pose of the sheet at rest, with the reported joint angles (6,) of both arms, rad."""
+
+    left_rad: Floats
+    right_rad: Floats
+    marks: tuple[EdgeMark, ...]
+
+    def joints_rad(self, side: Side) -> Floats:
+        return self.left_rad if side == "left" else self.right_rad
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """Corrections (4, 4) of flange_from_edge, to be multiplied from the right, for left and right.
+    """Fitted arm, and the errors of the fit.
 
-    shifts_m, rotations_rad: (left, right) displacement along the normal and rotation about x.
-    standard_deviations: of the left and right shift (m), then of both rotations (rad), from the
-    jackknife over poses. rms_m: distances of the points from the fitted sheet; held_out_rms_m: mean
-    distance of the points of a pose that was excluded from the fit, rms over poses; before_rms_m:
-    the same without corrections.
+    residual_rms_m: root mean square distance of a mark from its fitted position.
+    edge_std_m: standard deviation of the fitted position of a mark in the measured poses, all axes
+    together. compliance_std_m_per_n: standard deviation of the compliance.
     """
 
-    shifts_m: tuple[float, float]
-    rotations_rad: tuple[float, float]
-    standard_deviations: tuple[float, float, float, float]
-    rms_m: float
-    held_out_rms_m: float
-    before_rms_m: float
-
-    @property
-    def corrections(self) -> Edges:
-        left, right = (
-            transform(rotation_from_vector([rotation_rad, 0.0, 0.0]), [0.0, 0.0, shift_m])
-            for shift_m, rotation_rad in zip(self.shifts_m, self.rotations_rad, strict=True)
-        )
-        return left, right
+    arm: ArmSpec
+    residual_rms_m: float
+    edge_std_m: float
+    compliance_std_m_per_n: float
+    marks: int
+    poses: int
 
 
-def fit_edges(edges: Sequence[Edges], points: Sequence[Floats], sheet: SheetSpec) -> EdgeFit:
-    """Fit both edges by linear least squares.
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """Measured mark with everything that its model needs; force_n: (3,) on the edge, world."""
 
-    edges: predicted world_from_edge (4, 4) of the left and right edge, for each pose. points:
-    measured points (n, 3) on the sheet in the same poses. Raises EdgeFitError.
-    """
-    if len(edges) < MIN_POSES or min(len(one) for one in points) < MIN_POINTS:
-        counts = ", ".join(str(len(one)) for one in points)
-        raise EdgeFitError(
-            f"{len(edges)} poses with {counts} points; at least {MIN_POSES} poses with "
-            f"{MIN_POINTS} points each are required"
-        )
-    # All points of a pose share the errors of the arms, so that each pose has the same weight.
-    rows = [
-        (matrix / np.sqrt(len(heights)), heights / np.sqrt(len(heights)))
-        for matrix, heights in (
-            _linearize(*pair, one, sheet) for pair, one in zip(edges, points, strict=True)
-        )
-    ]
+    joints_rad: Floats
+    mark_edge_m: Floats
+    position_world_m: Floats
+    force_n: Floats
 
-    def solve(chosen: Sequence[int]) -> Floats:
-        matrix = np.concatenate([rows[i][0] for i in chosen])
-        heights = np.concatenate([rows[i][1] for i in chosen])
-        return np.asarray(np.linalg.lstsq(matrix, heights, rcond=None)[0])
 
-    count = len(rows)
-    solution = solve(range(count))
-    without = np.array([solve([j for j in range(count) if j != i]) for i in range(count)])
-    deviations = np.sqrt(
-        (count - 1) / count * np.sum((without - without.mean(axis=0)) ** 2, axis=0)
+def fit_edges(poses: Sequence[HeldPose], scene: Scene) -> dict[Side, EdgeFit]:
+    """Fit both arms; raises EdgeFitError if the marks do not determine them."""
+    sides: tuple[tuple[Side, ArmSpec], ...] = (
+        ("left", scene.arms.left),
+        ("right", scene.arms.right),
     )
-    residuals = [heights - matrix @ solution for matrix, heights in rows]
-    rms_m = float(np.sqrt(np.mean([one @ one for one in residuals])))
-    if rms_m > MAX_RMS_M:
-        worst = int(np.argmax([one @ one for one in residuals])) + 1
-        raise EdgeFitError(
-            f"the points are {1e3 * rms_m:.2f} mm rms from the sheet between the arms, at most "
-            f"{1e3 * MAX_RMS_M:g} mm; largest in pose {worst}"
+    return {side: _fit_arm(_make_rows(poses, side, scene.sheet), arm) for side, arm in sides}
+
+
+def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[_Row]:
+    rows = []
+    for pose in poses:
+        centres = {
+            one: [m.position_world_m for m in pose.marks if m.side == one]
+            for one in ("left", "right")
+        }
+        if not all(centres.values()):
+            continue
+        across = np.mean(centres["right"], axis=0) - np.mean(centres["left"], axis=0)
+        length_m = float(np.linalg.norm(across))
+        tension_n = edge_force_n(
+            length_m / sheet.width_m,
+            young_modulus_pa=sheet.young_modulus_pa,
+            width_m=sheet.width_m,
+            height_m=sheet.height_m,
+            thickness_m=sheet.thickness_m,
         )
-    held_out = [
-        np.sum(heights - matrix @ other) / np.sqrt(len(heights))
-        for (matrix, heights), other in zip(rows, without, strict=True)
-    ]
-    before = [np.sum(heights) / np.sqrt(len(heights)) for _, heights in rows]
-    left_m, right_m, left_rad, right_rad = solution.tolist()
+        force_n = (1.0 if side == "left" else -1.0) * tension_n * across / length_m
+        rows += [
+            _Row(pose.joints_rad(side), mark.mark_edge_m, mark.position_world_m, force_n)
+            for mark in pose.marks
+            if mark.side == side
+        ]
+    count = len({tuple(row.joints_rad.tolist()) for row in rows})
+    if count < MIN_POSES:
+        raise EdgeFitError(
+            f"{side} arm: {count} poses with marks on both clamps, at least {MIN_POSES} are needed"
+        )
+    return rows
+
+
+class _ArmModel:
+    """Model of the marks of one arm as a function of the unknowns (19,)."""
+
+    def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
+        self._rows = rows
+        self._base, self._clamp = _matrix(arm.world_from_base), _matrix(arm.flange_from_edge)
+        self.prior = np.zeros(19)
+        self.prior[JOINTS] = arm.joint_offsets_rad
+        self.prior[COMPLIANCE] = arm.flange_compliance_m_per_n or PRIOR_COMPLIANCE_M_PER_N
+        self.measured = np.array([row.position_world_m for row in rows])
+
+    def transforms(self, unknowns: Floats) -> tuple[Floats, Floats]:
+        """Return world_from_base and flange_from_edge (4, 4)."""
+        return _shift(self._base, unknowns[BASE]), _shift(self._clamp, unknowns[EDGE])
+
+    def positions(self, unknowns: Floats) -> Floats:
+        """Return the positions (n, 3) of the marks in the world."""
+        base, clamp = self.transforms(unknowns)
+        found = [
+            apply(base @ forward(row.joints_rad + unknowns[JOINTS]) @ clamp, row.mark_edge_m)
+            + unknowns[COMPLIANCE] * row.force_n
+            for row in self._rows
+        ]
+        return np.array(found)
+
+
+def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
+    model = _ArmModel(arm, rows)
+    unknowns, sigma_m = model.prior, INITIAL_SIGMA_M
+    bound = np.full(19, np.inf)
+    lower, upper = -bound, bound.copy()
+    lower[COMPLIANCE], upper[COMPLIANCE] = 0.0, MAX_COMPLIANCE_M_PER_N
+    for _ in range(2):
+
+        def residuals(values: Floats, sigma_m: float = sigma_m) -> Floats:
+            off = (model.positions(values) - model.measured).ravel() / sigma_m
+            return np.concatenate([off, (values - model.prior) / PRIOR_SIGMA])
+
+        found = least_squares(
+            residuals,
+            unknowns,
+            x_scale=PRIOR_SIGMA,
+            bounds=(lower, upper),
+            loss="huber",
+            f_scale=OUTLIER_SIGMAS,
+        )
+        unknowns = found.x
+        off = model.positions(unknowns) - model.measured
+        # The median is not affected by single wrong marks; 0.6745 is that of a normal deviate.
+        sigma_m = max(float(np.median(np.abs(off))) / 0.6745, MIN_SIGMA_M)
+    residual_rms_m = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    if not residual_rms_m <= MAX_RESIDUAL_M:
+        raise EdgeFitError(
+            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, at most "
+            f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joints belong together"
+        )
+    marks = off.size
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    spread = found.jac[:marks] @ covariance @ found.jac[:marks].T
+    # The marks of one pose share the error of the joints, so each pose counts once.
+    poses = len({tuple(row.joints_rad.tolist()) for row in rows})
+    spread *= len(rows) / poses
+    base, clamp = model.transforms(unknowns)
     return EdgeFit(
-        (left_m, right_m),
-        (left_rad, right_rad),
-        tuple(deviations.tolist()),
-        rms_m,
-        float(np.sqrt(np.mean(np.square(held_out)))),
-        float(np.sqrt(np.mean(np.square(before)))),
+        arm=arm.model_copy(
+            update={
+                "world_from_base": _pose(base),
+                "flange_from_edge": _pose(clamp),
+                "joint_offsets_rad": tuple(unknowns[JOINTS].tolist()),
+                "flange_compliance_m_per_n": float(unknowns[COMPLIANCE]),
+            }
+        ),
+        residual_rms_m=residual_rms_m,
+        edge_std_m=float(sigma_m * np.sqrt(np.trace(spread) / len(rows))),
+        compliance_std_m_per_n=float(
+            np.sqrt(covariance[COMPLIANCE, COMPLIANCE] * len(rows) / poses)
+        ),
+        marks=len(rows),
+        poses=poses,
     )
 
 
-def _linearize(
-    left: Floats, right: Floats, points: Floats, sheet: SheetSpec
-) -> tuple[Floats, Floats]:
-    """Return derivatives (n, 4) of the sheet's height at points, and their heights above it (n,).
+def _matrix(pose: Pose) -> Floats:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
-    The derivatives are by the shifts of the left and right edge and by their rotations.
-    """
-    span = right[:3, 3] - left[:3, 3]
-    distance_m = float(np.linalg.norm(span))
-    x_axis = span / distance_m
-    normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    y_axis = np.cross(normal, x_axis)
-    relative = points - left[:3, 3]
-    across, along = relative @ x_axis / distance_m, relative @ y_axis
-    left_slope, right_slope = (edge[:3, 1] @ normal for edge in (left, right))
-    sag_m = compute_sag_m(
-        make_rubber(sheet),
-        normal,
-        density_kg_per_m3=sheet.density_kg_per_m3,
-        edge_distance_m=distance_m,
-        across=across,
-        along=along / sheet.height_m,
+
+def _pose(matrix: Floats) -> Pose:
+    return Pose(
+        position_m=np.ascontiguousarray(matrix[:3, 3]), rpy_rad=rpy_from_rotation(matrix[:3, :3])
     )
-    ruled_m = along * ((1.0 - across) * left_slope + across * right_slope)
-    weights = np.column_stack([1.0 - across, across])
-    return np.hstack([weights, along[:, None] * weights]), relative @ normal - ruled_m - sag_m
+
+
+def _shift(pose: Floats, error: Floats) -> Floats:
+    """Return a pose rotated by error[:3] about its own origin and moved by error[3:]."""
+    return transform(rotation_from_vector(error[:3]) @ pose[:3, :3], pose[:3, 3] + error[3:])

@@ -112,20 +112,16 @@ class SimulatedSheet:
         moving_in, moving_out = (float(ratio) * force_n for ratio in self._history_ratios)
         return (moving_in, moving_out), clamp_n
 
-    def hold(
-        self, world_from_sheet: Floats, distance_m: float
-    ) -> tuple[tuple[Floats, Floats], Floats, Floats]:
+    def hold(self, world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
         """Hold the sheet at a commanded pose (4, 4).
 
-        Returns the reported joint angles (6,) of both arms, the true pose (4, 4) of the flat sheet
-        between the edges, and the true points (n, 3) of the sheet, which its weight bends.
+        Returns the true pose (4, 4) of the flat sheet between the edges, and the true points (n, 3)
+        of the sheet, which its weight bends.
         """
-        edges = place_edges(world_from_sheet, distance_m)
-        joints = self._arms.solve_joints(edges)
-        left, right = self._arms.hold(edges)
+        left, right = self._arms.hold(place_edges(world_from_sheet, distance_m))
         x, y, normal, middle = _flat_axes(left, right)
         flat = transform(np.column_stack([x, y, normal]), middle)
-        return joints, flat, solve(self._rubber, left, right).positions.reshape(-1, 3)
+        return flat, solve(self._rubber, left, right).positions.reshape(-1, 3)
 
 
 def simulate_force(

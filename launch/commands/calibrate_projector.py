@@ -156,7 +156,7 @@ def projector(
                     true = make_true_projector(require_projector(scene), seed=seed)
                 else:
                     true = require_projector(apply_apparatus(scene, devices))
-                views = [one for one, _ in simulate_views(scene, true, devices, poses, seed)]
+                views = list(simulate_views(scene, true, devices, poses, seed))
             else:
                 assert pictures is not None
                 views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
@@ -212,17 +212,16 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
 
 def simulate_views(
     scene: Scene, true: Projector, apparatus: Apparatus | None, poses: int, seed: int
-) -> Iterator[tuple[Views, tuple[Any, ...]]]:
+) -> Iterator[Views]:
     """Yield the simulated left and right images of all patterns, for each pose of the sheet.
 
-    Also yields the reported joint angles (6,) of both arms. true: simulated projector. apparatus:
-    other true devices, whose arms hold the sheet; None: a flat sheet at the commanded poses.
+    true: simulated projector. apparatus: other true devices, whose arms hold the sheet; None: the
+    sheet is flat, at the commanded poses.
     """
     from rich.progress import track
 
     from flexsheet.launch.calibration.gray_code import make_patterns
     from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
-    from flexsheet.messages.apparatus import nominal_apparatus
     from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
     from flexsheet.nodes.twin.rig import make_true_camera
     from flexsheet.nodes.twin.truth import apply_apparatus
@@ -230,16 +229,15 @@ def simulate_views(
     shown = make_patterns(require_projector(scene).width_px, require_projector(scene).height_px)
     camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
     lit = LitSheet(scene, camera, true, seed=seed)
-    arms = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
+    arms = None if apparatus is None else SimulatedSheet(scene, apparatus)
     spec = scene.sheet
     distance_m = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio) * spec.width_m
     tracked = track(sheet_poses(poses), "simulating images", console=words.console, transient=True)
     for world_from_sheet in tracked:
-        joints, held, points = arms.hold(world_from_sheet, distance_m)
-        if apparatus is None:
-            yield lit.pair(shown, world_from_sheet), joints
+        if arms is None:
+            yield lit.pair(shown, world_from_sheet)
         else:
-            yield lit.pair(shown, held, points), joints
+            yield lit.pair(shown, *arms.hold(world_from_sheet, distance_m))
 
 
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:

@@ -6,9 +6,7 @@ what its simulated devices report: images, joint angles, forces of a gauge, and 
 
 from __future__ import annotations
 
-import csv
 import json
-import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,7 +43,6 @@ from flexsheet.nodes.models.rigid import rpy_from_rotation, transform_from_rpy
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
-POINTS = "projector-points.npz"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
 FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
 """Boards of simulated laboratories, for the camera and for the flanges."""
@@ -65,8 +62,8 @@ INSTRUCTIONS: dict[StepName, str] = {
     "sheet=CSV",
     StepName.PROJECTOR: "write the patterns with `flexsheet calibrate projector --write-patterns`, "
     "capture them on the sheet in six poses, and give --data projector=FOLDER",
-    StepName.EDGES: "write the joint angles of both arms in each pose of the step projector to a "
-    "CSV file with the columns left_j1_rad to right_j6_rad, and give --data edges=CSV",
+    StepName.EDGES: "fix three marks on each clamp, record them with `flexsheet calibrate "
+    "edges-capture`, and give --data edges=CSV",
     StepName.MARKER: "touch known points as for `flexsheet calibrate marker --rows`, and give "
     "--data marker=CSV; give the finger's radius with --finger-radius-mm",
     StepName.VERIFICATION: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` "
@@ -284,25 +281,22 @@ class Laboratory:
         scene = load_scene(lab.scene_copy)
         guess = require_projector(scene)
         camera = calibrate_projector.load_camera(scene, lab.find_file(STEREO))
-        joints: list[Any] = []
         if self.apparatus is None:
             patterns = make_patterns(guess.width_px, guess.height_px)
             folder = self._find_data(StepName.PROJECTOR)
             views = list(calibrate_projector.read_views(folder, len(patterns)))
         else:
             true = require_projector(apply_apparatus(scene, self.apparatus))
-            seen = list(
+            views = list(
                 calibrate_projector.simulate_views(
                     scene, true, self.apparatus, self.sheet_poses, self.seed
                 )
             )
-            views, joints = [pair for pair, _ in seen], [one for _, one in seen]
         try:
             points = measure_points(views, camera, guess)
             fit = fit_projector(points, guess)
         except ProjectorError as error:
             raise CommissionError(f"step projector: {error}") from error
-        np.savez(lab.folder / POINTS, world=points.world, pose=points.pose, joints=np.array(joints))
         lens = fit.projector.lens
         pose = fit.projector.world_from_projector
         matrix = transform_from_rpy(pose.position_m, pose.rpy_rad)
@@ -324,55 +318,38 @@ class Laboratory:
 
     def calibrate_edges(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
-        from flexsheet.nodes.arm_bridge.kinematics import forward
+        from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
 
         scene = load_scene(lab.scene_copy)
-        if not (lab.folder / POINTS).exists():
-            raise CommissionError(
-                "step edges: it uses the points that the step projector measures; run that step, "
-                "or skip this one with --skip edges=REASON"
-            )
-        with np.load(lab.folder / POINTS) as stored:
-            world, pose, joints = stored["world"], stored["pose"], stored["joints"]
+        stereo = lab.find_file(STEREO)
         if self.apparatus is None:
-            joints = read_joints(self._find_data(StepName.EDGES))
-        points = [world[pose == number] for number in np.unique(pose)]
-        if len(joints) != len(points):
-            raise CommissionError(
-                f"step edges: {len(joints)} rows of joint angles for {len(points)} poses of the "
-                "step projector; give one row for each pose"
-            )
-        arms = (scene.arms.left, scene.arms.right)
-        edges = [
-            tuple(
-                _matrix(arm.world_from_base) @ forward(one) @ _matrix(arm.flange_from_edge)
-                for arm, one in zip(arms, row, strict=True)
-            )
-            for row in joints
-        ]
+            poses = read_edge_marks(self._find_data(StepName.EDGES))
+        else:
+            optics = None if stereo is None else load_calibration(stereo)
+            poses = simulate_edge_marks(scene, self.apparatus, calibration=optics, seed=self.seed)
         try:
-            fit = fit_edges([(left, right) for left, right in edges], points, scene.sheet)
+            fits = fit_edges(poses, scene)
         except EdgeFitError as error:
-            raise CommissionError(f"step edges: {error}") from error
+            raise CommissionError(f"step edges: {error}; {error.remedy}") from error
         values: dict[str, Any] = {}
-        for side, arm, correction in zip(("left", "right"), arms, fit.corrections, strict=True):
-            values |= _pose_values(
-                f"arms.{side}.flange_from_edge", _matrix(arm.flange_from_edge) @ correction
-            )
-        left_m, right_m, left_rad, right_rad = fit.standard_deviations
+        uncertainty = {}
+        for side, fit in fits.items():
+            arm, key = fit.arm, f"arms.{side}"
+            values |= _pose_values(f"{key}.world_from_base", _matrix(arm.world_from_base))
+            values |= _pose_values(f"{key}.flange_from_edge", _matrix(arm.flange_from_edge))
+            offsets = [calibrate.round_digits(one) for one in arm.joint_offsets_rad]
+            values[f"{key}.joint_offsets_rad"] = offsets
+            compliance = calibrate.round_digits(arm.flange_compliance_m_per_n)
+            values[f"{key}.flange_compliance_m_per_n"] = compliance
+            uncertainty[f"{side}_edge_mm"] = 1e3 * fit.edge_std_m
+            uncertainty[f"{side}_compliance_um_per_n"] = 1e6 * fit.compliance_std_m_per_n
         return StepResult(
-            residual=1e3 * fit.held_out_rms_m,
+            residual=1e3 * max(fit.residual_rms_m for fit in fits.values()),
             unit="mm",
-            limit=0.3,
-            advice="Repeat the steps arms and projector with the sheet at rest in each pose.",
-            uncertainty={
-                "left_shift_mm": 1e3 * left_m,
-                "right_shift_mm": 1e3 * right_m,
-                "left_rotation_mrad": 1e3 * left_rad,
-                "right_rotation_mrad": 1e3 * right_rad,
-            },
+            limit=0.4,
+            advice="Check the marks and their fixing; repeat the step arms.",
+            uncertainty=uncertainty,
             scene_values=values,
-            figures={"before_mm": 1e3 * fit.before_rms_m},
         )
 
     def calibrate_marker(self, lab: Commissioning) -> StepResult:
@@ -390,7 +367,9 @@ class Laboratory:
             touches = simulate_touches(scene, self.apparatus, calibration=optics, seed=self.seed)
             source = f"twin of {scene.name}"
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
-            radius_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
+            read_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
+            # Tables that are computed for a finger then serve for all fingers of about its size.
+            radius_m = 5e-4 * round(read_m / 5e-4)
         found = calibrate_marker.make_calibration(touches, scene, source)
         save_marker_calibration(found, lab.folder / MARKER)
         uncertainty = {
@@ -470,16 +449,17 @@ def _state_errors(lab: Commissioning) -> dict[str, float]:
         record = lab.state.steps.get(step)
         if record is None or record.result is None:
             return []
-        values = {**record.result.uncertainty, "residual": record.result.residual}
-        return [values[key] for key in keys]
+        return [record.result.uncertainty[key] for key in keys]
 
     tip = [
         *collect(StepName.CAMERA, "depth_mm", "lateral_mm"),
         *collect(StepName.MARKER, "x_mm", "y_mm", "z_mm"),
     ]
-    sheet = collect(StepName.EDGES, "residual") or collect(
+    arms = collect(StepName.EDGES, "left_edge_mm", "right_edge_mm") or collect(
         StepName.ARMS, "left_position_mm", "right_position_mm"
     )
+    # The middle of the sheet moves by half the error of each edge.
+    sheet = [0.5 * one for one in arms]
     return {"fingertip": float(np.linalg.norm(tip)), "sheet": float(np.linalg.norm(sheet))}
 
 
@@ -502,32 +482,6 @@ def _pose_values(key: str, matrix: Any) -> dict[str, Any]:
             calibrate.round_digits(one) for one in rpy_from_rotation(matrix[:3, :3])
         ],
     }
-
-
-def read_joints(path: Path) -> Any:
-    """Read joint angles (n, 2, 6), rad, of both arms from a CSV file; raises CommissionError."""
-    columns = [f"{side}_j{number}_rad" for side in ("left", "right") for number in range(1, 7)]
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CommissionError(f"{path}: cannot be read: {error}; give a CSV file") from error
-    rows = []
-    for number, line in enumerate(lines, start=2):
-        row = []
-        for column in columns:
-            try:
-                value = float(line.get(column) or "")
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise CommissionError(
-                    f"{path}: row {number}, column {column}: expected a number, found "
-                    f"{line.get(column)!r}; give the joint angle in rad"
-                )
-            row.append(value)
-        rows.append(row)
-    return np.array(rows).reshape(-1, 2, 6)
 
 
 def _read_stroke(path: Path) -> dict[str, Any]:

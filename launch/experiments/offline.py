@@ -26,9 +26,11 @@ from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges, pos
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.nodes import node_class
+from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
@@ -84,23 +86,28 @@ ALL_METRICS = frozenset(Metric)
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations of camera and sheet that the nodes use in addition to the scene."""
+    """Calibrations that the nodes use in addition to the scene."""
 
     stereo: StereoCalibration | None = None
     sheet: SheetCalibration | None = None
+    marker: MarkerCalibration | None = None
 
     @staticmethod
     def of(plan: ResolvedGraph) -> NodeCalibrations:
         """Read the calibration files that the plan's triangulator and planner use."""
         stereo: StereoCalibration | None = None
         sheet: SheetCalibration | None = None
+        marker: MarkerCalibration | None = None
         for node in plan.nodes.values():
             kind = node_class(node.type)
-            if issubclass(kind, node_class("triangulator")) and node.parameters["calibration"]:
-                stereo = load_calibration(Path(node.parameters["calibration"]))
+            if issubclass(kind, node_class("triangulator")):
+                if path := node.parameters["calibration"]:
+                    stereo = load_calibration(Path(path))
+                if path := node.parameters["marker_calibration"]:
+                    marker = load_marker_calibration(Path(path))
             if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
                 sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
-        return NodeCalibrations(stereo, sheet)
+        return NodeCalibrations(stereo, sheet, marker)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +206,10 @@ class OfflineEvaluator:
         self._scene = scene
         self._geometry = StereoGeometry.of(scene.camera, given.stereo)
         self._force_model = make_force_model(scene.sheet, given.sheet)
+        marker = scene.finger if given.marker is None else given.marker
+        self._marker_from_pad = world_from_finger(scene.finger.direction_world) @ np.array(
+            marker.marker_from_pad_m
+        )
         self._shape = make_shape(dict(scene.object.geometry))
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
@@ -296,7 +307,7 @@ class OfflineEvaluator:
                     f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "
                     "triangulated; check the camera offsets in the apparatus"
                 )
-            errors.append(found.point_world - contact.point)
+            errors.append(found.point_world - self._marker_from_pad - contact.point)
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:

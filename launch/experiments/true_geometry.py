@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import ArmSpec, Pose, Scene
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.arms import forward, solve_inverse_kinematics
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.sheet_pull import SheetPull
@@ -62,6 +63,7 @@ class ArmPair:
         specs, true_specs = scene.arms, true_scene.arms
         self._believed = ArmModel.of(specs.left), ArmModel.of(specs.right)
         self._true = ArmModel.of(true_specs.left), ArmModel.of(true_specs.right)
+        self._specs, self._sheet = (specs.left, specs.right), scene.sheet
         self._offsets_rad = (
             np.array(apparatus.arms.left.joint_offsets_rad),
             np.array(apparatus.arms.right.joint_offsets_rad),
@@ -70,22 +72,46 @@ class ArmPair:
         self._guesses = [START_GUESS_RAD, START_GUESS_RAD]
 
     def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """Return the joint angles (6,) of both arms, rad, for commanded poses `edges` (4, 4)."""
-        for side, edge in enumerate(edges):
-            self._guesses[side] = self._believed[side].solve_joints(edge, self._guesses[side])
-        return self._guesses[0], self._guesses[1]
+        """Return the commanded joint angles (6,) of both arms, rad, for poses `edges` (4, 4).
 
-    def hold(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+        The bridges correct their commands by the scene's joint offsets and flange compliances.
+        """
+        across = edges[1][:3, 3] - edges[0][:3, 3]
+        length_m = float(np.linalg.norm(across))
+        sheet = self._sheet
+        tension_n = edge_force_n(
+            length_m / sheet.width_m,
+            young_modulus_pa=sheet.young_modulus_pa,
+            width_m=sheet.width_m,
+            height_m=sheet.height_m,
+            thickness_m=sheet.thickness_m,
+        )
+        commanded = []
+        for side, (spec, wanted) in enumerate(zip(self._specs, edges, strict=True)):
+            edge, outwards = wanted.copy(), (-1.0, 1.0)[side]
+            moved_m = spec.flange_compliance_m_per_n * tension_n
+            edge[:3, 3] += outwards * moved_m * across / length_m
+            joints_rad = self._believed[side].solve_joints(edge, self._guesses[side])
+            self._guesses[side] = joints_rad
+            commanded.append(joints_rad - np.array(spec.joint_offsets_rad))
+        return commanded[0], commanded[1]
+
+    def hold(
+        self, edges: tuple[Floats, Floats], *, play_rad: tuple[Floats, Floats] | None = None
+    ) -> tuple[Floats, Floats]:
         """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
 
-        The pull of the sheet displaces the flanges. Backlash and servo lag are not included.
+        The pull of the true sheet displaces the true flanges. Servo lag is not included.
+        play_rad: position of each joint (6,) of both arms within its backlash.
         """
-        left, right = (
-            arm.world_from_base @ forward(joints_rad + offsets_rad)
-            for arm, joints_rad, offsets_rad in zip(
-                self._true, self.solve_joints(edges), self._offsets_rad, strict=True
-            )
-        )
+        commanded = self.solve_joints(edges)
+        flanges = []
+        for side, joints_rad in enumerate(commanded):
+            true_rad = joints_rad + self._offsets_rad[side]
+            if play_rad is not None:
+                true_rad = true_rad + play_rad[side]
+            flanges.append(self._true[side].world_from_base @ forward(true_rad))
+        left, right = flanges
         clamps = [arm.flange_from_edge for arm in self._true]
         if self._pull is not None:
             left, right = self._pull.displace(left, right, clamps[0], clamps[1])

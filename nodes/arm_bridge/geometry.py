@@ -20,7 +20,7 @@ from flexsheet.nodes.arm_bridge.kinematics import (
 from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
-from flexsheet.nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
+from flexsheet.nodes.models.sheet import flange_pose, sheet_from_edges
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +55,9 @@ class ArmGeometry:
         self.base_from_world = inverse(self.world_from_base)
         self.flange_from_edge = _transform(arm.flange_from_edge)
         self.other_flange_from_edge = _transform(other.flange_from_edge)
+        self._joint_offsets_rad = np.array(arm.joint_offsets_rad)
+        self._compliance_m_per_n = arm.flange_compliance_m_per_n
+        self._other_compliance_m_per_n = other.flange_compliance_m_per_n
         self.max_tool_speed = TOOL_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s
         sheet = scene.sheet
         half = 0.5 * sheet.height_m
@@ -81,11 +84,18 @@ class ArmGeometry:
             min_flange_distance_m=scene.arms.min_distance_m,
             workspace_min_m=scene.arms.workspace_min_m,
             workspace_max_m=scene.arms.workspace_max_m,
+            compliance_m_per_n=self._compliance_m_per_n + self._other_compliance_m_per_n,
         )
 
+    def _base_from_flange(self, joints_rad: Floats) -> Floats:
+        return _base_from_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
+
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the flange at joints (6,) rad."""
-        return self.world_from_base @ _base_from_flange(tuple(joints_rad.tolist()))
+        """Return the world pose (4, 4) of the flange of a rigid arm.
+
+        joints_rad: angles (6,) that the encoders report.
+        """
+        return self.world_from_base @ self._base_from_flange(joints_rad)
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
         """Return the world pose (4, 4) of the clamped edge at joints (6,) rad."""
@@ -93,25 +103,55 @@ class ArmGeometry:
 
     def tool_points(self, joints_rad: Floats) -> Floats:
         """Return centre and ends of the clamped edge, and the flange (4, 3), m, base frame."""
-        return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
+        return apply(self._base_from_flange(joints_rad), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
         """Return joints (6,) rad that place this arm's edge for a pose of the sheet.
 
-        They are near the present joints.  Raises UnreachableError if there are none.
+        They are near the present joints, and hold the edge against the tension of the sheet.
+        Raises UnreachableError if there are none.
         """
-        edges = edge_poses(
-            motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
-        )
-        flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return solve_next_joints(self.base_from_world @ flange, present_rad)
+        edge = motion.world_from_sheet.copy()
+        edge[:3, 3] += self.edge_offset_m(motion.stretch_ratio) * edge[:3, 0]
+        return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
+
+    def edge_offset_m(self, stretch_ratio: float) -> float:
+        """Return where to command the edge along x of the sheet, from its centre.
+
+        The tension of the sheet moves the flange from there towards the other one.
+        """
+        length_m = stretch_ratio * self.sheet_limits.width_m
+        moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
+        return (-1.0 if self.left else 1.0) * (0.5 * length_m + moved_m)
+
+    def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
+        """Return the encoder angles (6,) rad, near given ones, for the flange of a rigid arm.
+
+        Raises UnreachableError if there are none.
+        """
+        offsets_rad = self._joint_offsets_rad
+        base_from_flange = self.base_from_world @ world_from_flange
+        joints_rad = solve_next_joints(base_from_flange, near_rad + offsets_rad) - offsets_rad
+        return np.asarray(joints_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the sheet at rest between this arm's edge and the other one (world poses)."""
+        """Return the sheet at rest between this arm's edge and the other one.
+
+        Both are world poses of the edges if the arms were rigid.
+        """
+        limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
-        distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
-        stretch = distance / self.sheet_limits.width_m
-        return SheetMotion(sheet_from_edges(left, right), np.zeros(6), stretch, 0.0)
+        distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+        length_m = limits.sheet_length_m(distance_m)
+        sheet = sheet_from_edges(left, right)
+        # The more compliant arm moves more, so the sheet is not midway between the rigid edges.
+        own_m, other_m = (
+            compliance * limits.force_n(length_m)
+            for compliance in (self._compliance_m_per_n, self._other_compliance_m_per_n)
+        )
+        shift_m = 0.5 * (own_m - other_m if self.left else other_m - own_m)
+        sheet[:3, 3] += shift_m * sheet[:3, 0]
+        return SheetMotion(sheet, np.zeros(6), length_m / limits.width_m, 0.0)
 
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
@@ -121,12 +161,5 @@ class ArmGeometry:
             return None, None
         other_edge = world_from_other_flange @ self.other_flange_from_edge
         across = other_edge[:3, 3] - self.world_from_edge(joints_rad)[:3, 3]
-        distance, limits = sqrt(float(across @ across)), self.sheet_limits
-        force = edge_force_n(
-            distance / limits.width_m,
-            young_modulus_pa=limits.young_modulus_pa,
-            width_m=limits.width_m,
-            height_m=limits.height_m,
-            thickness_m=limits.thickness_m,
-        )
-        return distance, force
+        length_m = self.sheet_limits.sheet_length_m(sqrt(float(across @ across)))
+        return length_m, self.sheet_limits.force_n(length_m)

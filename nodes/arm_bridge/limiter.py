@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
@@ -35,6 +36,7 @@ up faster than the tool speed allows."""
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
 """Minimum and maximum duration of a command; speeds over a shorter one are rounding errors."""
 
+LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02
 """Minimum weight of the desired velocity that is tried in its blend with a decelerating one."""
 
@@ -73,6 +75,21 @@ class SheetLimits:
     min_flange_distance_m: float
     workspace_min_m: Floats
     workspace_max_m: Floats
+    compliance_m_per_n: float = 0.0
+    """Sum of the compliances of both flanges under the tension of the sheet."""
+
+    def sheet_length_m(self, edge_distance_m: float) -> float:
+        """Return the length of the sheet (m), which pulls its edges towards each other.
+
+        edge_distance_m: distance between the edges if the arms were rigid.
+        """
+        if self.compliance_m_per_n == 0.0 or not edge_distance_m > self.width_m:
+            return edge_distance_m
+
+        def excess_m(length_m: float) -> float:
+            return length_m + self.compliance_m_per_n * self.force_n(length_m) - edge_distance_m
+
+        return float(brentq(excess_m, self.width_m, edge_distance_m, xtol=LENGTH_TOLERANCE_M))
 
     def force_n(self, length_m: float) -> float:
         """Return the force (N) on each edge of the sheet when the edges are this far apart."""
@@ -321,7 +338,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
-    distance = math.sqrt(float(across @ across))
+    distance = limits.sheet_length_m(math.sqrt(float(across @ across)))
     if not distance <= limits.max_length_m:
         return f"sheet of {distance * 1e3:.1f} mm, at most {limits.max_length_m * 1e3:.1f} mm"
     force = limits.force_n(distance)

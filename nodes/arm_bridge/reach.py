@@ -32,7 +32,6 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     find_branch,
     singularities,
     solve_joints_on_branch,
-    solve_next_joints,
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
@@ -152,12 +151,10 @@ class ArmReach:
 
 
 def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
-    """Return the flange poses world_from_flange (n, 4, 4) of an arm for poses of the sheet."""
-    width = geometry.sheet_limits.width_m
-    outwards = -0.5 if geometry.left else 0.5
+    """Return the flange poses world_from_flange (n, 4, 4) of a rigid arm for poses of the sheet."""
     edges = places.world_from_sheet.copy()
-    offset = outwards * width * places.stretch_ratio[:, None] * edges[:, :3, 0]
-    edges[:, :3, 3] += offset
+    offset = np.array([geometry.edge_offset_m(ratio) for ratio in places.stretch_ratio])
+    edges[:, :3, 3] += offset[:, None] * edges[:, :3, 0]
     return np.asarray(edges @ inverse(geometry.flange_from_edge))
 
 
@@ -502,7 +499,7 @@ def _solve_joints(
 ) -> Floats:
     try:
         pose = compute_flange_poses(arm, _make_poses([place]))[0]
-        return solve_next_joints(arm.base_from_world @ pose, near_rad)
+        return arm.solve_joints(pose, near_rad)
     except UnreachableError as error:
         limit = error.limit if error.limit == "reach" else f"{error.limit} range"
         raise PathError(

@@ -53,6 +53,9 @@ PIECES = (
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 """Corners of a box, (8, 3); in the index, bit 4 is the sign of x, bit 2 of y, bit 1 of z."""
 
+BRACKET_WIDTH_M = 0.012
+"""Width of the bar between a flange and its clamp."""
+
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
 """Size of the bar that clamps the sheet: across, along (longer than the edge), thickness."""
 
@@ -80,6 +83,19 @@ def rounded_box(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
     return vertices + np.array(centre_m), _orient_outwards(vertices, _box_triangles())
+
+
+def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Make the mesh of the bar from the flange to its clamp: vertices (24, 3), triangles (44, 3).
+
+    flange_from_clamp_m: centre of the clamp (3,) in the flange frame. The bar reaches into the
+    flange and the clamp, so that no gap is visible.
+    """
+    reach_m = np.abs(flange_from_clamp_m)
+    vertices, triangles = rounded_box(
+        tuple((BRACKET_WIDTH_M + reach_m).tolist()), tuple(0.5 * flange_from_clamp_m)
+    )
+    return vertices.astype(np.float32), triangles
 
 
 def _box_triangles() -> NDArray[np.int32]:

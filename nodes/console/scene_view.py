@@ -9,8 +9,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
-from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, make_bracket, rounded_box
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points, make_sheet_triangles
 from flexsheet.nodes.console.snapshot import (
@@ -48,6 +48,8 @@ Without it, a flat object in the plane of the sheet would flicker, because both 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
+FINGER_NAME_M = (0.0, -0.06, 0.04)
+"""Position of the finger's name relative to its tip, below its end."""
 NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
 """Distance of the drawn floor below the bases of the arms."""
@@ -114,7 +116,8 @@ class SceneView:
         self._of_scene, self._skin_shape, self._posed = scene, None, set()
         self._add_floor(scene)
         self._links = {
-            side: self._add_arm(side, scene.sheet.height_m) for side in ("left", "right")
+            "left": self._add_arm("left", scene.arms.left, scene.sheet.height_m),
+            "right": self._add_arm("right", scene.arms.right, scene.sheet.height_m),
         }
         self.show_layer("Arms", self._shown["Arms"])
         self._add_sheet(scene)
@@ -134,6 +137,8 @@ class SceneView:
         self._object = self._add(
             "Object", self._scene.add_mesh_simple("/object", corners, split, color=OBJECT)
         )
+        left_m, lowest_m = rest.min(axis=0)[:2]
+        self._add_name("/object/name", "virtual object", (left_m, lowest_m - 0.02, 0.0))
         self._skin_shape, self._ray_vertices = rest.shape, select_ray_vertices(rest)
         self._make_touchable(self._object)
 
@@ -198,8 +203,8 @@ class SceneView:
             position=(0.0, lowest - FLOOR_M, 0.0),
         )
 
-    def _add_arm(self, side: str, height_m: float) -> list[Any]:
-        """Add the frames and boxes of an arm's seven links and of its clamp."""
+    def _add_arm(self, side: str, arm: ArmSpec, height_m: float) -> list[Any]:
+        """Add the frames and boxes of an arm's seven links, its bracket and its clamp."""
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -213,6 +218,12 @@ class SceneView:
                 color=ARM_DARK if piece.dark else ARM,
                 flat_shading=True,
             )
+        self._scene.add_mesh_simple(
+            f"/{side}/6/bracket",
+            *make_bracket(np.asarray(arm.flange_from_edge.position_m)),
+            color=ARM_DARK,
+            flat_shading=True,
+        )
         clamp = self._add("Arms", self._scene.add_frame(f"/{side}/clamp", show_axes=False))
         across, along, through = CLAMP_SIZE_M
         vertices, triangles = rounded_box((across, along * height_m, through), (0.0, 0.0, 0.0))
@@ -292,31 +303,36 @@ class SceneView:
             )
 
     def _add_names(self, scene: Scene) -> None:
-        """Add name labels above the devices."""
+        """Add name labels above the devices; those of finger and sheet move with them."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
         centre = apply(
             transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
         )
-        positions = {
-            "stereo camera": centre + NAME_ABOVE_M,
-            "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
-            "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
-            "right arm": np.asarray(scene.arms.right.world_from_base.position_m),
+        named: dict[str, tuple[str, Any]] = {
+            "/names/camera": ("stereo camera", centre + NAME_ABOVE_M),
+            "/names/eyes": ("user's eyes", scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M),
+            "/names/left": ("left arm", scene.arms.left.world_from_base.position_m),
+            "/names/right": ("right arm", scene.arms.right.world_from_base.position_m),
+            "/finger/name": ("finger", FINGER_NAME_M),
+            "/right/clamp/name": ("rubber sheet", (0.0, 0.5 * scene.sheet.height_m + 0.012, 0.0)),
         }
         if scene.projector is not None:
-            pose = scene.projector.world_from_projector
-            positions["projector"] = np.asarray(pose.position_m) + NAME_ABOVE_M
-        for i, (text, position) in enumerate(positions.items()):
-            label = self._scene.add_label(
-                f"/names/{i}",
-                text,
-                position=position,
-                font_screen_scale=0.9,
-                anchor="bottom-center",
-                depth_test=False,
-            )
-            self._add("Names", label)
+            position_m = np.asarray(scene.projector.world_from_projector.position_m)
+            named["/names/projector"] = ("projector", position_m + NAME_ABOVE_M)
+        for node, (text, position) in named.items():
+            self._add_name(node, text, position)
+
+    def _add_name(self, node: str, text: str, position: Any) -> None:
+        label = self._scene.add_label(
+            node,
+            text,
+            position=position,
+            font_screen_scale=0.9,
+            anchor="bottom-center",
+            depth_test=False,
+        )
+        self._add("Names", label)
 
     def _add_device(
         self,

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from flexsheet.messages.apparatus import ArmTruth
+from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
@@ -126,14 +126,15 @@ class TwinArmsNode(Node):
             await server.stop()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
-        truth = self.parameters.apparatus
+        truth = self.parameters.apparatus or nominal_apparatus(scene)
+        self._arms = truth.arms
         scene = apply_apparatus(scene, truth)
         arms = {"left": scene.arms.left, "right": scene.arms.right}
         for side, spec in arms.items():
             base, clamp = spec.world_from_base, spec.flange_from_edge
             self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
             self._flange_from_edge[side] = transform_from_rpy(clamp.position_m, clamp.rpy_rad)
-        self._pull = None if truth is None else SheetPull.of(scene.sheet, truth)
+        self._pull = SheetPull.of(scene.sheet, truth)
         if len(self.servers) == len(arms):
             return
         self._started_ns = self.clock.now_ns()
@@ -185,8 +186,7 @@ class TwinArmsNode(Node):
         return ArmServer(controller, host=given.host, port=port, before=before)
 
     def _truth(self, side: str) -> ArmTruth:
-        given = self.parameters.apparatus
-        return ArmTruth() if given is None else getattr(given.arms, side)
+        return self._arms.left if side == "left" else self._arms.right
 
     def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
         """Return the true joint angles (6,), given the angles (6,) after the gears' backlash.

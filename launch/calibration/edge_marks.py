@@ -1,0 +1,272 @@
+"""Read, record and simulate marks on the clamps of the sheet (`flexsheet calibrate edges`)."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.calibration.arm_poses import MAX_STILL_RAD, MIN_STILL_S
+from flexsheet.launch.calibration.edge_fit import EdgeMark, HeldPose
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
+from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.calibration import StereoCalibration
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.triangulator.tracking import Gate
+from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+SIDES: tuple[Side, Side] = ("left", "right")
+JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
+COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
+"""One row for each mark: number of the pose, arm, position of the mark along the clamped edge from
+its centre, measured position in the world, and the joint angles of both arms."""
+
+MAX_PROBLEMS = 20
+
+ALONG = (-0.45, 0.0, 0.45)
+"""Positions of the simulated marks along the edge, as fractions of its length."""
+
+SIMULATED_POSES = 24
+MAX_TRIES = 400
+TILT_RAD = np.array([0.5, 0.35, 0.1])
+CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
+MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
+"""Lower bound of the stretch, and the used fraction of the range above it."""
+
+SEARCH_M = 0.02
+"""Maximum distance of a mark from its expected position."""
+
+MIN_NEW_JOINT_RAD = 0.02
+"""Minimum rotation of a joint between two recorded poses."""
+
+
+def read_edge_marks(path: Path) -> list[HeldPose]:
+    """Read marks from a file with the columns `COLUMNS`.
+
+    Raises BadInputError with file, line, column, value and remedy.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
+            columns = tuple(reader.fieldnames or ())
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise BadInputError(
+            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        ) from error
+    problems = [
+        Problem(str(path), (name,), "missing column", "add it")
+        for name in COLUMNS
+        if name not in columns
+    ]
+    if problems:
+        raise BadInputError(problems)
+    joints: dict[str, tuple[Floats, Floats]] = {}
+    marks: dict[str, list[EdgeMark]] = defaultdict(list)
+    for number, row in rows:
+        where, values = f"{path}:{number}", {}
+        for name in COLUMNS[2:]:
+            values[name] = _parse(where, name, row[name], problems)
+        named = (row["side"] or "").strip()
+        side = next((one for one in SIDES if one == named), None)
+        if side is None:
+            what = f'expected left or right, found "{named}"'
+            problems.append(Problem(where, ("side",), what, "name the arm that holds the clamp"))
+            continue
+        left, right = np.radians([values[name] for name in JOINT_COLUMNS]).reshape(2, 6)
+        joints[row["pose"]] = left, right
+        marks[row["pose"]].append(_make_mark(side, values))
+    if problems:
+        raise BadInputError(problems[:MAX_PROBLEMS])
+    return [HeldPose(*joints[pose], tuple(marks[pose])) for pose in joints]
+
+
+def _parse(where: str, name: str, text: str | None, problems: list[Problem]) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        what = f'expected a finite number, found "{text}"'
+        problems.append(Problem(where, (name,), what, "measure this mark again, or remove its row"))
+    return value
+
+
+def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:
+    position = 1e-3 * np.array([values["x_mm"], values["y_mm"], values["z_mm"]])
+    return EdgeMark(side, np.array([0.0, 1e-3 * values["along_mm"], 0.0]), position)
+
+
+class MarkDetector:
+    """Detector of marks in stereo images, with the triangulator's methods."""
+
+    def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
+        given = TriangulatorParameters()
+        self._geometry = StereoGeometry.of(scene.camera, calibration)
+        self._config = DetectorConfig(
+            blob_filter=BlobFilter(
+                min_contrast=given.marker_min_contrast,
+                min_area_px=given.marker_min_area_px,
+                max_area_px=given.marker_max_area_px,
+                window_half_px=given.window_half_px,
+            ),
+            refine=MARKER_METHODS["subpixel_fit"],
+            triangulate=TRIANGULATION_METHODS["dlt"],
+            max_reprojection_px=given.max_reprojection_px,
+        )
+
+    def find(self, left: Image, right: Image, *, near_world_m: Floats) -> Floats | None:
+        """Return the position (3,) of the mark near an expected one; None without a clear mark."""
+        reason, measured = detect(
+            left,
+            right,
+            geometry=self._geometry,
+            config=self._config,
+            volume=(near_world_m - SEARCH_M, near_world_m + SEARCH_M),
+            gate=Gate(near_world_m, SEARCH_M),
+        )
+        return measured.point_world if reason == "ok" and measured is not None else None
+
+
+class EdgeMarkRecorder:
+    """Recorder that appends the marks to a file when both arms rest in a new pose.
+
+    Joint angles and images must be added in the order of their times (s, on one clock).
+    """
+
+    def __init__(self, path: Path, scene: Scene, calibration: StereoCalibration | None) -> None:
+        self.count = 0
+        self._path, self._scene = path, scene
+        self._detector = MarkDetector(scene, calibration)
+        self._geometries = {side: ArmGeometry(scene, side) for side in SIDES}
+        self._joints: dict[Side, Floats] = {}
+        self._still_since_s = math.inf
+        self._recorded: list[Floats] = []
+        with path.open("x", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow(COLUMNS)
+
+    def update_joints(self, side: Side, joints_rad: Floats, time_s: float) -> None:
+        """Add measured joint angles (6,), rad."""
+        before = self._joints.get(side)
+        if before is None or np.abs(joints_rad - before).max() > MAX_STILL_RAD:
+            self._joints[side], self._still_since_s = joints_rad, time_s
+
+    def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
+        """Add an image pair (h, w), record its marks if its pose is new, and return a hint."""
+        if len(self._joints) < len(SIDES):
+            return "no message from both arms yet"
+        if exposed_s - self._still_since_s < MIN_STILL_S:
+            return "the arms are moving"
+        joints = np.concatenate([self._joints[side] for side in SIDES])
+        if any(np.abs(joints - other).max() < MIN_NEW_JOINT_RAD for other in self._recorded):
+            return "a similar pose is already recorded; move and rotate the sheet"
+        rows = []
+        for side in SIDES:
+            edge = self._geometries[side].world_from_edge(self._joints[side])
+            for fraction in ALONG:
+                mark = np.array([0.0, fraction * self._scene.sheet.height_m, 0.0])
+                found = self._detector.find(left, right, near_world_m=apply(edge, mark))
+                if found is not None:
+                    rows.append([side, *(1e3 * np.array([mark[1], *found])).tolist()])
+        if {row[0] for row in rows} != set(SIDES):
+            return "no mark is visible on one of the clamps"
+        self.count += 1
+        self._recorded.append(joints)
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(
+                [self.count, *row, *np.degrees(joints).tolist()] for row in rows
+            )
+        return f"pose {self.count} recorded with {len(rows)} marks; move and rotate the sheet"
+
+
+def simulate_edge_marks(
+    scene: Scene,
+    apparatus: Apparatus,
+    *,
+    calibration: StereoCalibration | None,
+    seed: int,
+    poses: int = SIMULATED_POSES,
+) -> list[HeldPose]:
+    """Simulate marks on the clamps, as the simulated stereo camera sees them.
+
+    The arms hold the stretched sheet in random poses. In each pose every joint rests anywhere
+    within its backlash. A mark that the triangulator's detector does not accept is left out.
+    calibration: optics that the detector uses; None: the scene's optics.
+    """
+    random = np.random.default_rng(seed)
+    true_scene = apply_apparatus(scene, apparatus)
+    arms = ArmPair(scene, apparatus)
+    detector = MarkDetector(scene, calibration)
+    camera = TwinCamera(
+        make_true_camera(true_scene.camera), finger_radius_m=true_scene.finger.radius_m, seed=seed
+    )
+    found: list[HeldPose] = []
+    for _ in range(MAX_TRIES):
+        if len(found) == poses:
+            break
+        edges = _draw_edges(scene, random)
+        try:
+            joints = arms.solve_joints(edges)
+        except ValueError:
+            continue  # The pose is out of reach: try another random one.
+        play = tuple(_draw_play(apparatus, side, random) for side in ("left", "right"))
+        true_edges = arms.hold(edges, play_rad=(play[0], play[1]))
+        marks = _see_marks(scene, camera, detector, edges, true_edges)
+        found.append(HeldPose(*joints, tuple(marks)))
+    return found
+
+
+def _draw_edges(scene: Scene, random: np.random.Generator) -> tuple[Floats, Floats]:
+    sheet = scene.sheet
+    highest = MIN_STRETCH + STRETCH_RANGE * (sheet.max_stretch_ratio - MIN_STRETCH)
+    length_m = sheet.width_m * random.uniform(MIN_STRETCH, highest)
+    rotation = rotation_from_vector(random.uniform(-TILT_RAD, TILT_RAD))
+    return place_edges(transform(rotation, random.uniform(CENTRE_MIN_M, CENTRE_MAX_M)), length_m)
+
+
+def _draw_play(apparatus: Apparatus, side: Side, random: np.random.Generator) -> Floats:
+    truth = apparatus.arms.left if side == "left" else apparatus.arms.right
+    return 0.5 * (truth.backlash_rad or 0.0) * random.uniform(-1.0, 1.0, 6)
+
+
+def _rest(position: Floats, _time_s: float) -> Floats:
+    return position
+
+
+def _see_marks(
+    scene: Scene,
+    camera: TwinCamera,
+    detector: MarkDetector,
+    expected_edges: tuple[Floats, Floats],
+    true_edges: tuple[Floats, Floats],
+) -> list[EdgeMark]:
+    """Return the marks of both clamps that the detector accepts."""
+    marks = []
+    for side, expected, true in zip(SIDES, expected_edges, true_edges, strict=True):
+        for fraction in ALONG:
+            mark = np.array([0.0, fraction * scene.sheet.height_m, 0.0])
+            images = camera.picture(
+                partial(_rest, apply(true, mark)), exposure_s=scene.camera.exposure_s
+            )
+            found = detector.find(*images, near_world_m=apply(expected, mark))
+            if found is not None:
+                marks.append(EdgeMark(side, mark, found))
+    return marks

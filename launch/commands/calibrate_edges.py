@@ -1,0 +1,225 @@
+"""Define the commands that measure where the arms hold the edges of the sheet."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands.calibrate import (
+    edit_scene,
+    load_optics,
+    load_true_devices,
+    require_twin,
+    round_digits,
+)
+from flexsheet.launch.commands.calibrate_arms import CalibrationOption
+from flexsheet.launch.commands.graph import run_interruptible
+from flexsheet.launch.commands.options import (
+    CYLINDER,
+    JsonOption,
+    RunOption,
+    SceneOption,
+    SeedOption,
+    TwinApparatusOption,
+    output_file,
+)
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    check_folder,
+    examples,
+    print_fields,
+    print_json,
+    words,
+)
+
+if TYPE_CHECKING:
+    from flexsheet.launch.calibration.edge_fit import EdgeFit
+    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
+    from flexsheet.messages.types import Side
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `flexsheet calibrate`."""
+    app.command(
+        "edges",
+        epilog=examples(
+            "flexsheet calibrate edges --rows marks.csv --scene lab.yaml -o measured.yaml",
+            "flexsheet calibrate edges --twin --apparatus seed:3 "
+            "--calibration launch/calibrations/twin-bumblebee.yaml -o measured.yaml",
+        ),
+    )(edges)
+    app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))(
+        edges_capture
+    )
+
+
+def edges(
+    *,
+    output: Annotated[Path, output_file("Copy of the scene file with the measured arms.")],
+    rows: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV", help="CSV file of measured marks, from `calibrate edges-capture`."
+        ),
+    ] = None,
+    scene_file: SceneOption = CYLINDER,
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Simulate the marks instead of reading a file.")
+    ] = False,
+    apparatus: TwinApparatusOption = None,
+    calibration: CalibrationOption = None,
+    seed: SeedOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure where the arms hold the sheet, by marks on the clamps that the stereo camera sees.
+
+    For each arm, the pose of the base, the pose of the edge on the flange, the joint offsets and
+    the compliance of the flange are fitted together, and written into a copy of the scene.
+    """
+    from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
+    from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.apparatus import nominal_apparatus
+
+    check_folder("-o", output)
+    if twin == (rows is not None):
+        raise CommandError("give exactly one of --rows CSV and --twin", BAD_INPUT)
+    require_twin(apparatus, simulated=twin)
+    scene = load_scene(scene_file)
+    if rows is not None:
+        poses = read_edge_marks(rows)
+    else:
+        true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
+        optics = load_optics(calibration, scene)
+        poses = simulate_edge_marks(scene, true, calibration=optics, seed=seed)
+    try:
+        fits = fit_edges(poses, scene)
+    except EdgeFitError as error:
+        raise CommandError(f"{rows or scene_file}: {error}; {error.remedy}", BAD_INPUT) from error
+    _write_scene(scene_file, fits, output)
+    _print_result(fits, output, as_json=as_json)
+
+
+def _write_scene(scene_file: Path, fits: dict[Side, EdgeFit], copy: Path) -> None:
+    with edit_scene(scene_file, copy) as tree:
+        for side, fit in fits.items():
+            target = tree["arms"][side]
+            for name in ("world_from_base", "flange_from_edge"):
+                pose = getattr(fit.arm, name)
+                for key in ("position_m", "rpy_rad"):
+                    for index, value in enumerate(getattr(pose, key)):
+                        target[name][key][index] = round_digits(value)
+            target["joint_offsets_rad"] = [round_digits(one) for one in fit.arm.joint_offsets_rad]
+            target["flange_compliance_m_per_n"] = round_digits(fit.arm.flange_compliance_m_per_n)
+
+
+def _print_result(fits: dict[Side, EdgeFit], output: Path, *, as_json: bool) -> None:
+    if as_json:
+        found = {
+            side: {
+                "marks": fit.marks,
+                "poses": fit.poses,
+                "residual_rms_m": fit.residual_rms_m,
+                "edge_std_m": fit.edge_std_m,
+                "joint_offsets_rad": fit.arm.joint_offsets_rad,
+                "flange_compliance_m_per_n": fit.arm.flange_compliance_m_per_n,
+                "compliance_std_m_per_n": fit.compliance_std_m_per_n,
+            }
+            for side, fit in fits.items()
+        }
+        print_json({"scene": str(output), "arms": found})
+        return
+    print_fields([("scene", output)])
+    for side, fit in fits.items():
+        print()
+        compliance = 1e6 * fit.arm.flange_compliance_m_per_n
+        print_fields(
+            [
+                (f"{side} arm", f"{fit.marks} marks in {fit.poses} poses"),
+                ("residual", f"{1e3 * fit.residual_rms_m:.3f} mm rms"),
+                ("uncertainty of the edge", f"{1e3 * fit.edge_std_m:.3f} mm"),
+                (
+                    "compliance of the flange",
+                    f"{compliance:.0f} ± {1e6 * fit.compliance_std_m_per_n:.0f} µm/N",
+                ),
+            ]
+        )
+
+
+def edges_capture(
+    *,
+    output: Annotated[Path, output_file("New CSV file for the marks.")],
+    scene_file: SceneOption = CYLINDER,
+    poses: Annotated[
+        int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
+    ] = 24,
+    calibration: CalibrationOption = None,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Record marks on both clamps for `calibrate edges`, from the running graph.
+
+    Fix three bright marks on each clamp: at its centre and 45 % of its length above and below. Move
+    the sheet to poses that differ in position, rotation and stretch. A pose is recorded when both
+    arms are at rest. Ctrl-C stops.
+    """
+    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
+    from flexsheet.launch.plans.plan import load_scene
+
+    scene = load_scene(scene_file)
+    try:
+        recorder = EdgeMarkRecorder(output, scene, load_optics(calibration, scene))
+    except OSError as error:
+        raise CommandError(
+            f"-o {output}: cannot be created: {error.strerror}; name a new file", BAD_INPUT
+        ) from error
+    size = (scene.camera.width_px, scene.camera.height_px)
+    run_interruptible(_record(recorder, size, poses, run))
+    if as_json:
+        print_json({"rows": str(output), "poses": recorder.count})
+    else:
+        words.print(f"{recorder.count} poses in {output}", markup=False)
+
+
+async def _record(
+    recorder: EdgeMarkRecorder, size: tuple[int, int], poses: int, run: Path | None
+) -> int:
+    from flexsheet.launch.commands.topic import make_listener
+    from flexsheet.messages.topics import TOPICS
+
+    images: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
+
+    def on_stereo(pair: Any, _: Any) -> None:
+        # Image pairs that arrive while another one is processed are dropped and not needed.
+        if images.empty():
+            images.put_nowait((pair, time.monotonic()))
+
+    def on_arm(state: Any, _: Any) -> None:
+        recorder.update_joints(state.side, state.joints_rad, time.monotonic())
+
+    handlers = {"arm_left": on_arm, "arm_right": on_arm, "stereo": on_stereo}
+    subscribers = [make_listener(TOPICS[name], run, handler) for name, handler in handlers.items()]
+    printed = ""
+    try:
+        for subscriber in subscribers:
+            subscriber.start()
+        while recorder.count < poses:
+            pair, time_s = await images.get()
+            if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
+                hint = "the camera publishes image regions; configure it to publish whole images"
+            else:
+                hint = await asyncio.to_thread(
+                    recorder.update_images, pair.left, pair.right, time_s
+                )
+            if hint != printed:
+                words.print(hint, markup=False)
+            printed = hint
+    finally:
+        for subscriber in subscribers:
+            subscriber.close()
+    return 0

@@ -1,0 +1,222 @@
+"""Make the images of the console in docs/images: `python -m website.console_images`.
+
+A graph with the simulator records a finger that strokes the object and pushes it.  The animation is
+drawn from that bag, frame by frame, so it does not depend on the speed of the computer.  The images
+of the page show the console of a running graph.  Chromium is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import viser
+from PIL import Image
+from playwright.async_api import Page, async_playwright, expect
+
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.run import run_experiment
+from flexsheet.launch.experiments.stroke import object_pose
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.precompute import precompute_graph
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Scene, require_cylinder
+from flexsheet.messages.types import FingerPath, Skin
+from flexsheet.nodes.console.replay import Timeline
+from flexsheet.nodes.console.scene_view import SceneView
+from flexsheet.nodes.console.snapshot import compute_snapshot
+from flexsheet.nodes.models.rigid import apply
+
+ROOT = Path(__file__).resolve().parent.parent
+DEMO = ROOT / "launch" / "demo.yaml"
+IMAGES = ROOT / "docs" / "images"
+CHROMIUM = Path("/usr/bin/chromium")
+WITHOUT_GPU = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+DEADLINE_MS = 180_000.0
+
+PATH_LABEL = "stroke and push"
+KNOTS = (
+    # time (s), along the axis (m), angle from the front (rad), depth (m)
+    (0.0, -0.02, 0.0, 0.012),
+    (0.8, -0.02, 0.0, 0.012),
+    (2.2, 0.0, 0.55, 0.004),
+    (4.2, 0.0, -0.55, 0.004),
+    (5.4, 0.02, 0.0, 0.004),
+    (6.3, 0.02, 0.0, 0.016),
+    (6.9, 0.02, 0.0, 0.016),
+    (8.0, -0.02, 0.0, 0.012),
+)
+"""Points of the finger's path on the cylinder; the last equals the first, so that it repeats."""
+
+PATH_S = KNOTS[-1][0]
+FRAMES_PER_S = 12
+SIZE_PX = (760, 480)
+POSITION_M, TARGET_M, FOV_RAD = (0.42, 0.16, 0.78), (0.0, -0.07, 0.0), 0.75
+WEBP_QUALITY = 72
+PAGE_PX = (1200, 760)
+
+
+def finger_path(scene: Scene) -> FingerPath:
+    """Make the path of the finger on the scene's cylinder."""
+    radius_m = require_cylinder(scene).radius_m
+    knots = np.array(KNOTS)
+    distance_m = radius_m - knots[:, 3]
+    points = np.column_stack(
+        [knots[:, 1], distance_m * np.sin(knots[:, 2]), distance_m * np.cos(knots[:, 2])]
+    )
+    return FingerPath(
+        label=PATH_LABEL,
+        times_s=knots[:, 0],
+        positions_world_m=apply(object_pose(scene), points),
+        wander_m=0.0,
+        tremor_m=0.0,
+        joined_by="spline",
+    )
+
+
+def record(bag: Path) -> None:
+    """Record two passes of the finger; the second one has no approach."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        for _ in range(2):
+            await driver.follow(finger_path(scene))
+
+    run_experiment(DEMO, (), bag, procedure, print)
+
+
+def start_of_last_pass_s(bag: Path) -> float:
+    """Return the time in the bag at which the last pass of the finger begins."""
+    reader = BagReader(bag)
+    times_ns = [time_ns for _, _, _, time_ns in BagReader(bag, topics=["twin/finger_path"])]
+    return (times_ns[-1] - reader.info().start_ns) * 1e-9
+
+
+@asynccontextmanager
+async def open_page(url: str, size_px: tuple[int, int], *, dark: bool) -> AsyncIterator[Page]:
+    async with async_playwright() as play:
+        chromium = await play.chromium.launch(
+            executable_path=str(CHROMIUM), args=list(WITHOUT_GPU), timeout=DEADLINE_MS
+        )
+        width, height = size_px
+        page = await chromium.new_page(
+            viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
+        )
+        page.set_default_timeout(DEADLINE_MS)
+        await page.goto(url)
+        yield page
+        await chromium.close()
+
+
+async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) -> None:
+    """Draw the last pass of the finger in a bag as an animated WebP."""
+    timeline = Timeline(bag)
+    start_s = start_of_last_pass_s(bag)
+    timeline.seconds = start_s
+    scene, skin = timeline.latest("scene", Scene), timeline.latest("skin", Skin)
+    assert scene is not None
+    assert skin is not None
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    joined: asyncio.Future[viser.ClientHandle] = asyncio.get_running_loop().create_future()
+    loop = asyncio.get_running_loop()
+
+    @server.on_client_connect
+    def _join(client: viser.ClientHandle) -> None:
+        loop.call_soon_threadsafe(joined.set_result, client)
+
+    view = SceneView(server)
+    view.set_scene(scene[0])
+    view.set_skin(np.asarray(skin[0].vertices_world_m, dtype=np.float64), skin[0].triangles)
+    url = f"http://127.0.0.1:{server.get_port()}/"
+    frames = []
+    async with open_page(url, SIZE_PX, dark=False):
+        client = await joined
+        client.camera.position, client.camera.look_at = POSITION_M, TARGET_M
+        client.camera.up_direction, client.camera.fov = (0.0, 1.0, 0.0), FOV_RAD
+        for seconds in np.arange(0.0, PATH_S, 1.0 / frames_per_s):
+            timeline.seconds = start_s + float(seconds)
+            view.draw(compute_snapshot(scene[0], timeline))
+            drawn = await asyncio.to_thread(
+                client.get_render, SIZE_PX[1], SIZE_PX[0], transport_format="png"
+            )
+            frames.append(Image.fromarray(drawn[..., :3]))
+    server.stop()
+    frames[0].save(
+        output,
+        save_all=True,
+        append_images=frames[1:],
+        duration=round(1000 / frames_per_s),
+        loop=0,
+        quality=WEBP_QUALITY,
+        method=6,
+    )
+
+
+async def slide(page: Page, label: str, value: float) -> None:
+    """Enter a number beside a slider of the page."""
+    box = page.get_by_role("textbox", name=label)
+    await box.fill(f"{value:g}")
+    await box.press("Enter")
+
+
+async def photograph(bag: Path) -> None:
+    """Save images of the page of a running graph: tab Touch, a replay, and tab Graph when dark."""
+    settings = [f"console.bags={bag.parent}"]
+    plan = load_graph(DEMO, settings=settings, console=True)
+    precompute_graph(plan, print)
+    url = f"http://127.0.0.1:{plan.nodes['console'].parameters['page_port']}/"
+    expect.set_options(timeout=DEADLINE_MS)
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_MS / 1e3)
+        async with open_page(url, PAGE_PX, dark=False) as page:
+            await dismiss_notice(page)
+            await slide(page, "Push, mm", 12)
+            await expect(page.get_by_role("status")).to_contain_text("following")
+            await expect(page.get_by_text("pushes 1")).to_be_visible()
+            await page.screenshot(path=IMAGES / "console.png")
+            await page.get_by_role("tab", name="Record").click()
+            await page.get_by_role("button", name="Show the bag").click()
+            await slide(page, "Time, s", 12)
+            await page.screenshot(path=IMAGES / "console-replay.png")
+            await page.get_by_role("button", name="Back to the running graph").click()
+        async with open_page(f"{url}?darkMode", PAGE_PX, dark=True) as page:
+            await dismiss_notice(page)
+            await page.get_by_role("tab", name="Graph").click()
+            await expect(page.get_by_role("table", name="Topics")).to_contain_text("sheet_target")
+            await page.screenshot(path=IMAGES / "console-dark.png")
+
+
+async def dismiss_notice(page: Page) -> None:
+    """Close the notice of the 3D view that there is no graphics card."""
+    notice = page.get_by_role("alert").filter(has_text="Software WebGL")
+    await notice.get_by_role("button").evaluate("button => button.click()")
+    await expect(notice).to_have_count(0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bag", type=Path, help="bag of an earlier run of this command")
+    parser.add_argument("--animation-only", action="store_true")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
+        bag = given.bag or Path(folder) / "touch.mcap"
+        if given.bag is None or not bag.exists():
+            record(bag)
+        asyncio.run(animate(bag, IMAGES / "console.webp"))
+        if not given.animation_only:
+            asyncio.run(photograph(bag))
+
+
+if __name__ == "__main__":
+    main()
