@@ -49,6 +49,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "calibrate_projector",
         "calibrate_sheet",
     ),
+    "commission": ("commission",),
     "precompute": ("precompute",),
     "keys": ("keys",),
     "systemd": ("systemd",),

@@ -23,7 +23,6 @@ from flexsheet.launch.experiments.offline import (
     Metric,
     NodeCalibrations,
     OfflineEvaluator,
-    compute_history_ratios,
     exceeded_tolerances,
 )
 from flexsheet.launch.experiments.ports import choose_ports
@@ -42,6 +41,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import SelfCheck, Status, SuspectedCause
+from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,

@@ -28,6 +28,7 @@ from flexsheet.launch.calibration.corners import (
     match_views,
 )
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CameraLens, CornerView, LensRig
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -48,6 +49,7 @@ from flexsheet.nodes.twin.arms import RANGE_RAD, solve_inverse_kinematics
 from flexsheet.nodes.twin.arms import forward as twin_forward
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -313,24 +315,74 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
     )
 
 
+class SimulatedArm:
+    """Simulated arm without a sheet: true pose of its base, and true errors of its joints.
+
+    Without an apparatus, the base deviates at random from the scene's, and each joint has random
+    errors of SIMULATED_JOINT_RAD. With one, its values count, and the backlash leaves each joint
+    anywhere within the play.
+    """
+
+    def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:
+        self._random = np.random.default_rng([seed, side == "left", 2])
+        if apparatus is None:
+            self.world_from_base = draw_true_base(scene, side, seed=seed)
+            self._offsets_rad, self._backlash_rad = np.zeros(6), None
+            return
+        pose = getattr(apply_apparatus(scene, apparatus).arms, side).world_from_base
+        self.world_from_base = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        truth = getattr(apparatus.arms, side)
+        self._offsets_rad, self._backlash_rad = (
+            np.array(truth.joint_offsets_rad),
+            truth.backlash_rad,
+        )
+
+    def place_flange(self, joints_rad: Floats, *, exact: bool = False) -> Floats:
+        """Return the true world_from_flange (4, 4) for reported joint angles (6,).
+
+        exact: leave out the errors that differ from pose to pose.
+        """
+        if exact:
+            errors = np.zeros(6)
+        elif self._backlash_rad is None:
+            errors = self._random.normal(0.0, SIMULATED_JOINT_RAD, 6)
+        else:
+            errors = 0.5 * self._backlash_rad * self._random.uniform(-1.0, 1.0, 6)
+        true_rad = joints_rad + self._offsets_rad + errors
+        return self.world_from_base @ twin_forward(
+            np.clip(true_rad, RANGE_RAD[:, 0], RANGE_RAD[:, 1])
+        )
+
+
+READY_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
+"""Joint angles at which the simulated arm reaches forward."""
+
+
 def simulate_poses(
-    scene: Scene, board: Board, side: Side, folder: Path, *, places: int, seed: int
+    scene: Scene,
+    board: Board,
+    side: Side,
+    folder: Path,
+    *,
+    places: int,
+    seed: int,
+    apparatus: Apparatus | None = None,
 ) -> Iterator[int]:
     """Write images of a board on the simulated arm to a folder; yield the count after each pose.
 
-    The joint angles have random errors of SIMULATED_JOINT_RAD; the images have blur and noise.
-    Raises BoardError for a board that cannot be rendered.
+    The images have blur and noise. apparatus: true camera and arms; None: arms that deviate at
+    random from the scene. Raises BoardError for a board that cannot be rendered.
     """
     random = np.random.default_rng([seed, side == "left", 1])
-    camera = make_true_camera(scene.camera)
-    simulated = TwinBoard(camera, board, seed=seed)
-    base = draw_true_base(scene, side, seed=seed)
-    camera_pose = scene.camera.world_from_left
+    true_camera = apply_apparatus(scene, apparatus).camera
+    simulated = TwinBoard(make_true_camera(true_camera), board, seed=seed)
+    arm = SimulatedArm(scene, side, apparatus, seed=seed)
+    base = arm.world_from_base
+    camera_pose = true_camera.world_from_left
     world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
-    ready = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
     # Put the board 60 mm in front of the flange; it faces the camera while the arm reaches forward.
-    flange = base @ twin_forward(ready)
+    flange = base @ twin_forward(READY_RAD)
     position = flange[:3, 3] + 0.06 * flange[:3, 2]
     facing = transform(world_from_left[:3, :3], position - world_from_left[:3, :3] @ middle)
     flange_from_board = inverse(flange) @ facing
@@ -341,16 +393,11 @@ def simulate_poses(
         board_pose = transform(rotation, centre - rotation @ middle)
         try:
             joints = solve_inverse_kinematics(
-                inverse(base) @ board_pose @ inverse(flange_from_board), ready
+                inverse(base) @ board_pose @ inverse(flange_from_board), READY_RAD
             )
         except ValueError:
             continue  # The pose is out of reach: try another random one.
-        true_joints = np.clip(
-            joints + random.normal(0.0, SIMULATED_JOINT_RAD, 6), RANGE_RAD[:, 0], RANGE_RAD[:, 1]
-        )
-        left_from_board = (
-            inverse(world_from_left) @ base @ twin_forward(true_joints) @ flange_from_board
-        )
+        left_from_board = inverse(world_from_left) @ arm.place_flange(joints) @ flange_from_board
         if not _is_in_both_views(simulated, left_from_board):
             continue
         done += 1

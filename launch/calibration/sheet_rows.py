@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flexsheet.launch.calibration.sheet_fit import MeasuredPush
-from flexsheet.launch.calibration.simulated_sheet import simulate_push
+from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene, SheetSpec
 
 REQUIRED = ("depth_mm", "force_n")
@@ -199,29 +200,37 @@ def simulate_rows(
     places: bool,
     noise_n: float,
     seed: int,
+    apparatus: Apparatus | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[MeasuredPush]:
     """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
 
-    places: whether to push at points all over the sheet, not only at its centre.
+    places: whether to push at points all over the sheet, not only at its centre. apparatus: true
+    arms and sheet; None: as the scene. Rubber with hysteresis gives a row for each direction.
     """
     rng = np.random.default_rng(seed)
+    sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
+    radius_m = scene.finger.radius_m
     pushes: list[MeasuredPush] = []
     cases = list(_simulated_cases(scene, places))
-    for done, (stretch, depth, point_m) in enumerate(cases, start=1):
-        force, edge_force = simulate_push(
-            scene.sheet, stretch, depth, point_m, scene.finger.radius_m
-        )
-        pushes.append(
-            MeasuredPush(
-                edge_distance_m=stretch * scene.sheet.width_m,
-                depth_m=depth,
-                force_n=force + float(rng.normal(0.0, noise_n)),
-                finger_radius_m=scene.finger.radius_m,
-                position_m=point_m,
-                edge_force_n=edge_force + float(rng.normal(0.0, 10.0 * noise_n)),
+    for done, (stretch, depth_m, point_m) in enumerate(cases, start=1):
+        distance_m = stretch * scene.sheet.width_m
+        forces_n, edge_force_n = sheet.push(distance_m, depth_m, point_m, radius_m)
+        hysteresis = forces_n[0] != forces_n[1]
+        for force_n, unloading in zip(forces_n, (False, True), strict=True):
+            if unloading and not hysteresis:
+                continue
+            pushes.append(
+                MeasuredPush(
+                    edge_distance_m=distance_m,
+                    depth_m=depth_m,
+                    force_n=force_n + float(rng.normal(0.0, noise_n)),
+                    finger_radius_m=radius_m,
+                    position_m=point_m,
+                    edge_force_n=edge_force_n + float(rng.normal(0.0, 10.0 * noise_n)),
+                    unloading=unloading if hysteresis else None,
+                )
             )
-        )
         progress(done, len(cases))
     return pushes
 

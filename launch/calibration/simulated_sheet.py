@@ -10,12 +10,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
+from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import METRES_PER_PX, seen
-from flexsheet.nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, solve
+from flexsheet.nodes.twin.force_history import compute_history_ratios
+from flexsheet.nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, TrueRubber, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -41,18 +45,83 @@ def simulate_push(
 
     point_m: pushed point on the sheet (x, y from its centre).
     """
-    half = 0.5 * sheet.width_m * stretch_ratio
+    edges = place_edges(np.eye(4), sheet.width_m * stretch_ratio)
+    return _push(true_rubber(sheet, None), edges, depth_m, point_m, finger_radius_m, cells=cells)
+
+
+def _push(
+    rubber: TrueRubber,
+    edges: tuple[Floats, Floats],
+    depth_m: float,
+    point_m: tuple[float, float],
+    finger_radius_m: float,
+    *,
+    cells: int = CELLS,
+) -> tuple[float, float]:
+    """Return normal force and clamp force of `simulate_push` for a sheet between two edges (4, 4).
+
+    depth_m and point_m are relative to the flat sheet halfway between the edges.
+    """
+    x, y, normal, middle = _flat_axes(*edges)
+    distance_m = float((edges[1][:3, 3] - edges[0][:3, 3]) @ x)
     pushed = solve(
-        true_rubber(sheet, None),
-        transform(np.eye(3), [-half, 0.0, 0.0]),
-        transform(np.eye(3), [half, 0.0, 0.0]),
-        finger_tip=np.array([*point_m, -depth_m]),
+        rubber,
+        *edges,
+        finger_tip=middle + point_m[0] * x + point_m[1] * y - depth_m * normal,
         finger_radius_m=finger_radius_m,
         cells=cells,
-        slack_tension=JUST_TAUT_TENSION if stretch_ratio >= 1.0 else SLACK_TENSION,
+        slack_tension=JUST_TAUT_TENSION if distance_m >= rubber.width_m else SLACK_TENSION,
     )
-    clamp_force_n = 0.5 * (pushed.left_force_n[0] - pushed.right_force_n[0])
-    return float(pushed.finger_force_n[2]), float(clamp_force_n)
+    clamp_force_n = 0.5 * float((pushed.left_force_n - pushed.right_force_n) @ x)
+    return float(pushed.finger_force_n @ normal), clamp_force_n
+
+
+def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return x, y, normal and centre (3,) of the flat sheet between two edges (4, 4)."""
+    x = right[:3, 3] - left[:3, 3]
+    x = x / np.linalg.norm(x)
+    normal = np.cross(x, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    return x, np.cross(normal, x), normal, 0.5 * (left[:3, 3] + right[:3, 3])
+
+
+class SimulatedSheet:
+    """Sheet between the simulated arms of an apparatus, which are controlled by a scene.
+
+    The arms move the edges to the poses that the kinematics of the scene compute. The true edges
+    deviate from them by the errors of bases, joints and clamps, and by the compliance of the arms.
+    """
+
+    def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
+        true_scene = apply_apparatus(scene, apparatus)
+        self._arms = ArmPair(scene, apparatus)
+        self._rubber = true_rubber(true_scene.sheet, apparatus)
+        self._history_ratios = compute_history_ratios(apparatus)
+
+    def push(
+        self, distance_m: float, depth_m: float, point_m: tuple[float, float], radius_m: float
+    ) -> tuple[tuple[float, float], float]:
+        """Return the normal forces of a push, while the finger moves in and out, and the clamp
+        force, N.
+
+        distance_m: commanded distance of the edges. radius_m: radius of the pushing ball,
+        to which touched rubber sticks.
+        """
+        edges = self._arms.hold(place_edges(np.eye(4), distance_m))
+        force_n, clamp_n = _push(self._rubber, edges, depth_m, point_m, radius_m)
+        moving_in, moving_out = (float(ratio) * force_n for ratio in self._history_ratios)
+        return (moving_in, moving_out), clamp_n
+
+    def hold(self, world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
+        """Hold the sheet at a commanded pose (4, 4).
+
+        Returns the true pose (4, 4) of the flat sheet between the edges, and the true points (n, 3)
+        of the sheet, which its weight bends.
+        """
+        left, right = self._arms.hold(place_edges(world_from_sheet, distance_m))
+        x, y, normal, middle = _flat_axes(left, right)
+        flat = transform(np.column_stack([x, y, normal]), middle)
+        return flat, solve(self._rubber, left, right).positions.reshape(-1, 3)
 
 
 def simulate_force(

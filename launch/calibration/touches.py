@@ -15,6 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.finger_frame import world_from_finger
+from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
@@ -154,23 +155,29 @@ def simulate_touches(
 ) -> list[Touch]:
     """Simulate touches of a known point, as the simulated stereo camera sees them.
 
-    Each orientation of `SIMULATED_TILTS_DEG` is used once. The marker positions are those that the
-    triangulator's detector finds; a touch whose marker it does not accept is left out. calibration:
-    optics that the detector uses; None: the scene's optics.
+    Each orientation of `SIMULATED_TILTS_DEG` is used once, relative to the usual orientation of the
+    finger. The fit takes that one for `direction_world`, so that its offset is right in use. The
+    marker positions are those that the triangulator's detector finds; a touch whose marker it does
+    not accept is left out. calibration: optics that the detector uses; None: the scene's optics.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
     random = np.random.default_rng(seed)
+    usual = Nail.of(apparatus.finger)
     touches = []
     for number, tilt_deg in enumerate(SIMULATED_TILTS_DEG):
         tilt_rad = np.radians(tilt_deg)
         held = tilt_rad + random.normal(0.0, SIMULATED_TILT_RAD, 2)
-        finger = apparatus.finger.model_copy(update={"finger_tilt_rad": tuple(held.tolist())})
+        turn = rotation_from_vector([*held, 0.0])
         camera = TwinCamera(
             make_true_camera(true_scene.camera),
             finger_radius_m=true_scene.finger.radius_m,
             seed=seed + number,
-            nail=Nail.of(finger),
+            nail=Nail(
+                turn @ usual.marker_offset_m,
+                None if usual.marker_normal is None else turn @ usual.marker_normal,
+                turn @ usual.direction,
+            ),
         )
         pad = SIMULATED_POINT_M + random.normal(0.0, SIMULATED_HAND_M, 3)
         seen = _see_marker(camera, scene, geometry, pad)

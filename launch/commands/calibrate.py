@@ -10,13 +10,17 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SeedOption, output_file
+from flexsheet.launch.commands.options import (
+    JsonOption,
+    SeedOption,
+    TwinApparatusOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -27,9 +31,9 @@ from flexsheet.launch.commands.output import (
     print_table,
     words,
 )
-from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
+    from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Scene
 
@@ -97,6 +101,7 @@ def stereo(
         Path | None,
         typer.Option(metavar="SCENE", help="Simulate the camera of this scene file."),
     ] = None,
+    apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
     pictures: Annotated[
@@ -135,6 +140,7 @@ def stereo(
 
     check_folder("-o", output)
     _check_single_source(left, right, device_source, twin)
+    require_twin(apparatus, simulated=twin is not None)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
     command = ["flexsheet", "calibrate", "stereo"]
@@ -156,8 +162,10 @@ def stereo(
                 still_images=1 if device_source is None else 4,
             )
             if device_source is None:
-                views = capture.simulate_views(scene, described, pairs=pairs, seed=seed)
+                true = load_true_devices(apparatus, scene)
+                views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
                 command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
+                command += [] if apparatus is None else ["--apparatus", apparatus]
             else:
                 views = capture.read_device_views(device_source, scene)
                 command += ["--device-source", device_source, "--scene", str(camera_scene)]
@@ -440,19 +448,11 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 
     Comments and layout are preserved. Raises BadInputError if the changed scene is invalid.
     """
-    from ruamel.yaml import YAML
-
+    from flexsheet.launch.plans.documents import edit_yaml
     from flexsheet.launch.plans.plan import load_scene
 
-    yaml = YAML(typ="rt", pure=True)
-    yaml.width = 4096
-    yaml.preserve_quotes = True
-    yaml.indent(sequence=4, offset=2)
-    tree = yaml.load(scene_file.read_text(encoding="utf-8"))
-    yield tree
-    text = StringIO()
-    yaml.dump(tree, text)
-    write_file(copy, text.getvalue())
+    with edit_yaml(scene_file, copy) as tree:
+        yield tree
     load_scene(copy)
 
 
@@ -471,6 +471,26 @@ def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
     except CalibrationMismatchError as error:
         raise CommandError(f"{path}: {error}", BAD_INPUT) from error
     return calibration
+
+
+def require_twin(apparatus: str | None, *, simulated: bool) -> None:
+    """Raise CommandError if --apparatus is given without --twin."""
+    if apparatus is not None and not simulated:
+        raise CommandError(
+            f"--apparatus {apparatus}: the option is for --twin only; remove it", BAD_INPUT
+        )
+
+
+def load_true_devices(text: str | None, scene: Scene) -> Apparatus | None:
+    """Load the apparatus of a simulated calibration; None without a text.
+
+    It is described in the world frame that the stereo camera defines, to which all calibrations
+    refer.
+    """
+    from flexsheet.launch.plans.apparatus import load_apparatus
+    from flexsheet.nodes.twin.truth import align_world_to_camera
+
+    return None if text is None else align_world_to_camera(scene, load_apparatus(text, scene))
 
 
 def round_digits(value: float) -> float:

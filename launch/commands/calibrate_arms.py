@@ -24,6 +24,8 @@ from flexsheet.launch.commands.calibrate import (
     _progress,
     edit_scene,
     load_optics,
+    load_true_devices,
+    require_twin,
     round_digits,
 )
 from flexsheet.launch.commands.graph import run_interruptible
@@ -32,6 +34,7 @@ from flexsheet.launch.commands.options import (
     RunOption,
     SceneOption,
     SeedOption,
+    TwinApparatusOption,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -47,6 +50,7 @@ from flexsheet.launch.commands.output import (
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.arm_poses import PoseRecorder
     from flexsheet.launch.calibration.hand_eye import BaseFit, BoardDetection
+    from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Scene
@@ -109,6 +113,7 @@ def arms(
         bool, typer.Option("--twin", help="Calibrate simulated arms instead of recorded poses.")
     ] = False,
     places: Annotated[int, typer.Option(help="Number of simulated poses per arm.", min=6)] = 16,
+    apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
@@ -134,9 +139,11 @@ def arms(
     check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give either --twin, or --left-arm, --right-arm or both", BAD_INPUT)
+    require_twin(apparatus, simulated=twin)
     if copy is not None:
         _check_new_file(copy, "--write-scene")
     scene = load_scene(scene_file)
+    true = load_true_devices(apparatus, scene)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     optics = load_optics(calibration, scene)
     folders: dict[Side, Path | None] = {"left": left_arm, "right": right_arm}
@@ -146,20 +153,22 @@ def arms(
     try:
         for side in SIDES:
             if simulated is not None:
-                folders[side] = _simulate_folder(
-                    scene, described, side, folder=simulated, places=places, seed=seed
+                folders[side] = simulate_folder(
+                    scene, described, side, true, folder=simulated, places=places, seed=seed
                 )
             folder = folders[side]
             if folder is not None:
-                fits[side], blind[side] = _fit(folder, described, scene, optics, side)
+                fits[side], blind[side] = fit_folder(folder, described, scene, optics, side)
     finally:
         if simulated is not None:
             shutil.rmtree(simulated)
-    measured = _make_calibration(fits, scene, described)
+    measured = make_calibration(fits, scene, described)
     save_arms_calibration(measured, output, comment=shlex.join(["flexsheet", *sys.argv[1:]]))
     if copy is not None:
         _write_copy(scene_file, measured, copy)
-    truth = {side: _true_errors(scene, side, fits[side], seed) for side in fits} if twin else {}
+    truth = (
+        {side: _true_errors(scene, side, fits[side], true, seed) for side in fits} if twin else {}
+    )
     _print_result(
         measured, scene, blind=blind, truth=truth, output=output, copy=copy, as_json=as_json
     )
@@ -295,8 +304,15 @@ def _check_new_file(path: Path, option: str) -> None:
     check_folder(option, path)
 
 
-def _simulate_folder(
-    scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
+def simulate_folder(
+    scene: Scene,
+    board: Board,
+    side: Side,
+    apparatus: Apparatus | None,
+    *,
+    folder: Path,
+    places: int,
+    seed: int,
 ) -> Path:
     """Write the simulated poses of one arm to a new folder, and return its path."""
     from flexsheet.launch.calibration.arm_poses import simulate_poses
@@ -306,14 +322,16 @@ def _simulate_folder(
     poses.mkdir()
     try:
         with _progress(f"simulating the {side} arm") as progress:
-            for done in simulate_poses(scene, board, side, poses, places=places, seed=seed):
+            for done in simulate_poses(
+                scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
+            ):
                 progress(done, places, f"simulating the {side} arm")
     except BoardError as error:
         raise CommandError(str(error), BAD_INPUT) from error
     return poses
 
 
-def _fit(
+def fit_folder(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
     from flexsheet.launch.calibration.arm_poses import ArmPosesError, make_lens_rig, read_detections
@@ -334,7 +352,7 @@ def _fit(
         raise CommandError(f"{side} arm, {folder}: {error}", BAD_INPUT) from error
 
 
-def _make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:
+def make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:
     from flexsheet.messages.arms_calibration import ArmsCalibration
 
     return ArmsCalibration(
@@ -400,14 +418,19 @@ def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None
                     target[key][index] = round_digits(value)
 
 
-def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str, float]:
-    """Return the position and rotation errors of a simulated arm's base at the world origin."""
+def _true_errors(
+    scene: Scene, side: Side, fit: BaseFit, apparatus: Apparatus | None, seed: int
+) -> dict[str, float]:
+    """Return the errors of a simulated arm's flange at the world origin, without backlash."""
     import numpy as np
 
-    from flexsheet.launch.calibration.arm_poses import draw_true_base
+    from flexsheet.launch.calibration.arm_poses import READY_RAD, SimulatedArm
+    from flexsheet.nodes.arm_bridge.kinematics import forward
     from flexsheet.nodes.models.rigid import inverse, vector_from_rotation
 
-    error = draw_true_base(scene, side, seed=seed) @ inverse(fit.world_from_base)
+    arm = SimulatedArm(scene, side, apparatus, seed=seed)
+    true = arm.place_flange(READY_RAD, exact=True)
+    error = true @ inverse(fit.world_from_base @ forward(READY_RAD))
     return {
         "true_error_m": float(np.linalg.norm(error[:3, 3])),
         "true_error_rad": float(np.linalg.norm(vector_from_rotation(error[:3, :3]))),

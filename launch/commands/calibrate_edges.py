@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.calibrate import edit_scene, load_optics, round_digits
+from flexsheet.launch.commands.calibrate import (
+    edit_scene,
+    load_optics,
+    load_true_devices,
+    require_twin,
+    round_digits,
+)
 from flexsheet.launch.commands.calibrate_arms import CalibrationOption
 from flexsheet.launch.commands.graph import run_interruptible
 from flexsheet.launch.commands.options import (
@@ -18,6 +24,7 @@ from flexsheet.launch.commands.options import (
     RunOption,
     SceneOption,
     SeedOption,
+    TwinApparatusOption,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -64,13 +71,7 @@ def edges(
     twin: Annotated[
         bool, typer.Option("--twin", help="Simulate the marks instead of reading a file.")
     ] = False,
-    apparatus: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|seed:N",
-            help="With --twin: true parameters of the simulated hardware; default: as the scene.",
-        ),
-    ] = None,
+    apparatus: TwinApparatusOption = None,
     calibration: CalibrationOption = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
@@ -82,22 +83,18 @@ def edges(
     """
     from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
     from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
-    from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.apparatus import nominal_apparatus
 
     check_folder("-o", output)
     if twin == (rows is not None):
         raise CommandError("give exactly one of --rows CSV and --twin", BAD_INPUT)
-    if apparatus is not None and not twin:
-        raise CommandError(
-            f"--apparatus {apparatus}: the option is for --twin only; remove it", BAD_INPUT
-        )
+    require_twin(apparatus, simulated=twin)
     scene = load_scene(scene_file)
     if rows is not None:
         poses = read_edge_marks(rows)
     else:
-        true = nominal_apparatus(scene) if apparatus is None else load_apparatus(apparatus, scene)
+        true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
         optics = load_optics(calibration, scene)
         poses = simulate_edge_marks(scene, true, calibration=optics, seed=seed)
     try:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexsheet.launch.commands.calibrate import load_true_devices
 from flexsheet.launch.commands.options import (
     CYLINDER,
     JsonOption,
     SceneOption,
     SeedOption,
+    TwinApparatusOption,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -27,7 +29,9 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from flexsheet.launch.calibration.marker_fit import Touch
     from flexsheet.messages.marker_calibration import MarkerCalibration
+    from flexsheet.messages.scene import Scene
 
 
 def register(app: typer.Typer) -> None:
@@ -57,13 +61,7 @@ def marker(
         Path | None,
         typer.Option(metavar="SCENE", help="Simulate the touches with the finger of this scene."),
     ] = None,
-    apparatus: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|seed:N",
-            help="With --twin: true parameters of the simulated hardware; default: as the scene.",
-        ),
-    ] = None,
+    apparatus: TwinApparatusOption = None,
     calibration_file: Annotated[
         Path | None,
         typer.Option(
@@ -77,13 +75,11 @@ def marker(
 
     Touches of known points are rows of a CSV file (--rows, --scene) or are simulated (--twin).
     """
-    from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
-    from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.apparatus import nominal_apparatus
     from flexsheet.messages.calibration import load_calibration
-    from flexsheet.messages.marker_calibration import MarkerCalibration, save_marker_calibration
+    from flexsheet.messages.marker_calibration import save_marker_calibration
 
     check_folder("-o", output)
     if (rows is None) == (twin is None):
@@ -102,18 +98,28 @@ def marker(
     else:
         assert twin is not None
         scene = load_scene(twin)
-        true = nominal_apparatus(scene) if apparatus is None else load_apparatus(apparatus, scene)
+        true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
         optics = None if calibration_file is None else load_calibration(calibration_file)
         touches = simulate_touches(scene, true, calibration=optics, seed=seed)
         command += ["--twin", str(twin), "--seed", str(seed)]
         command += [] if apparatus is None else ["--apparatus", apparatus]
         command += [] if calibration_file is None else ["--calibration", str(calibration_file)]
         source = f"twin of {scene.name}"
+    calibration = make_calibration(touches, scene, source)
+    save_marker_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    _print_result(calibration, output, as_json)
+
+
+def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
+    """Fit the marker's position to touches, and return it as a calibration; raises CommandError."""
+    from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
+    from flexsheet.messages.marker_calibration import MarkerCalibration
+
     try:
         fit = fit_marker(touches)
     except MarkerFitError as error:
         raise CommandError(f"{source}: {error}; {error.remedy}", BAD_INPUT) from error
-    calibration = MarkerCalibration(
+    return MarkerCalibration(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         code_version=version("flexsheet"),
         source=source,
@@ -126,8 +132,6 @@ def marker(
         touches=len(touches),
         orientations=fit.orientations,
     )
-    save_marker_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
-    _print_result(calibration, output, as_json)
 
 
 def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -> None:

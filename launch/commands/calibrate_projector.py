@@ -8,8 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.calibrate import edit_scene, load_optics, round_digits
-from flexsheet.launch.commands.options import JsonOption, SceneOption, SeedOption, output_file
+from flexsheet.launch.commands.calibrate import (
+    edit_scene,
+    load_optics,
+    load_true_devices,
+    require_twin,
+    round_digits,
+)
+from flexsheet.launch.commands.options import (
+    JsonOption,
+    SceneOption,
+    SeedOption,
+    TwinApparatusOption,
+    output_file,
+)
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
@@ -25,6 +37,7 @@ from flexsheet.messages.scene import require_projector
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.gray_code import Image
     from flexsheet.launch.calibration.projector import ProjectorFit
+    from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.scene import Projector, Scene, StereoCamera
 
     Views = tuple[list[Image], list[Image]]
@@ -95,6 +108,7 @@ def projector(
         ),
     ] = False,
     poses: Annotated[int, typer.Option(min=3, help="Number of sheet poses for --twin.")] = 6,
+    apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -125,6 +139,7 @@ def projector(
             "the patterns with --write-patterns FOLDER",
             BAD_INPUT,
         )
+    require_twin(apparatus, simulated=twin)
     if output is not None:
         check_folder("-o", output)
     true: Projector | None = None
@@ -134,13 +149,18 @@ def projector(
         else:
             if twin:
                 from flexsheet.nodes.twin.projector import make_true_projector
+                from flexsheet.nodes.twin.truth import apply_apparatus
 
-                true = make_true_projector(require_projector(scene), seed=seed)
-                views = list(_simulate_views(scene, true, poses, seed))
+                devices = load_true_devices(apparatus, scene)
+                if devices is None:
+                    true = make_true_projector(require_projector(scene), seed=seed)
+                else:
+                    true = require_projector(apply_apparatus(scene, devices))
+                views = list(simulate_views(scene, true, devices, poses, seed))
             else:
                 assert pictures is not None
-                views = list(_read_views(pictures, len(gray_code.make_patterns(*size))))
-            camera = _load_camera(scene, calibration)
+                views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
+            camera = load_camera(scene, calibration)
             fit = calibrate_projector(
                 measure_points(views, camera, require_projector(scene)), require_projector(scene)
             )
@@ -164,7 +184,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
     )
 
 
-def _read_views(folder: Path, count: int) -> Iterator[Views]:
+def read_views(folder: Path, count: int) -> Iterator[Views]:
     from flexsheet.launch.calibration.corners import CalibrationError, read_gray
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
@@ -190,22 +210,37 @@ def _read_views(folder: Path, count: int) -> Iterator[Views]:
         yield sides[0], sides[1]
 
 
-def _simulate_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
-    """Yield the simulated left and right images of all patterns, for each pose of the sheet."""
+def simulate_views(
+    scene: Scene, true: Projector, apparatus: Apparatus | None, poses: int, seed: int
+) -> Iterator[Views]:
+    """Yield the simulated left and right images of all patterns, for each pose of the sheet.
+
+    true: simulated projector. apparatus: other true devices, whose arms hold the sheet; None: the
+    sheet is flat, at the commanded poses.
+    """
     from rich.progress import track
 
     from flexsheet.launch.calibration.gray_code import make_patterns
+    from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
     from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
     from flexsheet.nodes.twin.rig import make_true_camera
+    from flexsheet.nodes.twin.truth import apply_apparatus
 
     shown = make_patterns(require_projector(scene).width_px, require_projector(scene).height_px)
-    lit = LitSheet(scene, make_true_camera(scene.camera), true, seed=seed)
+    camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
+    lit = LitSheet(scene, camera, true, seed=seed)
+    arms = None if apparatus is None else SimulatedSheet(scene, apparatus)
+    spec = scene.sheet
+    distance_m = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio) * spec.width_m
     tracked = track(sheet_poses(poses), "simulating images", console=words.console, transient=True)
     for world_from_sheet in tracked:
-        yield lit.pair(shown, world_from_sheet)
+        if arms is None:
+            yield lit.pair(shown, world_from_sheet)
+        else:
+            yield lit.pair(shown, *arms.hold(world_from_sheet, distance_m))
 
 
-def _load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
+def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """Return the camera of the scene, with lenses and baseline from a calibration file if given."""
     optics = load_optics(calibration, scene)
     if optics is None:

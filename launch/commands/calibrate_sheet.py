@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexsheet.launch.commands.calibrate import load_true_devices, require_twin
 from flexsheet.launch.commands.options import (
     CYLINDER,
     JsonOption,
     SceneOption,
     SeedOption,
+    TwinApparatusOption,
     output_file,
 )
 from flexsheet.launch.commands.output import (
@@ -28,6 +30,7 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.sheet_fit import MeasuredPush
+    from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.sheet_calibration import SheetCalibration
 
@@ -93,6 +96,7 @@ def sheet(
         float,
         typer.Option(help="With --twin: standard deviation of the force noise, N.", min=0.0),
     ] = 0.005,
+    apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -110,6 +114,7 @@ def sheet(
     check_folder("-o", output)
     if sum(one is not None for one in (rows, bag, twin)) != 1:
         raise CommandError("give exactly one of --rows CSV, --bag BAG and --twin SCENE", BAD_INPUT)
+    require_twin(apparatus, simulated=twin is not None)
     command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
         scene = load_scene(scene_file)
@@ -124,9 +129,11 @@ def sheet(
     else:
         assert twin is not None
         scene = load_scene(twin)
-        pushes = _simulate_pushes(scene, places, noise_n, seed)
+        true = load_true_devices(apparatus, scene)
+        pushes = simulate_pushes(scene, true, places=places, noise_n=noise_n, seed=seed)
         lines = list(range(1, len(pushes) + 1))
         command += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
+        command += [] if apparatus is None else ["--apparatus", apparatus]
         command += ["--places"] if places else []
         source = f"twin of {scene.name}"
     command += ["--table"] if table else []
@@ -249,7 +256,10 @@ def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
         raise CommandError(f"{bag}: {error}", BAD_INPUT) from error
 
 
-def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
+def simulate_pushes(
+    scene: Scene, apparatus: Apparatus | None, *, places: bool, noise_n: float, seed: int
+) -> list[MeasuredPush]:
+    """Simulate pushes as `simulate_rows` does, with a progress bar."""
     from rich.progress import Progress
 
     from flexsheet.launch.calibration.sheet_rows import simulate_rows
@@ -261,6 +271,7 @@ def _simulate_pushes(scene: Scene, places: bool, noise_n: float, seed: int) -> l
             places=places,
             noise_n=noise_n,
             seed=seed,
+            apparatus=apparatus,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from flexsheet.launch.calibration.capture import Capture
+    from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.calibration import Board
     from flexsheet.messages.scene import Scene
     from flexsheet.nodes.camera.sources import AnySource
@@ -74,13 +75,20 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
         raise CommandError(str(error)) from error
 
 
-def simulate_views(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
-    """Yield one simulated image pair per pose of a board.  Raises CommandError."""
+def simulate_views(
+    scene: Scene, board: Board, apparatus: Apparatus | None = None, *, pairs: int, seed: int
+) -> Iterator[Views]:
+    """Yield one simulated image pair per pose of a board, by the camera of an apparatus.
+
+    Raises CommandError for a board that cannot be rendered.
+    """
     from flexsheet.nodes.twin.board import BoardError, TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
+    from flexsheet.nodes.twin.truth import apply_apparatus
 
     try:
-        shown = TwinBoard(make_true_camera(scene.camera), board, seed=seed)
+        camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
+        shown = TwinBoard(camera, board, seed=seed)
         for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
             yield shown.pair(left_from_board)
     except BoardError as error:

@@ -46,6 +46,7 @@ def register(app: typer.Typer) -> None:
         epilog=examples(
             "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
             "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
+            "flexsheet experiment robustness --seeds 0-3 --commissioned",
         )
     )(robustness)
     app.command(
@@ -72,6 +73,13 @@ def robustness(
     ],
     profile: ProfileOption = "modern",
     calibrated: CalibratedOption = False,
+    commissioned: Annotated[
+        bool,
+        typer.Option(
+            "--commissioned",
+            help="Commission each simulated laboratory first, as `flexsheet commission` does.",
+        ),
+    ] = False,
     seconds: StrokeOption = 10.0,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
@@ -108,6 +116,7 @@ def robustness(
             workers=workers,
             scheduler=scheduler,
             keep_bags=keep_bags,
+            commissioned=commissioned,
         )
     if as_json:
         print_json(result)

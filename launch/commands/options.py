@@ -20,7 +20,6 @@ DEMO, CYLINDER = Path("demo"), Path("cylinder")
 
 FORMER_NAMES = {
     "also": "include",
-    "commissioned": "calibrated",
     "into": "launch",
     "names": "gesture",
     "parameters": "parameter",
@@ -117,6 +116,15 @@ ApparatusOption = Annotated[
         metavar="FILE|seed:N",
         help="True parameters of the simulated hardware: a file, or a random sample such as "
         "seed:7,paper,calibrated; default: equal to the scene.",
+    ),
+]
+TwinApparatusOption = Annotated[
+    str | None,
+    typer.Option(
+        "--apparatus",
+        metavar="FILE|seed:N",
+        help="With --twin: true parameters of the simulated hardware, a file or a random sample; "
+        "default: equal to the scene, or for arms and projector deviations drawn with --seed.",
     ),
 ]
 RunOption = Annotated[

@@ -25,9 +25,11 @@ from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.nodes import node_class
+from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
@@ -41,7 +43,7 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, meas
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
-from flexsheet.nodes.twin.force_history import ForceHistory, apply_history
+from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.membrane import NotConvergedError, solve
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
@@ -61,10 +63,6 @@ STROKE_RATIOS = (0.0, 0.5, 1.0)
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
 """Depths of the pushes whose forces are compared. They are limited to half and to all of the push
 depth of the scene."""
-
-MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
-which the finger reverses, to the evaluated force."""
 
 MIN_FORCE_N = 0.1
 """Minimum denominator of relative force errors. Relative errors of smaller forces are not felt."""
@@ -88,23 +86,28 @@ ALL_METRICS = frozenset(Metric)
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations of camera and sheet that the nodes use in addition to the scene."""
+    """Calibrations that the nodes use in addition to the scene."""
 
     stereo: StereoCalibration | None = None
     sheet: SheetCalibration | None = None
+    marker: MarkerCalibration | None = None
 
     @staticmethod
     def of(plan: ResolvedGraph) -> NodeCalibrations:
         """Read the calibration files that the plan's triangulator and planner use."""
         stereo: StereoCalibration | None = None
         sheet: SheetCalibration | None = None
+        marker: MarkerCalibration | None = None
         for node in plan.nodes.values():
             kind = node_class(node.type)
-            if issubclass(kind, node_class("triangulator")) and node.parameters["calibration"]:
-                stereo = load_calibration(Path(node.parameters["calibration"]))
+            if issubclass(kind, node_class("triangulator")):
+                if path := node.parameters["calibration"]:
+                    stereo = load_calibration(Path(path))
+                if path := node.parameters["marker_calibration"]:
+                    marker = load_marker_calibration(Path(path))
             if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
                 sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
-        return NodeCalibrations(stereo, sheet)
+        return NodeCalibrations(stereo, sheet, marker)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +206,10 @@ class OfflineEvaluator:
         self._scene = scene
         self._geometry = StereoGeometry.of(scene.camera, given.stereo)
         self._force_model = make_force_model(scene.sheet, given.sheet)
+        marker = scene.finger if given.marker is None else given.marker
+        self._marker_from_pad = world_from_finger(scene.finger.direction_world) @ np.array(
+            marker.marker_from_pad_m
+        )
         self._shape = make_shape(dict(scene.object.geometry))
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
@@ -300,7 +307,7 @@ class OfflineEvaluator:
                     f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "
                     "triangulated; check the camera offsets in the apparatus"
                 )
-            errors.append(found.point_world - contact.point)
+            errors.append(found.point_world - self._marker_from_pad - contact.point)
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
@@ -494,20 +501,6 @@ class OfflineEvaluator:
         points = np.full((size, size, 3), np.nan)
         points[hit] = rays.origin + directions[hit] / hits.inverse_range[hit][:, None]
         return (rays.origin + directions)[..., :2], points
-
-
-def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the rubber's force to that of an elastic sheet, for in and out.
-
-    The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
-    """
-    history = ForceHistory.of(apparatus)
-    if history is None:
-        return np.ones(2)
-    elastic = np.concatenate([np.linspace(0.0, TURNING_RATIO, 51), np.linspace(1.0, 0.0, 41)])
-    times_s = MOVING_IN_S * np.concatenate([elastic[:51], 2.0 * TURNING_RATIO - elastic[51:]])
-    forces = apply_history(history, times_s, elastic)
-    return np.array([np.interp(1.0, elastic[:51], forces[:51]), forces[51]])
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:

@@ -60,8 +60,19 @@ def run_robustness(
     workers: int = 1,
     scheduler: str | None = None,
     keep_bags: bool = False,
+    commissioned: bool = False,
 ) -> dict[str, Any]:
-    """Run one trial per seed; return the results of `experiment robustness --json`."""
+    """Run one trial per seed; return the results of `experiment robustness --json`.
+
+    commissioned: calibrate each simulated laboratory first, in a folder of its own, and evaluate it
+    with the resulting scene and launch file. The apparatus is then that of hardware that nobody has
+    calibrated, described in the world frame that the calibrated camera defines.
+    """
+    if commissioned and calibrated:
+        raise ExperimentError(
+            "--commissioned calibrates the devices itself, --calibrated samples calibrated ones; "
+            "give one of the two"
+        )
     plan = load_graph(launch_file, settings=settings)
     require_scene(plan)
     common = {
@@ -69,6 +80,7 @@ def run_robustness(
         **describe_graph(plan, launch_file, settings),
         "profile": profile.value,
         "calibrated": calibrated,
+        "commissioned": commissioned,
         "seconds": seconds,
     }
     trials = {}
@@ -82,6 +94,7 @@ def run_robustness(
             "apparatus": apparatus_text(seed, profile, calibrated=calibrated),
             "seconds": seconds,
             "bag": str(folder.resolve() / f"{name}.mcap") if keep_bags else None,
+            "commission_folder": str(folder.resolve() / f"{name}-lab") if commissioned else None,
         }
     rows = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
     raise_if_all_failed(rows, folder)
@@ -94,6 +107,7 @@ def run_robustness(
     return {
         "profile": profile.value,
         "calibrated": calibrated,
+        "commissioned": commissioned,
         "rows": found,
         "failed": failed,
         "summary": summarize(found),

@@ -88,10 +88,16 @@ def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
     """Return the errors of a random apparatus: of sheet and finger in motion, others at rest."""
-    plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
+    apparatus_file, launch_file = trial["apparatus"], Path(trial["launch_file"])
+    commissioning: Row = {}
+    if trial.get("commission_folder"):
+        commissioning, launch_file, apparatus_file = _commission(trial)
+        settings = [one for one in trial["settings"] if not one.startswith("scene=")]
+        trial = {**trial, "launch_file": str(launch_file), "settings": settings}
+    plan = load_graph(launch_file, settings=trial["settings"], apparatus=apparatus_file)
     scene, apparatus = require_scene(plan), plan.apparatus_message()
     assert apparatus is not None
-    moving = run_stroke(trial, trial["apparatus"])
+    moving = run_stroke(trial, apparatus_file)
     metrics = frozenset({Metric.IMAGE, Metric.FORCE})
     resting = OfflineEvaluator(scene, NodeCalibrations.of(plan)).evaluate(apparatus, metrics)
     figures: Row = {
@@ -110,7 +116,35 @@ def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
         "latency_ms": moving["latency_ms"],
         "drops": moving["drops"],
         "bag": moving["bag"],
+        **commissioning,
     }
+
+
+def _commission(trial: Mapping[str, Any]) -> tuple[Row, Path, str]:
+    """Commission the laboratory of a trial; return its row, launch file and apparatus file.
+
+    The stroke of the trial takes the place of the verification.
+    """
+    from flexsheet.launch.calibration.commission import APPARATUS_FILE, StepName
+    from flexsheet.launch.commands.commission import summarize
+    from flexsheet.launch.commands.commission_steps import open_laboratory
+
+    folder, base = Path(trial["commission_folder"]), Path(trial["launch_file"])
+    plan = load_graph(base, settings=trial["settings"])
+    assert plan.scene_file is not None
+    lab, devices = open_laboratory(folder, base, Path(plan.scene_file), trial["apparatus"])
+    for name in lab.pending():
+        if name is not StepName.VERIFICATION:
+            _tell(f"step {name}")
+            lab.run(name, devices.steps[name])
+    result = summarize(lab)
+    steps = [
+        {key: one[key] for key in ("name", "seconds", "residual", "unit", "within_limit")}
+        for one in result["steps"]
+    ]
+    above = [one["name"] for one in steps if not one["within_limit"]]
+    row = {"commission": {"folder": str(folder), "steps": steps, "above_limit": above}}
+    return row, lab.launch_copy, str(folder / APPARATUS_FILE)
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import lru_cache
+from io import StringIO
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
@@ -44,6 +46,7 @@ from flexsheet.launch.plans.renamed_keys import (
     VALUES,
 )
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES
 
@@ -512,3 +515,20 @@ def _inner_type(annotation: Any, part: str | int) -> Any:
     while get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     return annotation
+
+
+@contextmanager
+def edit_yaml(source: Path, copy: Path) -> Iterator[Any]:
+    """Yield the tree of a YAML file, and write the tree to `copy` after the caller's changes.
+
+    Comments and layout are preserved.
+    """
+    yaml = YAML(typ="rt", pure=True)
+    yaml.width = 4096
+    yaml.preserve_quotes = True
+    yaml.indent(sequence=4, offset=2)
+    tree = yaml.load(source.read_text(encoding="utf-8"))
+    yield tree
+    text = StringIO()
+    yaml.dump(tree, text)
+    write_file(copy, text.getvalue())

@@ -39,6 +39,10 @@ MIN_FORCE_N = 1e-3
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
 """Fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
 
+MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
+"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
+which the finger reverses, to the evaluated force."""
+
 
 class ForceHistory:
     """State of the hysteresis and creep of one force of the sheet.
@@ -110,3 +114,17 @@ def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> 
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )
+
+
+def compute_history_ratios(apparatus: Apparatus) -> Floats:
+    """Return the ratios (2,) of the rubber's force to that of an elastic sheet, for in and out.
+
+    The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
+    """
+    history = ForceHistory.of(apparatus)
+    if history is None:
+        return np.ones(2)
+    elastic = np.concatenate([np.linspace(0.0, TURNING_RATIO, 51), np.linspace(1.0, 0.0, 41)])
+    times_s = MOVING_IN_S * np.concatenate([elastic[:51], 2.0 * TURNING_RATIO - elastic[51:]])
+    forces = apply_history(history, times_s, elastic)
+    return np.array([np.interp(1.0, elastic[:51], forces[:51]), forces[51]])

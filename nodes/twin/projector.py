@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Lens, Pose, Projector, Scene, StereoCamera
@@ -126,21 +127,30 @@ class LitSheet:
         self._rays = [slopes_of(lens, grid) for lens in (camera.left, camera.right)]
 
     def pair(
-        self, patterns: Sequence[Image], world_from_sheet: Floats
+        self, patterns: Sequence[Image], world_from_sheet: Floats, points: Floats | None = None
     ) -> tuple[list[Image], list[Image]]:
-        """Render the left and right images of patterns projected on the sheet at a pose (4, 4)."""
+        """Render the left and right images of patterns projected on the sheet at a pose (4, 4).
+
+        points: points (n, 3) of a sheet that its weight bends; None: the sheet is flat.
+        """
+        bend = None if points is None else _fit_bend(apply(inverse(world_from_sheet), points))
         world_from_left = pose_matrix(self._camera.world_from_left)
         views = (world_from_left, world_from_left @ inverse(self._camera.right_from_left))
         left, right = (
-            self._pictures(patterns, rays, world_from_eye, world_from_sheet)
+            self._pictures(patterns, rays, world_from_eye, world_from_sheet, bend)
             for rays, world_from_eye in zip(self._rays, views, strict=True)
         )
         return left, right
 
     def _pictures(
-        self, patterns: Sequence[Image], rays: Floats, world_from_eye: Floats, sheet: Floats
+        self,
+        patterns: Sequence[Image],
+        rays: Floats,
+        world_from_eye: Floats,
+        sheet: Floats,
+        bend: Floats | None,
     ) -> list[Image]:
-        x, y, inside = self._lit_by(rays, world_from_eye, sheet)
+        x, y, inside = self._lit_by(rays, world_from_eye, sheet, bend)
         height, width = self._camera.height_px, self._camera.width_px
         pictures = []
         for pattern in patterns:
@@ -154,7 +164,7 @@ class LitSheet:
         return pictures
 
     def _lit_by(
-        self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
+        self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats, bend: Floats | None
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
         """Return the projector columns and rows that light the points of the sheet that rays hit.
 
@@ -162,14 +172,29 @@ class LitSheet:
         hits the sheet.
         """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
-        points, ahead = on_plane(
-            world_from_eye[:3, 3], directions @ world_from_eye[:3, :3].T, world_from_sheet
-        )
-        local = apply(inverse(world_from_sheet), points.reshape(-1, 3)).reshape(points.shape)
+        directions = directions @ world_from_eye[:3, :3].T
+        points, ahead = on_plane(world_from_eye[:3, 3], directions, world_from_sheet)
+        sheet_from_world = inverse(world_from_sheet)
+        local = apply(sheet_from_world, points.reshape(-1, 3)).reshape(points.shape)
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
+        if bend is not None:
+            # The bend is small, so that a ray meets it close to where it meets the plane.
+            along = directions @ sheet_from_world[:3, :3].T
+            flat, slopes = local[..., :2], along[..., :2] / along[..., 2:]
+            for _ in range(2):
+                x, y = np.moveaxis(np.clip(local[..., :2], -half, half), -1, 0)
+                height = polynomial.polyval2d(x, y, bend)[..., None]
+                local = np.concatenate([flat + height * slopes, height], axis=-1)
+            points = apply(world_from_sheet, local.reshape(-1, 3)).reshape(points.shape)
         inside = ahead & (np.abs(local[..., :2]) <= half).all(axis=-1)
         pixels = pixels_lighting(self._projector, np.where(inside[..., None], points, 0.0))
         return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), inside
+
+
+def _fit_bend(points: Floats) -> Floats:
+    """Fit the height z of points (n, 3) in the sheet's frame by a polynomial in x and y (5, 5)."""
+    powers = polynomial.polyvander2d(points[:, 0], points[:, 1], [4, 4])
+    return np.asarray(np.linalg.lstsq(powers, points[:, 2], rcond=None)[0].reshape(5, 5))
 
 
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:

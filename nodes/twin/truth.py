@@ -12,13 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flexsheet.messages.apparatus import Apparatus, ArmTruth, LensTruth
+from flexsheet.messages.apparatus import (
+    Apparatus,
+    ArmTruth,
+    CameraTruth,
+    LensTruth,
+    devices_of,
+)
 from flexsheet.messages.scene import ArmSpec, Lens, Pose, Scene, StereoCamera
 from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
     rotation_from_rpy,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
+    transform_from_rpy,
+    vector_from_rotation,
 )
 from flexsheet.nodes.node import NodeParameters
 
@@ -151,6 +161,64 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
         turned = rotation_from_vector(rotation_rad) @ rotation_from_rpy(rpy_rad)
         rpy_rad = rpy_from_rotation(turned)
     return Pose(position_m=pose.position_m + np.array(shift_m), rpy_rad=rpy_rad)
+
+
+def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
+    """Return the same hardware, described in the world frame that the stereo camera defines.
+
+    Calibrations define the world by the left camera: its pose in the scene is exact. So the pose
+    errors of the camera become opposite pose errors of arms, projector and eyes. The finger's path,
+    the direction of gravity and the finger's tilt are kept in the new world frame.
+    """
+    nominal = apparatus.nominal or devices_of(scene)
+    true_scene = apply_apparatus(scene, apparatus)
+    aligned_from_world = _matrix(nominal.camera.world_from_left) @ inverse(
+        _matrix(true_scene.camera.world_from_left)
+    )
+
+    def offsets(before: Pose, true: Pose) -> list[tuple[float, ...]]:
+        moved = aligned_from_world @ _matrix(true)
+        turned = vector_from_rotation(moved[:3, :3] @ rotation_from_rpy(before.rpy_rad).T)
+        return [tuple((moved[:3, 3] - before.position_m).tolist()), tuple(turned.tolist())]
+
+    arms = {}
+    for side in ("left", "right"):
+        found = offsets(
+            getattr(nominal.arms, side).world_from_base,
+            getattr(true_scene.arms, side).world_from_base,
+        )
+        names = ("base_position_offset_m", "base_rotation_offset_rad")
+        arms[side] = getattr(apparatus.arms, side).model_copy(
+            update=dict(zip(names, found, strict=True))
+        )
+    projector = apparatus.projector
+    if nominal.projector is not None and true_scene.projector is not None:
+        found = offsets(
+            nominal.projector.world_from_projector, true_scene.projector.world_from_projector
+        )
+        names = ("position_offset_m", "rotation_offset_rad")
+        projector = projector.model_copy(update=dict(zip(names, found, strict=True)))
+    eyes_m = apply(aligned_from_world, true_scene.eyes.centre_world_m[None])[0]
+    return apparatus.model_copy(
+        update={
+            "nominal": nominal,
+            "camera": apparatus.camera.model_copy(
+                update={
+                    name: CameraTruth.model_fields[name].default
+                    for name in ("position_offset_m", "rotation_offset_rad")
+                }
+            ),
+            "arms": apparatus.arms.model_copy(update=arms),
+            "projector": projector,
+            "eyes": apparatus.eyes.model_copy(
+                update={"centre_offset_m": tuple((eyes_m - nominal.eyes.centre_world_m).tolist())}
+            ),
+        }
+    )
+
+
+def _matrix(pose: Pose) -> Floats:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:

@@ -1,0 +1,324 @@
+"""Run the calibrations of a laboratory in sequence, and store their results in one folder.
+
+The folder holds the state (`commission.json`), the calibration files, the scene and the launch file
+that use them, and a report. A step starts from the scene with the results of all steps before it. A
+repeated step therefore invalidates the later ones, which must be run again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+from ruamel.yaml.comments import CommentedSeq
+
+from flexsheet.launch.plans.documents import edit_yaml, read_document
+from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import write_file
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.nodes import node_class
+from flexsheet.nodes.twin.tolerance_table import set_value
+
+STATE_FILE, SCENE_FILE, LAUNCH_FILE = "commission.json", "scene.yaml", "launch.yaml"
+REPORT_FILE, APPARATUS_FILE = "report.md", "apparatus.yaml"
+
+
+class CommissionError(FlexsheetError, ValueError):
+    """Raised for a folder of a commissioning that cannot be continued, and for wrong data."""
+
+    code = "commission"
+    remedy = "Correct the option that the error names, or use a new folder."
+
+
+class StepName(StrEnum):
+    """Steps of a commissioning, in their order.
+
+    camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
+    edges: clamped edges of the sheet on the flanges, joint offsets and compliance of the flanges.
+    sheet: force model of the sheet. projector: pose and lens. marker: position of the marker on the
+    finger. verification: a stroke with the result.
+    """
+
+    CAMERA = "camera"
+    ARMS = "arms"
+    EDGES = "edges"
+    SHEET = "sheet"
+    PROJECTOR = "projector"
+    MARKER = "marker"
+    VERIFICATION = "verification"
+
+
+STEPS = tuple(StepName)
+
+
+class StepResult(LimitedModel):
+    """Result of one step.
+
+    residual: in `unit`; above `limit`, `advice` states what to do. uncertainty: standard deviations
+    with their units in the names. scene_values: values by dotted path in the scene. parameters:
+    node parameters by TYPE.PARAMETER; file names are relative to the folder. figures: further
+    results.
+    """
+
+    residual: float
+    unit: str
+    limit: float
+    advice: str
+    uncertainty: dict[str, float] = Field(default_factory=dict)
+    scene_values: dict[str, Any] = Field(default_factory=dict)
+    parameters: dict[str, str] = Field(default_factory=dict)
+    figures: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def within_limit(self) -> bool:
+        return self.residual <= self.limit
+
+
+class StepRecord(LimitedModel):
+    """Entry of one finished or skipped step in the state file."""
+
+    name: StepName
+    date: str
+    seconds: float = 0.0
+    skipped_because: str | None = None
+    result: StepResult | None = None
+
+
+class State(LimitedModel):
+    """Content of the state file: files from which the commissioning started, and finished steps."""
+
+    version: Literal[1] = 1
+    launch_file: str
+    scene_file: str
+    apparatus: str | None = None
+    steps: dict[StepName, StepRecord] = Field(default_factory=dict)
+
+
+class MissingDataError(CommissionError):
+    """Raised by a step that needs data of real devices; the text says how to capture them."""
+
+    def __init__(self, step: StepName, instruction: str) -> None:
+        super().__init__(f"step {step}: {instruction}")
+        self.step, self.instruction = step, instruction
+
+
+Step = Callable[["Commissioning"], StepResult]
+
+
+@dataclass(slots=True)
+class Commissioning:
+    """Commissioning of one laboratory in a folder; continues the state that the folder holds.
+
+    launch_file, scene_file: files to start from. apparatus: value of --apparatus for a simulated
+    laboratory, or None. Raises CommissionError if the folder belongs to other files.
+    """
+
+    folder: Path
+    launch_file: Path
+    scene_file: Path
+    apparatus: str | None
+    state: State = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        given = State(
+            launch_file=str(self.launch_file.resolve()),
+            scene_file=str(self.scene_file.resolve()),
+            apparatus=self.apparatus,
+        )
+        self.state = self._load_state() or given
+        for key in ("launch_file", "scene_file", "apparatus"):
+            before, now = getattr(self.state, key), getattr(given, key)
+            if before != now:
+                raise CommissionError(
+                    f"{self.folder / STATE_FILE}: {key}: the folder belongs to {before}, the "
+                    f"command gives {now}; give the same, or a new folder"
+                )
+
+    def _load_state(self) -> State | None:
+        path = self.folder / STATE_FILE
+        if not path.exists():
+            if any(self.folder.iterdir()):
+                raise CommissionError(
+                    f"{self.folder}: the folder is not empty and has no {STATE_FILE}; give a new "
+                    "or empty folder"
+                )
+            return None
+        try:
+            return State.model_validate_json(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, ValidationError) as error:
+            raise CommissionError(
+                f"{path}: not the state of a commissioning: {error}; use a new folder"
+            ) from error
+
+    @property
+    def scene_copy(self) -> Path:
+        """Return the scene file with the results so far."""
+        return self.folder / SCENE_FILE
+
+    @property
+    def launch_copy(self) -> Path:
+        """Return the launch file with the results so far."""
+        return self.folder / LAUNCH_FILE
+
+    def find_file(self, name: str) -> Path | None:
+        """Return a calibration file that a finished step uses, or None."""
+        used = [value for one in self._results(STEPS) for value in one.parameters.values()]
+        return self.folder / name if name in used else None
+
+    def _results(self, steps: tuple[StepName, ...]) -> Iterator[StepResult]:
+        for name in steps:
+            record = self.state.steps.get(name)
+            if record is not None and record.result is not None:
+                yield record.result
+
+    def pending(self) -> list[StepName]:
+        """Return the steps that are neither finished nor skipped."""
+        return [name for name in STEPS if name not in self.state.steps]
+
+    def skip(self, name: StepName, reason: str) -> None:
+        """Skip a step, and invalidate all later ones."""
+        self._invalidate_from(name)
+        self._record(StepRecord(name=name, date=_now(), skipped_because=reason))
+
+    def run(self, name: StepName, step: Step) -> StepResult:
+        """Run a step with the results of the steps before it; invalidate all later ones."""
+        self._invalidate_from(name)
+        started_s = time.monotonic()
+        result = step(self)
+        seconds = time.monotonic() - started_s
+        self._record(StepRecord(name=name, date=_now(), seconds=seconds, result=result))
+        return result
+
+    def _invalidate_from(self, name: StepName) -> None:
+        # A verification changes nothing that another step uses.
+        for later in STEPS[STEPS.index(name) :]:
+            self.state.steps.pop(later, None)
+        self.write()
+
+    def _record(self, record: StepRecord) -> None:
+        self.state.steps[record.name] = record
+        self.write()
+
+    def write(self) -> None:
+        """Write state, scene, launch file and report."""
+        self._write_scene()
+        self._write_launch_file()
+        write_file(self.folder / REPORT_FILE, format_report(self.state))
+        write_file(self.folder / STATE_FILE, self.state.model_dump_json(indent=1))
+
+    def _write_scene(self) -> None:
+        values: dict[str, Any] = {}
+        for result in self._results(STEPS):
+            values |= result.scene_values
+        with edit_yaml(self.scene_file, self.scene_copy) as tree:
+            for path, value in values.items():
+                set_value(tree, path, _make_yaml(value))
+            for section, key in (("geometry", "file"), ("appearance", "image_file")):
+                part = tree["object"].get(section, {})
+                if key in part:
+                    part[key] = str((self.scene_file.parent / part[key]).resolve())
+        load_scene(self.scene_copy)
+
+    def _write_launch_file(self) -> None:
+        graph = load_graph(self.launch_file)
+        measured: dict[str, str] = {}
+        for result in self._results(STEPS):
+            measured |= result.parameters
+        with edit_yaml(self.launch_file, self.launch_copy) as tree:
+            tree["scene"] = SCENE_FILE
+            for name, spec in tree["nodes"].items():
+                if name not in graph.nodes:
+                    continue
+                given = spec.get("parameters", {})
+                for parameter in given:
+                    given[parameter] = graph.nodes[name].parameters[parameter]
+                for key, value in measured.items():
+                    kind, _, parameter = key.partition(".")
+                    if issubclass(node_class(graph.nodes[name].type), node_class(kind)):
+                        spec.setdefault("parameters", {})[parameter] = value
+        read_document(self.launch_copy)
+
+
+def _make_yaml(value: Any) -> Any:
+    """Return a value for a YAML tree; lists are written on one line."""
+    if not isinstance(value, list):
+        return value
+    row = CommentedSeq([_make_yaml(one) for one in value])
+    row.fa.set_flow_style()
+    return row
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+MEASURED_IN_OPERATION = (
+    "Servo lag and actuation delay of each arm, the camera's rate and the age of its images are "
+    "measured while the graph runs. The position of the eyes comes from the head tracker. No step "
+    "measures the delay of the projector and the time between exposure and time stamp."
+)
+
+
+def format_report(state: State) -> str:
+    """Return the report as Markdown: residuals, uncertainties and what limits the accuracy."""
+    lines = [
+        "# Commissioning",
+        "",
+        f"Launch file: {state.launch_file}. Scene: {state.scene_file}. "
+        f"Apparatus: {state.apparatus or 'real devices'}.",
+        "",
+        "| step | date | time | residual | limit | uncertainty (standard deviation) |",
+        "|---|---|---|---|---|---|",
+    ]
+    advice = []
+    for name in STEPS:
+        record = state.steps.get(name)
+        if record is None:
+            lines.append(f"| {name} | not done | | | | |")
+        elif record.result is None:
+            lines.append(f"| {name} | {record.date} | skipped: {record.skipped_because} | | | |")
+        else:
+            result = record.result
+            errors = ", ".join(f"{key} {value:.3g}" for key, value in result.uncertainty.items())
+            lines.append(
+                f"| {name} | {record.date} | {record.seconds:.0f} s | {result.residual:.3g} "
+                f"{result.unit} | {result.limit:g} {result.unit} | {errors} |"
+            )
+            if not result.within_limit:
+                advice.append(f"- {name}: above the limit. {result.advice}")
+    verification = state.steps.get(StepName.VERIFICATION)
+    if verification is not None and verification.result is not None:
+        lines += ["", "## Verification", "", "| figure | value |", "|---|---|"]
+        lines += [f"| {key} | {value} |" for key, value in _flatten(verification.result.figures)]
+    limits = _rank_uncertainties(state)
+    lines += ["", "## What limits the accuracy", ""]
+    lines += [f"- {text}" for text in limits] + advice + [f"- {MEASURED_IN_OPERATION}", ""]
+    return "\n".join(lines)
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _rank_uncertainties(state: State) -> list[str]:
+    """List the uncertainties in mm of all steps, the largest first."""
+    found = [
+        (value, f"{name}: {key.removesuffix('_mm').replace('_', ' ')} {value:.2f} mm")
+        for name, record in state.steps.items()
+        if record.result is not None
+        for key, value in record.result.uncertainty.items()
+        if key.endswith("_mm")
+    ]
+    return [text for _, text in sorted(found, reverse=True)]

@@ -1,0 +1,234 @@
+"""`flexsheet commission`: calibrate all devices of a laboratory in sequence, and verify them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands.options import (
+    DEMO,
+    ApparatusOption,
+    JsonOption,
+    LaunchOption,
+    OtherSceneOption,
+    SeedOption,
+)
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    examples,
+    print_json,
+    print_table,
+    words,
+)
+
+if TYPE_CHECKING:
+    from flexsheet.launch.calibration.commission import Commissioning, StepName
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet commission --apparatus seed:3 --output lab",
+        "flexsheet commission --launch launch/lab.yaml --output lab --data camera=board-images",
+        "flexsheet commission --launch launch/lab.yaml --output lab --step marker "
+        "--data marker=touches.csv",
+    )
+)
+def commission(
+    *,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FOLDER",
+            help="Folder for state and results; an existing one is continued.",
+        ),
+    ],
+    launch_file: LaunchOption = DEMO,
+    scene: OtherSceneOption = None,
+    apparatus: ApparatusOption = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--data", metavar="STEP=PATH", help="Captured data of a step; repeat for several."
+        ),
+    ] = None,
+    finger_radius_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--finger-radius-mm", metavar="MM", min=1.0, help="Measured radius of the fingertip."
+        ),
+    ] = None,
+    board: Annotated[
+        str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the camera's board.")
+    ] = "9x6",
+    square_mm: Annotated[
+        float, typer.Option(metavar="MM", min=1e-3, help="Square of the camera's board, mm.")
+    ] = 25.0,
+    flange_board: Annotated[
+        str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the flanges' board.")
+    ] = "7x5",
+    flange_square_mm: Annotated[
+        float, typer.Option(metavar="MM", min=1e-3, help="Square of the flanges' board, mm.")
+    ] = 15.0,
+    repeated: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--step", metavar="STEP", help="Step to repeat, with all later ones; may be repeated."
+        ),
+    ] = None,
+    skipped: Annotated[
+        list[str] | None,
+        typer.Option("--skip", metavar="STEP=REASON", help="Step to skip; may be repeated."),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only repeat the verification of earlier results.")
+    ] = False,
+    duration: Annotated[
+        float,
+        typer.Option("--duration", metavar="SECONDS", min=2.0, help="Time of the stroke, s."),
+    ] = 10.0,
+    seed: SeedOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate camera, arms, sheet, projector and marker in sequence, and verify the result.
+
+    Finished steps are not repeated. With --apparatus, all devices are simulated. Otherwise the
+    command stops at a step whose data are missing, with exit code 1, and states how to capture
+    them.
+    """
+    from flexsheet.launch.calibration.commission import MissingDataError, StepName
+    from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
+    from flexsheet.launch.commands.commission_steps import open_laboratory
+
+    given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
+    skips = _parse_pairs("--skip", skipped)
+    repeats = [_parse_step("--step", name) for name in repeated or ()]
+    if apparatus is not None and (given or finger_radius_mm is not None):
+        raise CommandError(
+            "--data and --finger-radius-mm are for real devices; remove them or --apparatus",
+            BAD_INPUT,
+        )
+    if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
+        raise CommandError(
+            "--check only repeats the verification; remove --step, --skip and other --data",
+            BAD_INPUT,
+        )
+    lab, devices = open_laboratory(
+        output,
+        launch_file,
+        scene,
+        apparatus,
+        data=given,
+        finger_radius_m=None if finger_radius_mm is None else 1e-3 * finger_radius_mm,
+        board=_parse_board(board, square_mm, None, FOUR_BITS),
+        flange_board=_parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
+        seconds=duration,
+        seed=seed,
+    )
+    if check:
+        unfinished = [name for name in lab.pending() if name is not StepName.VERIFICATION]
+        if unfinished:
+            raise CommandError(
+                f"--check: the steps {', '.join(unfinished)} are not done; run them first, or skip "
+                "them with a reason",
+                BAD_INPUT,
+            )
+        repeats = [StepName.VERIFICATION]
+    missing: MissingDataError | None = None
+    try:
+        for name in StepName:
+            if name in skips:
+                lab.skip(name, skips[name])
+            elif name in repeats or name not in lab.state.steps:
+                words.print(f"step {name}")
+                lab.run(name, devices.steps[name])
+    except MissingDataError as error:
+        missing = error
+    _print_result(lab, missing, as_json)
+    if missing is not None:
+        raise typer.Exit(FAILED)
+
+
+def _parse_step(option: str, text: str) -> StepName:
+    from flexsheet.launch.calibration.commission import STEPS, StepName
+
+    if text not in STEPS:
+        raise CommandError(f"{option} {text}: expected one of {', '.join(STEPS)}", BAD_INPUT)
+    return StepName(text)
+
+
+def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
+    """Parse values STEP=TEXT; raises CommandError for an unknown step or an empty text."""
+    pairs = {}
+    for one in given or ():
+        name, _, text = one.partition("=")
+        if not text.strip():
+            raise CommandError(f"{option} {one}: expected STEP=TEXT with a text", BAD_INPUT)
+        pairs[_parse_step(option, name)] = text.strip()
+    return pairs
+
+
+def summarize(lab: Commissioning) -> dict[str, Any]:
+    """Return the result of `commission --json`."""
+    from flexsheet.launch.calibration.commission import APPARATUS_FILE, REPORT_FILE, StepName
+
+    steps = []
+    for record in (lab.state.steps[name] for name in StepName if name in lab.state.steps):
+        result = record.result
+        steps.append(
+            {
+                "name": record.name,
+                "seconds": record.seconds,
+                "residual": None if result is None else result.residual,
+                "unit": None if result is None else result.unit,
+                "limit": None if result is None else result.limit,
+                "within_limit": None if result is None else result.within_limit,
+                "uncertainty": {} if result is None else result.uncertainty,
+                "advice": None if result is None or result.within_limit else result.advice,
+                "skipped_because": record.skipped_because,
+            }
+        )
+    verified = lab.state.steps.get(StepName.VERIFICATION)
+    found = None if verified is None or verified.result is None else verified.result.figures
+    apparatus = lab.folder / APPARATUS_FILE
+    return {
+        "launch_file": str(lab.launch_copy),
+        "scene_file": str(lab.scene_copy),
+        "apparatus": str(apparatus) if apparatus.exists() else None,
+        "report": str(lab.folder / REPORT_FILE),
+        "steps": steps,
+        "verification": found or {},
+        "complete": not lab.pending(),
+    }
+
+
+def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
+    result = summarize(lab)
+    if as_json:
+        print_json({**result, "next": None if missing is None else str(missing)})
+        return
+    print_table(
+        ["step", "time", "residual", "limit", ""],
+        [
+            [one["name"], f"{one['seconds']:.0f} s", "-", "-", f"skipped: {one['skipped_because']}"]
+            if one["residual"] is None
+            else [
+                one["name"],
+                f"{one['seconds']:.0f} s",
+                f"{one['residual']:.3g} {one['unit']}",
+                f"{one['limit']:g} {one['unit']}",
+                one["advice"] or "",
+            ]
+            for one in result["steps"]
+        ],
+    )
+    words.print(f"launch file: {result['launch_file']}\nreport: {result['report']}", markup=False)
+    if missing is not None:
+        words.print(str(missing), markup=False)

@@ -1,0 +1,496 @@
+"""Carry out the steps of `flexsheet commission`, with simulated devices or with captured data.
+
+The steps use the functions of the commands `flexsheet calibrate`. Of an apparatus, they use only
+what its simulated devices report: images, joint angles, forces of a gauge, and a calliper.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexsheet.launch.calibration.commission import (
+    APPARATUS_FILE,
+    CommissionError,
+    Commissioning,
+    MissingDataError,
+    Step,
+    StepName,
+    StepResult,
+)
+from flexsheet.launch.commands import (
+    calibrate,
+    calibrate_arms,
+    calibrate_marker,
+    calibrate_projector,
+    calibrate_sheet,
+    capture,
+)
+from flexsheet.launch.plans.apparatus import format_apparatus
+from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.calibration import Board, load_calibration, save_calibration
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Pose, require_projector
+from flexsheet.nodes.models.rigid import rpy_from_rotation, transform_from_rpy
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
+BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
+FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
+"""Boards of simulated laboratories, for the camera and for the flanges."""
+
+CALLIPER_M = 3e-4
+"""Standard deviation of the simulated measurement of the finger's radius."""
+
+GAUGE_N = 0.005
+"""Standard deviation of the simulated force gauge."""
+
+INSTRUCTIONS: dict[StepName, str] = {
+    StepName.CAMERA: "capture board images with `flexsheet calibrate stereo --device-source ... "
+    "--pictures FOLDER`, and give --data camera=FOLDER",
+    StepName.ARMS: "record poses with `flexsheet calibrate arms-capture` to FOLDER/left and "
+    "FOLDER/right, and give --data arms=FOLDER",
+    StepName.SHEET: "measure pushes as for `flexsheet calibrate sheet --rows`, and give --data "
+    "sheet=CSV",
+    StepName.PROJECTOR: "write the patterns with `flexsheet calibrate projector --write-patterns`, "
+    "capture them on the sheet in six poses, and give --data projector=FOLDER",
+    StepName.EDGES: "fix three marks on each clamp, record them with `flexsheet calibrate "
+    "edges-capture`, and give --data edges=CSV",
+    StepName.MARKER: "touch known points as for `flexsheet calibrate marker --rows`, and give "
+    "--data marker=CSV; give the finger's radius with --finger-radius-mm",
+    StepName.VERIFICATION: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` "
+    "with the launch file of this folder, and give its output with --data verification=JSON",
+}
+
+REPEAT: dict[str, StepName] = {
+    "camera_moved": StepName.ARMS,
+    "cameras_misaligned": StepName.CAMERA,
+    "marker_offset": StepName.MARKER,
+    "sheet_stiffness": StepName.SHEET,
+}
+"""Step to repeat for a cause that the self-checks of the nodes suspect."""
+
+
+def open_laboratory(
+    folder: Path,
+    launch_file: Path,
+    scene_file: Path | None = None,
+    apparatus: str | None = None,
+    **options: Any,
+) -> tuple[Commissioning, Laboratory]:
+    """Open the folder of a commissioning, and its devices; options: fields of `Laboratory`.
+
+    For simulated devices, write the apparatus file with which the results can be simulated.
+    """
+    plan = load_graph(launch_file)
+    if plan.scene_file is None:
+        raise CommissionError(f'{launch_file}: missing key "scene"; add a scene file')
+    base = scene_file or Path(plan.scene_file)
+    # Check the apparatus before the folder is created.
+    true = calibrate.load_true_devices(apparatus, load_scene(base))
+    lab = Commissioning(folder, launch_file, base, apparatus)
+    if true is not None:
+        write_file(folder / APPARATUS_FILE, format_apparatus(true))
+    lab.write()
+    return lab, Laboratory(true, **options)
+
+
+@dataclass(slots=True)
+class Laboratory:
+    """Devices of one laboratory: simulated ones, or files with their data by step.
+
+    apparatus: true parameters in the world frame of the camera. finger_radius_m: measured radius
+    for real devices. pairs, arm_poses, sheet_poses: numbers of simulated observations.
+    """
+
+    apparatus: Apparatus | None
+    data: dict[StepName, Path] = field(default_factory=dict)
+    board: Board = BOARD
+    flange_board: Board = FLANGE_BOARD
+    finger_radius_m: float | None = None
+    seconds: float = 10.0
+    seed: int = 1
+    pairs: int = 20
+    arm_poses: int = 16
+    sheet_poses: int = 6
+
+    @property
+    def steps(self) -> dict[StepName, Step]:
+        """Return the function of each step."""
+        return {
+            StepName.CAMERA: self.calibrate_camera,
+            StepName.ARMS: self.calibrate_arms,
+            StepName.SHEET: self.calibrate_sheet,
+            StepName.PROJECTOR: self.calibrate_projector,
+            StepName.EDGES: self.calibrate_edges,
+            StepName.MARKER: self.calibrate_marker,
+            StepName.VERIFICATION: self.verify,
+        }
+
+    def _find_data(self, step: StepName) -> Path:
+        path = self.data.get(step)
+        if path is None:
+            raise MissingDataError(step, INSTRUCTIONS[step])
+        if not path.exists():
+            raise CommissionError(f"--data {step}={path}: does not exist; {INSTRUCTIONS[step]}")
+        return path
+
+    @contextmanager
+    def _folder(self, step: StepName) -> Iterator[Path]:
+        """Yield the folder with the data of a step; for simulated devices, an empty one."""
+        if self.apparatus is None:
+            yield self._find_data(step)
+            return
+        with tempfile.TemporaryDirectory(prefix="flexsheet-commission-") as folder:
+            yield Path(folder)
+
+    def calibrate_camera(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.capture import Capture
+        from flexsheet.launch.calibration.stereo import calibrate_stereo
+
+        scene = load_scene(lab.scene_copy)
+        camera = scene.camera
+        values: dict[str, Any] = {}
+        with self._folder(StepName.CAMERA) as given:
+            folder = given if self.apparatus is None else given / "pairs"
+            if self.apparatus is not None:
+                capture.write_pairs(
+                    capture.simulate_views(
+                        scene, self.board, self.apparatus, pairs=self.pairs, seed=self.seed
+                    ),
+                    Capture(
+                        self.board,
+                        lens=camera.left,
+                        size=(camera.width_px, camera.height_px),
+                        pairs=self.pairs,
+                        still_images=1,
+                    ),
+                    folder,
+                )
+                values = {"camera.rate_hz": apply_apparatus(scene, self.apparatus).camera.rate_hz}
+            found = calibrate_stereo(
+                *(_find_images(folder, side) for side in ("left", "right")),
+                board=self.board,
+                device=camera.device,
+                working_distance_m=float(np.linalg.norm(camera.world_from_left.position_m)),
+            ).calibration
+        save_calibration(found, lab.folder / STEREO)
+        assert found.uncertainty is not None
+        return StepResult(
+            residual=found.reprojection_rms_px,
+            unit="px",
+            limit=0.3,
+            advice="Check that the board is flat and rests in each image; add tilted poses.",
+            uncertainty={
+                "depth_mm": 1e3 * found.uncertainty.depth_std_m,
+                "lateral_mm": 1e3 * found.uncertainty.lateral_std_m,
+            },
+            scene_values=values,
+            parameters={"triangulator.calibration": STEREO},
+        )
+
+    def calibrate_arms(self, lab: Commissioning) -> StepResult:
+        from flexsheet.messages.arms_calibration import save_arms_calibration
+
+        scene = load_scene(lab.scene_copy)
+        stereo = lab.find_file(STEREO)
+        optics = None if stereo is None else load_calibration(stereo)
+        fits = {}
+        with self._folder(StepName.ARMS) as folder:
+            for side in calibrate_arms.SIDES:
+                poses = folder / side
+                if self.apparatus is not None:
+                    calibrate_arms.simulate_folder(
+                        scene, self.flange_board, side, self.apparatus,
+                        folder=folder, places=self.arm_poses, seed=self.seed,
+                    )  # fmt: skip
+                fits[side], _ = calibrate_arms.fit_folder(
+                    poses, self.flange_board, scene, optics, side
+                )
+        measured = calibrate_arms.make_calibration(fits, scene, self.flange_board)
+        save_arms_calibration(measured, lab.folder / ARMS)
+        values: dict[str, Any] = {}
+        uncertainty = {}
+        for side, fit in fits.items():
+            values |= _pose_values(f"arms.{side}.world_from_base", fit.world_from_base)
+            std_m, std_rad = fit.compute_std(np.zeros(3))
+            uncertainty[f"{side}_position_mm"] = 1e3 * std_m
+            uncertainty[f"{side}_rotation_mrad"] = 1e3 * std_rad
+        return StepResult(
+            residual=1e3 * max(fit.arm_sigma_m for fit in fits.values()),
+            unit="mm",
+            limit=1.0,
+            advice="Check that the board is rigid on the flange and that the arm was at rest.",
+            uncertainty=uncertainty,
+            scene_values=values,
+        )
+
+    def calibrate_sheet(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
+        from flexsheet.launch.calibration.sheet_rows import read_rows
+        from flexsheet.messages.sheet_calibration import save_sheet_calibration
+
+        scene = load_scene(lab.scene_copy)
+        if self.apparatus is None:
+            file = self._find_data(StepName.SHEET)
+            pushes, lines = read_rows(file, scene.sheet, scene.finger.radius_m)
+            source = str(file)
+        else:
+            pushes = calibrate_sheet.simulate_pushes(
+                scene, self.apparatus, places=False, noise_n=GAUGE_N, seed=self.seed
+            )
+            lines, source = list(range(1, len(pushes) + 1)), f"twin of {scene.name}"
+        try:
+            found = calibrate_sheet.make_calibration(
+                scene, pushes, lines, source=source, with_mooney=False, with_table=False
+            )
+        except SheetModelFitError as error:
+            raise CommissionError(f"step sheet, {source}: {error}") from error
+        save_sheet_calibration(found, lab.folder / SHEET)
+        modulus = found.modulus_thickness_n_per_m
+        return StepResult(
+            residual=100.0 * found.residual_rms_ratio,
+            unit="%",
+            limit=5.0,
+            advice="Tighten the clamps, and push more slowly; remove rows with a sliding finger.",
+            uncertainty={
+                "modulus_percent": 100.0 * modulus.standard_deviation / modulus.value,
+                "slack_width_mm": 1e3 * found.slack_width_m.standard_deviation,
+            },
+            parameters={"planner.sheet_calibration": SHEET},
+        )
+
+    def calibrate_projector(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.gray_code import make_patterns
+        from flexsheet.launch.calibration.projector import (
+            ProjectorError,
+            measure_points,
+        )
+        from flexsheet.launch.calibration.projector import (
+            calibrate_projector as fit_projector,
+        )
+
+        scene = load_scene(lab.scene_copy)
+        guess = require_projector(scene)
+        camera = calibrate_projector.load_camera(scene, lab.find_file(STEREO))
+        if self.apparatus is None:
+            patterns = make_patterns(guess.width_px, guess.height_px)
+            folder = self._find_data(StepName.PROJECTOR)
+            views = list(calibrate_projector.read_views(folder, len(patterns)))
+        else:
+            true = require_projector(apply_apparatus(scene, self.apparatus))
+            views = list(
+                calibrate_projector.simulate_views(
+                    scene, true, self.apparatus, self.sheet_poses, self.seed
+                )
+            )
+        try:
+            points = measure_points(views, camera, guess)
+            fit = fit_projector(points, guess)
+        except ProjectorError as error:
+            raise CommissionError(f"step projector: {error}") from error
+        lens = fit.projector.lens
+        pose = fit.projector.world_from_projector
+        matrix = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        values = _pose_values("projector.world_from_projector", matrix)
+        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            values[f"projector.lens.{key}"] = calibrate.round_digits(getattr(lens, key))
+        values["projector.lens.distortion"] = [calibrate.round_digits(k) for k in lens.distortion]
+        return StepResult(
+            residual=fit.rms_px,
+            unit="px",
+            limit=0.7,
+            advice="Keep the sheet still during each pose, and repeat the step camera.",
+            uncertainty={
+                "held_out_px": fit.held_out_rms_px,
+                "on_sheet_mm": 1e3 * fit.held_out_rms_px * fit.rms_m / max(fit.rms_px, 1e-9),
+            },
+            scene_values=values,
+        )
+
+    def calibrate_edges(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
+        from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
+
+        scene = load_scene(lab.scene_copy)
+        stereo = lab.find_file(STEREO)
+        if self.apparatus is None:
+            poses = read_edge_marks(self._find_data(StepName.EDGES))
+        else:
+            optics = None if stereo is None else load_calibration(stereo)
+            poses = simulate_edge_marks(scene, self.apparatus, calibration=optics, seed=self.seed)
+        try:
+            fits = fit_edges(poses, scene)
+        except EdgeFitError as error:
+            raise CommissionError(f"step edges: {error}; {error.remedy}") from error
+        values: dict[str, Any] = {}
+        uncertainty = {}
+        for side, fit in fits.items():
+            arm, key = fit.arm, f"arms.{side}"
+            values |= _pose_values(f"{key}.world_from_base", _matrix(arm.world_from_base))
+            values |= _pose_values(f"{key}.flange_from_edge", _matrix(arm.flange_from_edge))
+            offsets = [calibrate.round_digits(one) for one in arm.joint_offsets_rad]
+            values[f"{key}.joint_offsets_rad"] = offsets
+            compliance = calibrate.round_digits(arm.flange_compliance_m_per_n)
+            values[f"{key}.flange_compliance_m_per_n"] = compliance
+            uncertainty[f"{side}_edge_mm"] = 1e3 * fit.edge_std_m
+            uncertainty[f"{side}_compliance_um_per_n"] = 1e6 * fit.compliance_std_m_per_n
+        return StepResult(
+            residual=1e3 * max(fit.residual_rms_m for fit in fits.values()),
+            unit="mm",
+            limit=0.4,
+            advice="Check the marks and their fixing; repeat the step arms.",
+            uncertainty=uncertainty,
+            scene_values=values,
+        )
+
+    def calibrate_marker(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.touches import read_touches, simulate_touches
+        from flexsheet.messages.marker_calibration import save_marker_calibration
+
+        scene = load_scene(lab.scene_copy)
+        stereo = lab.find_file(STEREO)
+        optics = None if stereo is None else load_calibration(stereo)
+        radius_m = self.finger_radius_m
+        if self.apparatus is None:
+            file = self._find_data(StepName.MARKER)
+            touches, source = read_touches(file, scene), str(file)
+        else:
+            touches = simulate_touches(scene, self.apparatus, calibration=optics, seed=self.seed)
+            source = f"twin of {scene.name}"
+            true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
+            read_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
+            # Tables that are computed for a finger then serve for all fingers of about its size.
+            radius_m = 5e-4 * round(read_m / 5e-4)
+        found = calibrate_marker.make_calibration(touches, scene, source)
+        save_marker_calibration(found, lab.folder / MARKER)
+        uncertainty = {
+            f"{axis}_mm": 1e3 * deviation_m
+            for axis, deviation_m in zip("xyz", found.standard_deviations_m, strict=True)
+        }
+        return StepResult(
+            residual=1e3 * found.residual_rms_m,
+            unit="mm",
+            limit=0.5,
+            advice="Touch again with more different orientations of the finger.",
+            uncertainty=uncertainty,
+            scene_values=(
+                {} if radius_m is None else {"finger.radius_m": calibrate.round_digits(radius_m)}
+            ),
+            parameters={"triangulator.marker_calibration": MARKER},
+        )
+
+    def verify(self, lab: Commissioning) -> StepResult:
+        """Run a stroke with the result; evaluate simulated devices also at rest."""
+        if self.apparatus is None:
+            stroke = _read_stroke(self._find_data(StepName.VERIFICATION))
+            figures: dict[str, Any] = {"stroke": stroke, "flagged": stroke.get("flagged", [])}
+        else:
+            figures = run_verification(lab, self.seconds)
+        figures["repeat"] = [REPEAT[one] for one in figures["flagged"] if one in REPEAT]
+        tolerance_m = load_scene(lab.scene_copy).tolerances.sheet_position_m
+        return StepResult(
+            residual=figures["stroke"]["delta_d_mm"]["mean"],
+            unit="mm",
+            limit=1e3 * tolerance_m,
+            advice="Repeat the steps that the verification names.",
+            figures=figures,
+        )
+
+
+def run_verification(lab: Commissioning, seconds: float) -> dict[str, Any]:
+    """Run a stroke of a simulated laboratory, and evaluate it at rest before and after.
+
+    `stated_mm` are the errors that the uncertainties of the steps predict, to be compared with the
+    true errors of sheet and fingertip at rest.
+    """
+    from flexsheet.launch.experiments.offline import (
+        NodeCalibrations,
+        OfflineEvaluator,
+        exceeded_tolerances,
+    )
+    from flexsheet.launch.experiments.run import require_scene
+    from flexsheet.launch.experiments.trial import run_stroke
+
+    file = str(lab.folder / APPARATUS_FILE)
+    trial = {"launch_file": str(lab.launch_copy), "seconds": seconds}
+    stroke = run_stroke(trial, file)
+    at_rest = {}
+    for name, launch_file, scene_file in (
+        ("before", lab.launch_file, lab.scene_file),
+        ("after", lab.launch_copy, lab.scene_copy),
+    ):
+        plan = load_graph(launch_file, settings=[f"scene={scene_file}"], apparatus=file)
+        scene, apparatus = require_scene(plan), plan.apparatus_message()
+        assert apparatus is not None
+        evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
+        at_rest[name] = evaluator.evaluate(apparatus).figures()
+    return {
+        "stroke": stroke,
+        "at_rest": at_rest,
+        "stated_mm": _state_errors(lab),
+        "out_of_tolerance": exceeded_tolerances(scene, at_rest["after"]),
+        "flagged": stroke["flagged"],
+    }
+
+
+def _state_errors(lab: Commissioning) -> dict[str, float]:
+    """Return the errors (mm) of sheet and fingertip that the steps' uncertainties predict."""
+
+    def collect(step: StepName, *keys: str) -> list[float]:
+        record = lab.state.steps.get(step)
+        if record is None or record.result is None:
+            return []
+        return [record.result.uncertainty[key] for key in keys]
+
+    tip = [
+        *collect(StepName.CAMERA, "depth_mm", "lateral_mm"),
+        *collect(StepName.MARKER, "x_mm", "y_mm", "z_mm"),
+    ]
+    arms = collect(StepName.EDGES, "left_edge_mm", "right_edge_mm") or collect(
+        StepName.ARMS, "left_position_mm", "right_position_mm"
+    )
+    # The middle of the sheet moves by half the error of each edge.
+    sheet = [0.5 * one for one in arms]
+    return {"fingertip": float(np.linalg.norm(tip)), "sheet": float(np.linalg.norm(sheet))}
+
+
+def _find_images(folder: Path, side: str) -> list[Path]:
+    found = sorted(one for one in folder.glob(f"{side}*") if one.suffix in (".png", ".jpg"))
+    if not found:
+        raise CommissionError(f"{folder}: no images {side}*.png or {side}*.jpg; check the folder")
+    return found
+
+
+def _matrix(pose: Pose) -> Any:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+def _pose_values(key: str, matrix: Any) -> dict[str, Any]:
+    """Return the values of a pose (4, 4) in a scene by their dotted paths."""
+    return {
+        f"{key}.position_m": [calibrate.round_digits(one) for one in matrix[:3, 3]],
+        f"{key}.rpy_rad": [
+            calibrate.round_digits(one) for one in rpy_from_rotation(matrix[:3, :3])
+        ],
+    }
+
+
+def _read_stroke(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        float(found["delta_d_mm"]["mean"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CommissionError(
+            f"--data verification={path}: not a result of `flexsheet experiment stroke --json`: "
+            f"{error!r}; save the output of that command"
+        ) from error
+    return found

@@ -1,0 +1,532 @@
+"""Test the commissioning of a laboratory: its steps, state, report and command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from flexsheet.launch import cli
+from flexsheet.launch.calibration.arm_poses import READY_RAD, SimulatedArm, make_lens_rig
+from flexsheet.launch.calibration.commission import (
+    CommissionError,
+    Commissioning,
+    StepName,
+    StepResult,
+)
+from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
+from flexsheet.launch.calibration.sheet_rows import simulate_rows
+from flexsheet.launch.calibration.touches import simulate_touches
+from flexsheet.launch.commands import capture
+from flexsheet.launch.commands.calibrate_marker import make_calibration as fit_marker
+from flexsheet.launch.commands.calibrate_sheet import make_calibration as fit_sheet
+from flexsheet.launch.commands.commission_steps import (
+    BOARD,
+    INSTRUCTIONS,
+    Laboratory,
+    open_laboratory,
+)
+from flexsheet.launch.experiments.trial import run_robustness_trial
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
+from flexsheet.messages.calibration import load_calibration
+from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_vector,
+    transform,
+    transform_from_rpy,
+    vector_from_rotation,
+)
+from flexsheet.nodes.twin import projector as twin_projector
+from flexsheet.nodes.twin.rig import make_true_camera, pixels_of
+from flexsheet.nodes.twin.tolerance_table import sample_apparatus
+from flexsheet.nodes.twin.truth import align_world_to_camera, apply_apparatus
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parent.parent
+DEMO = ROOT / "launch" / "demo.yaml"
+SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+OPTICS = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
+SCENE = load_scene(SCENE_FILE)
+
+
+def matrix(pose: Any) -> Floats:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+def changed(section: str, **values: Any) -> Apparatus:
+    given = nominal_apparatus(SCENE).model_dump(mode="json")
+    for key, value in values.items():
+        if isinstance(value, dict):
+            given[section][key] |= value
+        else:
+            given[section][key] = value
+    return Apparatus.model_validate(given)
+
+
+# The world frame of the camera
+
+
+def test_the_camera_defines_the_world_and_the_hardware_stays_the_same() -> None:
+    drawn = sample_apparatus(SCENE, 5)
+    aligned = align_world_to_camera(SCENE, drawn)
+    before, after = apply_apparatus(SCENE, drawn), apply_apparatus(SCENE, aligned)
+    assert matrix(after.camera.world_from_left) == pytest.approx(
+        matrix(SCENE.camera.world_from_left), abs=1e-12
+    )
+    assert before.projector is not None
+    assert after.projector is not None
+    for pose in (
+        lambda scene: scene.arms.left.world_from_base,
+        lambda scene: scene.arms.right.world_from_base,
+        lambda scene: scene.projector.world_from_projector,
+    ):
+        relative = [
+            inverse(matrix(one.camera.world_from_left)) @ matrix(pose(one))
+            for one in (before, after)
+        ]
+        assert relative[0] == pytest.approx(relative[1], abs=1e-9)
+    eyes = [
+        apply(inverse(matrix(one.camera.world_from_left)), one.eyes.centre_world_m[None])
+        for one in (before, after)
+    ]
+    assert eyes[0] == pytest.approx(eyes[1], abs=1e-9)
+    assert aligned.sheet == drawn.sheet
+
+
+def test_a_camera_at_its_nominal_pose_changes_nothing() -> None:
+    given = changed("arms", left={"base_position_offset_m": [1e-3, 2e-3, 0.0]})
+    aligned = align_world_to_camera(SCENE, given)
+    assert aligned.arms.left.base_position_offset_m == pytest.approx((1e-3, 2e-3, 0.0), abs=1e-12)
+
+
+# Simulated observations
+
+
+def test_the_simulated_board_is_seen_by_the_camera_of_the_apparatus(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = changed("camera", left={"focal_ratio": 1.01}, right_position_offset_m=[1e-3, 0.0, 0.0])
+    cameras = []
+
+    class Board:
+        def __init__(self, camera: Any, *_: Any, **__: Any) -> None:
+            cameras.append(camera)
+
+        def poses(self, count: int) -> list[Floats]:
+            return []
+
+    monkeypatch.setattr("flexsheet.nodes.twin.board.TwinBoard", Board)
+    assert not list(capture.simulate_views(SCENE, BOARD, given, pairs=1, seed=1))
+    nominal = make_true_camera(SCENE.camera)
+    assert cameras[0].left.fx_px == pytest.approx(1.01 * nominal.left.fx_px)
+    moved = cameras[0].right_from_left[:3, 3] - nominal.right_from_left[:3, 3]
+    assert moved[0] == pytest.approx(-1e-3, abs=1e-5)
+
+
+def test_the_arm_of_an_apparatus_is_found_within_the_stated_uncertainty() -> None:
+    """The corners are exact but for noise; backlash is the error of the arm."""
+    given = changed(
+        "arms",
+        left={
+            "base_position_offset_m": [2e-3, -1e-3, 1e-3],
+            "base_rotation_offset_rad": [2e-3, 1e-3, -3e-3],
+            "backlash_rad": 4e-4,
+        },
+    )
+    arm = SimulatedArm(SCENE, "left", given, seed=3)
+    assert arm.world_from_base == pytest.approx(
+        matrix(apply_apparatus(SCENE, given).arms.left.world_from_base)
+    )
+    rig, random = make_lens_rig(SCENE, None), np.random.default_rng(4)
+    grid = np.mgrid[:7, :5].T.reshape(-1, 2) * 0.015
+    corners = np.concatenate([grid, np.zeros((35, 1))], axis=1)
+    held = arm.place_flange(READY_RAD, exact=True)
+    facing = rig.world_from_left[:3, :3]
+    middle = held[:3, 3] + 0.06 * held[:3, 2]
+    flange_from_board = inverse(held) @ transform(facing, middle - facing @ corners.mean(axis=0))
+    detections = []
+    for number in range(14):
+        joints = READY_RAD + random.normal(0.0, 0.15, 6)
+        left_from_board = (
+            inverse(rig.world_from_left) @ arm.place_flange(joints) @ flange_from_board
+        )
+        views = []
+        for lens, eye in (
+            (SCENE.camera.left, np.eye(4)),
+            (SCENE.camera.right, SCENE.camera.right_from_left),
+        ):
+            in_eye = apply(eye @ left_from_board, corners)
+            pixels = pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:])
+            views.append(CornerView(corners, pixels + random.normal(0.0, 0.05, pixels.shape)))
+        detections.append(BoardDetection(f"pose {number}", joints, *views))
+    fit = calibrate_base(detections, rig)
+    error = arm.world_from_base @ inverse(fit.world_from_base)
+    std_m, std_rad = fit.compute_std(np.zeros(3))
+    assert np.linalg.norm(error[:3, 3]) < 3.0 * std_m < 2e-3
+    assert np.linalg.norm(vector_from_rotation(error[:3, :3])) < 3.0 * std_rad < 3e-3
+
+
+def test_joint_offsets_of_an_apparatus_turn_the_true_flange() -> None:
+    offsets = [0.0, 0.0, 0.0, 0.0, 0.0, 0.01]
+    arms = [
+        SimulatedArm(SCENE, "right", one, seed=1)
+        for one in (nominal_apparatus(SCENE), changed("arms", right={"joint_offsets_rad": offsets}))
+    ]
+    flanges = [arm.place_flange(READY_RAD, exact=True) for arm in arms]
+    turned = vector_from_rotation(flanges[0][:3, :3].T @ flanges[1][:3, :3])
+    assert np.abs(turned) == pytest.approx([0.0, 0.0, 0.01], abs=1e-9)
+
+
+def test_a_stiffer_sheet_is_identified_from_pushes_between_the_true_arms() -> None:
+    """The clamps slip, and hysteresis gives one row for each direction."""
+    given = changed(
+        "sheet",
+        modulus_ratio=1.2,
+        slack_width_offset_m=5e-4,
+        hysteresis_ratio=0.1,
+        density_kg_per_m3=0.0,
+    )
+    reduced = SCENE.model_copy(
+        update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.012})}
+    )
+    rows = simulate_rows(reduced, places=False, noise_n=0.003, seed=2, apparatus=given)
+    assert [row.unloading for row in rows[:2]] == [False, True]
+    assert rows[0].force_n > rows[1].force_n
+    found = fit_sheet(
+        SCENE, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=False
+    )
+    assert found.modulus_thickness_n_per_m.value == pytest.approx(1200.0, rel=0.06)
+    assert found.slack_width_m.value == pytest.approx(0.2405, abs=8e-4)
+    assert found.hysteresis_ratio is not None
+    assert found.hysteresis_ratio.value == pytest.approx(0.1, abs=0.03)
+
+
+def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
+    """The triangulator assumes `direction_world`, so the offset must contain the finger's tilt."""
+    given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010], finger_tilt_rad=[0.2, -0.15])
+    touches = simulate_touches(SCENE, given, calibration=load_calibration(OPTICS), seed=1)
+    found = fit_marker(touches, SCENE, "twin")
+    used_m = touches[0].world_from_finger @ np.array(found.marker_from_pad_m)
+    true_m = find_marker_offset(given)
+    assert np.abs(used_m - true_m).max() < 3.0 * max(found.standard_deviations_m)
+
+
+def find_marker_offset(given: Apparatus) -> Floats:
+    """Return the true vector from pad to marker in the world, from the definition of the frame."""
+    turn = rotation_from_vector((*given.finger.finger_tilt_rad, 0.0))
+    x = turn @ np.array(SCENE.finger.direction_world)
+    x /= np.linalg.norm(x)
+    z = np.cross(x, turn[:, 0])
+    z /= np.linalg.norm(z)
+    return np.column_stack([x, np.cross(z, x), z]) @ np.array(given.finger.marker_from_pad_m)
+
+
+def test_light_meets_a_bent_sheet_where_it_is() -> None:
+    """The rays of the camera meet the surface z = 0.02 x, not the plane z = 0."""
+    assert SCENE.projector is not None
+    camera = make_true_camera(SCENE.camera)
+    lit = twin_projector.LitSheet(SCENE, camera, SCENE.projector, seed=1)
+    axis = np.linspace(-0.12, 0.12, 7)
+    x, y = (one.ravel() for one in np.meshgrid(axis, axis))
+    bend = twin_projector._fit_bend(np.column_stack([x, y, 0.02 * x]))
+    view = matrix(camera.world_from_left)
+    tilted = transform(rotation_from_vector([0.0, -np.arctan(0.02), 0.0]), np.zeros(3))
+    rays = lit._rays[0][::40, ::40]
+    found = lit._lit_by(rays, view, np.eye(4), bend)
+    expected = lit._lit_by(rays, view, tilted, None)
+    both = found[2] & expected[2]
+    assert both.sum() > 20
+    assert found[0][both] == pytest.approx(expected[0][both], abs=0.02)
+    assert found[1][both] == pytest.approx(expected[1][both], abs=0.02)
+
+
+# State, order and results
+
+
+def result(residual: float = 0.1, **values: Any) -> StepResult:
+    return StepResult(residual=residual, unit="mm", limit=0.5, advice="Repeat.", **values)
+
+
+def open_lab(folder: Path, apparatus: str | None = "seed:3") -> Commissioning:
+    return Commissioning(folder, DEMO, SCENE_FILE, apparatus)
+
+
+def test_results_go_into_scene_and_launch_file(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    lab.run(StepName.ARMS, lambda _: result(scene_values={"finger.radius_m": 0.0081}))
+    (tmp_path / "stereo.yaml").write_text(OPTICS.read_text())
+    lab.run(
+        StepName.MARKER, lambda _: result(parameters={"triangulator.calibration": "stereo.yaml"})
+    )
+    assert load_scene(lab.scene_copy).finger.radius_m == 0.0081
+    graph = load_graph(lab.launch_copy)
+    assert graph.nodes["triangulator"].parameters["calibration"] == str(tmp_path / "stereo.yaml")
+    assert lab.find_file("stereo.yaml") == tmp_path / "stereo.yaml"
+    assert lab.find_file("sheet.yaml") is None
+
+
+def test_a_scene_with_a_mesh_stays_valid_in_the_folder(tmp_path: Path) -> None:
+    lab = Commissioning(tmp_path, DEMO, SCENE_FILE.parent / "organ.yaml", None)
+    lab.write()
+    organ = load_scene(SCENE_FILE.parent / "organ.yaml")
+    assert identify_scene(load_scene(lab.scene_copy)) == identify_scene(organ)
+
+
+def test_a_commissioning_resumes_and_a_repeated_step_invalidates_later_ones(
+    tmp_path: Path,
+) -> None:
+    lab = open_lab(tmp_path)
+    radii = iter((0.008, 0.009))
+
+    def step(_: Commissioning) -> StepResult:
+        return result(scene_values={"finger.radius_m": next(radii)})
+
+    lab.run(StepName.CAMERA, step)
+    lab.skip(StepName.ARMS, "the arms come next week")
+    lab.run(StepName.EDGES, lambda _: result())
+    again = open_lab(tmp_path)
+    assert again.pending() == list(StepName)[3:]
+    assert again.state == lab.state
+    again.run(StepName.CAMERA, step)
+    assert again.pending() == list(StepName)[1:]
+    assert load_scene(again.scene_copy).finger.radius_m == 0.009
+
+
+def test_a_step_starts_from_the_scene_of_the_steps_before_it(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    seen = []
+
+    def add(one: Commissioning) -> StepResult:
+        radius_m = load_scene(one.scene_copy).finger.radius_m
+        seen.append(radius_m)
+        return result(scene_values={"finger.radius_m": radius_m + 0.001})
+
+    for _ in range(2):
+        lab.run(StepName.EDGES, add)
+    assert seen == [SCENE.finger.radius_m] * 2
+
+
+def test_a_failed_step_leaves_the_earlier_results(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    lab.run(StepName.CAMERA, lambda _: result())
+
+    def fail(_: Commissioning) -> StepResult:
+        raise CommissionError("the arm is off")
+
+    with pytest.raises(CommissionError, match="the arm is off"):
+        lab.run(StepName.ARMS, fail)
+    assert open_lab(tmp_path).pending() == list(StepName)[1:]
+
+
+def test_the_report_names_residuals_limits_and_advice(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    lab.run(StepName.CAMERA, lambda _: result(0.7, uncertainty={"depth_mm": 0.04}))
+    lab.skip(StepName.ARMS, "no board")
+    text = (tmp_path / "report.md").read_text()
+    assert "| camera | " in text
+    assert "0.7 mm | 0.5 mm | depth_mm 0.04 |" in text
+    assert "camera: above the limit. Repeat." in text
+    assert "skipped: no board" in text
+    assert "camera: depth 0.04 mm" in text
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (lambda folder: open_lab(folder, "seed:4").write(), "belongs to seed:4, .* gives seed:3"),
+        (lambda folder: (folder / "notes.txt").write_text("x"), "not empty and has no commission"),
+        (lambda folder: (folder / "commission.json").write_text("{]"), "not the state of a"),
+    ],
+)
+def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, words: str) -> None:
+    prepare(tmp_path)
+    with pytest.raises(CommissionError, match=words):
+        open_lab(tmp_path)
+
+
+def test_an_unknown_apparatus_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="not a random sample"):
+        open_laboratory(tmp_path / "lab", DEMO, None, "seed:x")
+    assert not (tmp_path / "lab").exists()
+
+
+# The command
+
+
+def invoke(*arguments: str) -> tuple[int, Any, str]:
+    done = CliRunner().invoke(cli.app, ["commission", *arguments, "--json"])
+    text = str(done.exception) if done.exception is not None else done.stderr
+    return done.exit_code, json.loads(done.stdout) if done.stdout else None, text
+
+
+@pytest.fixture
+def quick_steps(monkeypatch: pytest.MonkeyPatch) -> list[StepName]:
+    """Replace all steps by ones that only record their names."""
+    ran: list[StepName] = []
+
+    def make(name: StepName) -> Any:
+        def step(_: Commissioning) -> StepResult:
+            ran.append(name)
+            figures = {"flagged": []} if name is StepName.VERIFICATION else {}
+            return result(figures=figures)
+
+        return step
+
+    monkeypatch.setattr(
+        Laboratory, "steps", property(lambda _: {name: make(name) for name in StepName})
+    )
+    return ran
+
+
+def test_the_command_runs_skips_repeats_and_checks(
+    tmp_path: Path, quick_steps: list[StepName]
+) -> None:
+    folder = ("--apparatus", "seed:3", "--output", str(tmp_path / "lab"))
+    code, found, _ = invoke(*folder, "--skip", "marker=the finger is not here")
+    assert code == 0
+    assert found["complete"]
+    assert quick_steps == [name for name in StepName if name is not StepName.MARKER]
+    assert [one["name"] for one in found["steps"]] == list(StepName)
+    assert {"name", "seconds", "residual", "unit"} <= set(found["steps"][0])
+    assert found["steps"][5]["skipped_because"] == "the finger is not here"
+    assert found["launch_file"] == str(tmp_path / "lab" / "launch.yaml")
+    assert found["verification"] == {"flagged": []}
+    # The apparatus file describes the same hardware, whatever the commissioned scene says.
+    graph = load_graph(Path(found["launch_file"]), apparatus=found["apparatus"])
+    assert graph.apparatus is not None
+    quick_steps.clear()
+    assert invoke(*folder)[0] == 0
+    assert quick_steps == []
+    invoke(*folder, "--check")
+    assert quick_steps == [StepName.VERIFICATION]
+    quick_steps.clear()
+    invoke(*folder, "--step", "edges", "--step", "marker")
+    assert quick_steps == list(StepName)[2:]
+
+
+def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> None:
+    folder = ("--output", str(tmp_path / "lab"))
+    code, found, _ = invoke(*folder)
+    assert code == 1
+    assert not found["complete"]
+    assert INSTRUCTIONS[StepName.CAMERA] in found["next"]
+    steps = ("camera", "arms", "sheet", "projector", "edges")
+    skips = [part for name in steps for part in ("--skip", f"{name}=as in the data sheet")]
+    header = "marker_x_mm,marker_y_mm,marker_z_mm,point_x_mm,point_y_mm,point_z_mm"
+    rows = []
+    for tilt in ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25)):
+        turn = rotation_from_vector(np.radians([*tilt, 0.0]))
+        x, y, z = turn @ np.array([0.0, 5.0, 9.0])
+        rows.append(f"{x},{y},{z},0,0,0,{tilt[0]},{tilt[1]}")
+    file = tmp_path / "touches.csv"
+    file.write_text("\n".join([f"{header},tilt_x_deg,tilt_y_deg", *rows]))
+    data = ("--data", f"marker={file}", "--finger-radius-mm", "8.5")
+    code, found, _ = invoke(*folder, *skips, *data)
+    assert code == 1
+    assert found["steps"][-1]["name"] == "marker"
+    assert INSTRUCTIONS[StepName.VERIFICATION] in found["next"]
+    assert load_scene(Path(found["scene_file"])).finger.radius_m == 0.0085
+    stroke = tmp_path / "stroke.json"
+    stroke.write_text(json.dumps({"delta_d_mm": {"mean": 0.07}, "flagged": ["marker_offset"]}))
+    code, found, _ = invoke(*folder, "--data", f"verification={stroke}")
+    assert code == 0
+    assert found["complete"]
+    assert found["verification"]["repeat"] == ["marker"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--step", "lens"), "--step lens: expected one of camera, arms"),
+        (("--skip", "camera="), "expected STEP=TEXT with a text"),
+        (("--data", "camera"), "expected STEP=TEXT with a text"),
+        (("--data", "camera=nowhere"), "--data camera=nowhere: does not exist"),
+        (("--check",), "--check: the steps camera, arms, .* are not done"),
+        (("--check", "--step", "arms"), "--check only repeats the verification"),
+        (("--apparatus", "seed:1", "--data", "camera=x"), "--data .* are for real devices"),
+        (("--board", "9"), "--board 9: expected COLUMNSxROWS"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+    import re
+
+    code, _, text = invoke("--output", str(tmp_path / "lab"), *arguments)
+    assert code != 0
+    assert re.search(words, text)
+
+
+def test_an_apparatus_without_twin_is_refused() -> None:
+    for command in (
+        "stereo --left a --right b --board 9x6 --square-mm 25",
+        "arms --left-arm . --board 9x6 --square-mm 25 --scene cylinder",
+        "projector --scene cylinder --pictures .",
+        "sheet --rows a.csv",
+        "marker --rows a.csv",
+    ):
+        output = "" if command.startswith("projector") else " -o result.yaml"
+        line = f"calibrate {command} --apparatus seed:1{output}"
+        done = CliRunner().invoke(cli.app, line.split())
+        assert "--apparatus seed:1: the option is for --twin" in str(done.exception), command
+
+
+def test_a_robustness_trial_commissions_its_laboratory(
+    tmp_path: Path, quick_steps: list[StepName], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strokes = []
+
+    def run_stroke(trial: Any, apparatus: str) -> dict[str, Any]:
+        strokes.append((trial["launch_file"], apparatus))
+        errors = {key: {"mean": 0.1} for key in ("true_delta_d_mm", "true_delta_theta_deg")}
+        rest = dict.fromkeys(("valid_ratio", "latency_ms", "drops", "bag", "flagged"))
+        return {**errors, "fingertip_mm": {"mean": 0.2}, **rest}
+
+    class Evaluator:
+        def __init__(self, *_: Any) -> None: ...
+
+        def evaluate(self, *_: Any) -> Any:
+            return type(
+                "Found", (), {"figures": lambda _: {"image_mm": 0.1, "force_percent": 2.0}}
+            )()
+
+    monkeypatch.setattr("flexsheet.launch.experiments.trial.run_stroke", run_stroke)
+    monkeypatch.setattr("flexsheet.launch.experiments.trial.OfflineEvaluator", Evaluator)
+    row = run_robustness_trial(
+        {
+            "seed": 3,
+            "launch_file": str(DEMO),
+            "settings": [],
+            "apparatus": "seed:3,paper",
+            "commission_folder": str(tmp_path / "lab"),
+            "seconds": 1.0,
+        }
+    )
+    assert strokes == [(str(tmp_path / "lab/launch.yaml"), str(tmp_path / "lab/apparatus.yaml"))]
+    assert [one["name"] for one in row["commission"]["steps"]] == list(StepName)[:-1]
+    assert row["sheet_mm"] == 0.1
+    assert row["image_mm"] == 0.1
+
+
+def test_commissioned_and_calibrated_exclude_each_other() -> None:
+    line = "experiment robustness --seeds 0 --commissioned --calibrated --json"
+    done = CliRunner().invoke(cli.app, line.split())
+    assert "give one of the two" in str(done.exception)
+
+
+@pytest.mark.long
+def test_a_simulated_laboratory_is_commissioned_end_to_end(tmp_path: Path) -> None:
+    code, found, text = invoke(
+        "--apparatus", "seed:3", "--output", str(tmp_path / "lab"), "--duration", "6"
+    )
+    assert code == 0, text
+    at_rest = found["verification"]["at_rest"]
+    for metric in ("sheet_mm", "image_mm", "force_percent", "fingertip_mm"):
+        assert at_rest["after"][metric] < 0.5 * at_rest["before"][metric], metric
