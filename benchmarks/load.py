@@ -65,7 +65,7 @@ MAX_EXCESS_RATIO = 0.07
 
 ARMS = ("left", "right")
 RECOVERY_S = 60.0
-MEASURED = {
+MEASURED: dict[str, tuple[str, Callable[[Scene], float]]] = {
     "sheet_mm.p95": ("sheet", lambda scene: 1e3 * scene.tolerances.sheet_position_m),
     "hold_mm.p95": ("sheet to its target", lambda scene: 1e3 * scene.tolerances.sheet_position_m),
     "exposure_to_arm_ms.p95": ("exposure to arm", lambda scene: 1e3 * scene.tolerances.latency_s),

@@ -241,13 +241,35 @@ class ProcessMonitor:
 
 
 def missing_outside_faults(lost: list[Gap], results: list[Result]) -> list[Gap]:
-    """Return the gaps of the main host's bag outside the times of faults."""
-    spans = [(one.during_ns[0] - MARGIN_NS, one.during_ns[1] + MARGIN_NS) for one in results]
+    """Return the gaps of the main host's bag that are not within the times of faults.
+
+    A gap may extend over several faults if no time between them is free of faults: a launcher that
+    is killed again before its recorder is connected leaves one gap.
+    """
+    spans = merge_spans([(one.during_ns[0], one.during_ns[1]) for one in results])
     return [
         gap
         for gap in lost
         if not any(begin <= gap.from_ns and gap.to_ns <= end for begin, end in spans)
     ]
+
+
+def merge_spans(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Extend the times (start, end), ns, of faults by the margin, and merge those that overlap."""
+    merged: list[tuple[int, int]] = []
+    for begin, end in sorted((begin - MARGIN_NS, end + MARGIN_NS) for begin, end in spans):
+        if merged and begin <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(merged[-1][1], end)
+        else:
+            merged.append((begin, end))
+    return merged
+
+
+def fault_free_ratio(results: list[Result]) -> float:
+    """Return the fraction of the time that no fault and no margin of a fault covers."""
+    spans = merge_spans([(one.during_ns[0], one.during_ns[1]) for one in results])
+    covered_ns = sum(end - begin for begin, end in spans)
+    return 1.0 - covered_ns / (spans[-1][1] - spans[0][0]) if spans else 1.0
 
 
 def missing_by_fault(lost: list[Gap], results: list[Result]) -> dict[str, float]:
@@ -368,6 +390,7 @@ def evaluate(lab: Lab, results: list[Result], watch: ProcessMonitor) -> dict[str
         "back_s": percentiles(back),
         "missing_s": percentiles([gap.seconds for gap in lost]),
         "missing_by_fault": missing_by_fault(lost, results),
+        "fault_free_ratio": fault_free_ratio(results),
         "longest_sheet_mm": 1e3 * longest_m,
         "largest_joint_speed_ratio": max(speeds),
         "violations": violations,

@@ -66,6 +66,7 @@ class FemSolver(Node):
         self._table_task: asyncio.Task[None] | None = None
         self._eta = EtaEstimator()
         self._replaced: list[tuple[body.SceneBody, int]] = []
+        self._fallback: DeadlineFallback
         self._set_bodies([])
         self._reset_contact()
         self.note = "waiting for a scene"
