@@ -325,6 +325,7 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    make_line: Any = Line2D  # matplotlib's class is not typed
     names = list(dict.fromkeys(row["factor"] for row in rows))
     labels = [label for label, _ in MEASURED.values()]
     with page_style():
@@ -353,11 +354,11 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         figure.legend(
             handles=[
                 *(
-                    Line2D([], [], color=colour, label=label)
+                    make_line([], [], color=colour, label=label)
                     for colour, label in zip(COLOURS, labels, strict=False)
                 ),
                 *(
-                    Line2D([], [], linestyle="", marker=marker, color="0.5", label=state.value)
+                    make_line([], [], linestyle="", marker=marker, color="0.5", label=state.value)
                     for state, marker in MARKERS.items()
                 ),
             ],
