@@ -65,7 +65,7 @@ MAX_EXCESS_RATIO = 0.07
 
 ARMS = ("left", "right")
 RECOVERY_S = 60.0
-MEASURED = {
+MEASURED: Mapping[str, tuple[str, Callable[[Scene], float]]] = {
     "sheet_mm.p95": ("sheet", lambda scene: 1e3 * scene.tolerances.sheet_position_m),
     "hold_mm.p95": ("sheet to its target", lambda scene: 1e3 * scene.tolerances.sheet_position_m),
     "exposure_to_arm_ms.p95": ("exposure to arm", lambda scene: 1e3 * scene.tolerances.latency_s),
@@ -325,7 +325,6 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    make_line: Any = Line2D  # matplotlib's class is not typed
     names = list(dict.fromkeys(row["factor"] for row in rows))
     labels = [label for label, _ in MEASURED.values()]
     with page_style():
@@ -354,11 +353,11 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         figure.legend(
             handles=[
                 *(
-                    make_line([], [], color=colour, label=label)
+                    Line2D([], [], color=colour, label=label)
                     for colour, label in zip(COLOURS, labels, strict=False)
                 ),
                 *(
-                    make_line([], [], linestyle="", marker=marker, color="0.5", label=state.value)
+                    Line2D([], [], linestyle="", marker=marker, color="0.5", label=state.value)
                     for state, marker in MARKERS.items()
                 ),
             ],
