@@ -160,6 +160,8 @@ def format_markdown(rows: list[dict[str, Any]]) -> str:
 
 def render(path: Path) -> str:
     """Return the table of a recorded measurement, with its machine and command, in Markdown."""
+    if not path.exists():
+        return f"No measurement is recorded in docs/results/{path.name}."
     recorded = json.loads(path.read_text())
     return (
         f"{format_markdown(recorded['results']['scenes'])}\n\n"

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks import soft_body_size
+from benchmarks import scenes, soft_body_size
 from flexsheet.launch.methods import charts
 from flexsheet.launch.plans.drawing import svg
 from website import (
@@ -35,6 +35,7 @@ from website.graph import DRAWINGS
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 CHARTS = DOCS / "charts"
+RESULTS = DOCS / "results"
 SITE_INPUT = ROOT / "build" / "docs"
 INCLUDE = re.compile(r"^<!-- include: ([\w-]+) -->$", re.MULTILINE)
 
@@ -48,6 +49,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "parameters": parameters_page.render,
     "registers": registers_page.render,
     "scene-keys": scene_page.render,
+    "scenes": lambda: scenes.render(RESULTS / "scenes.json"),
     "tolerances": tolerances_page.render,
     "topics": messages_page.render_topics,
     "tracking-regret": lambda: tracking_page.render(CHARTS / "tracking-regret.json"),
