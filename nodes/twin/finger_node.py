@@ -93,6 +93,7 @@ class TwinFingerNode(Node):
     coupled: CoupledFinger | None = None
     preparing: asyncio.Task[None] | None = None
     lit_marks: LitMarks | None = None
+    waiting: FingerPath | None = None
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
@@ -124,8 +125,7 @@ class TwinFingerNode(Node):
     def on_scene(self, scene: Scene, header: Header) -> None:
         truth = self.parameters.apparatus
         true_scene = apply_apparatus(scene, truth)
-        first = self.camera is None
-        if first:
+        if self.camera is None:
             rest = np.array(self.parameters.rest_world_m)
             self.motion = self._make_resting(rest)
             self.motion_from_ns = self.clock.now_ns()
@@ -153,8 +153,8 @@ class TwinFingerNode(Node):
             if self.preparing is not None:
                 self.preparing.cancel()
             self.preparing = asyncio.create_task(self.call("couple", self._couple, scene))
-        elif first and self.twin__finger_path.message is not None:
-            self._follow(self.twin__finger_path.message)
+        else:
+            self._follow_waiting()
 
     async def _couple(self, scene: Scene) -> None:
         """Tabulate the sheet's force in a thread, couple the finger to it, and start the path."""
@@ -166,8 +166,13 @@ class TwinFingerNode(Node):
         sheet = await asyncio.to_thread(TrueSheet, true_scene, given.apparatus, reaction)
         self.coupled = CoupledFinger(HandImpedance.of(given.apparatus), sheet, self._voluntary)
         self.coupled.time_s = self._seconds(self.clock.now_ns())
-        if self.twin__finger_path.message is not None:
-            self._follow(self.twin__finger_path.message)
+        self._follow_waiting()
+
+    def _follow_waiting(self) -> None:
+        """Follow the path that arrived before the finger could."""
+        path, self.waiting = self.waiting, None
+        if path is not None:
+            self._follow(path)
 
     def _seconds(self, at_ns: int) -> float:
         return (at_ns - self.started_ns) * 1e-9
@@ -205,9 +210,10 @@ class TwinFingerNode(Node):
         )
 
     def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
-        ready = self.parameters.hand == "prescribed" or self.coupled is not None
-        if self.camera is not None and ready:
-            self._follow(path)
+        coupled = self.parameters.hand == "prescribed" or self.coupled is not None
+        self.waiting = path
+        if self.camera is not None and coupled:
+            self._follow_waiting()
 
     def _follow(self, path: FingerPath) -> None:
         """Start to follow a path now.
