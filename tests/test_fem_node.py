@@ -21,9 +21,12 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.fem_solver import precompute, precompute_table, snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import Response
 from flexsheet.nodes.fem_solver.mesh import cylinder
 from flexsheet.nodes.fem_solver.node import BLEND_S, FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
 from tests.scenes import load_values
@@ -366,6 +369,59 @@ async def test_the_table_is_made_while_the_linear_method_answers(
     assert answer.displacement_world_m.tobytes() == first.displacement_world_m.tobytes()
     await again.node.close()
     assert (bench.node.errors, again.node.errors) == (0, 0)
+
+
+class Scaled(Named):
+    """Method under another name whose force is a multiple of the original."""
+
+    def __init__(self, method: Any, name: str, ratio: float) -> None:
+        super().__init__(method, name)
+        self._ratio = ratio
+
+    def respond(self, query: ContactQuery) -> Response:
+        found = self._method.respond(query)
+        return replace(found, force_n=self._ratio * found.force_n)
+
+
+async def test_better_methods_replace_others_without_a_step(
+    cache: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+
+    def build_table(
+        factory: Any, scene: Scene, linear: SceneBody, progress: Any, on_quick: Any
+    ) -> SceneBody:
+        on_quick(replace(linear, method=Scaled(linear.method, "quick_table", 0.8)))
+        assert go_on.wait(DEADLINE_S)
+        return replace(linear, method=Scaled(linear.method, "nonlinear_table", 0.6))
+
+    monkeypatch.setattr(SoftBodyFactory, "build_table", build_table)
+    bench = Bench(cache_dir=cache, compute_table=True)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(), header())
+    tip, clock = fingertip((0.0, 0.0, -0.003)), bench.node.clock
+
+    async def wait_for(method: str) -> float:
+        async with asyncio.timeout(DEADLINE_S):
+            while (await bench.push(tip)).method != method:  # noqa: ASYNC110  # set by a thread
+                await asyncio.sleep(0)
+        assert f"{method}, force within 25 %" in bench.node.note
+        return float((await bench.push(tip)).force_world_n[2])
+
+    async def force_after(seconds: float) -> float:
+        clock.move_to(clock.now_ns() + round(1e9 * seconds))
+        return float((await bench.push(tip)).force_world_n[2])
+
+    first = float((await bench.push(tip)).force_world_n[2])
+    assert await wait_for("quick_table") == pytest.approx(first)
+    assert await force_after(0.5 * BLEND_S) == pytest.approx(0.9 * first)
+    go_on.set()
+    assert await wait_for("nonlinear_table") == pytest.approx(0.9 * first)  # amid the first blend
+    steps = [await force_after(0.05 * BLEND_S) for _ in range(25)]
+    assert np.diff([0.9 * first, *steps]).min() > -0.05 * first
+    assert steps[-1] == pytest.approx(0.6 * first)
+    await bench.node.close()
+    assert bench.node.errors == 0, bench.node.last_error
 
 
 async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_path: Path) -> None:
