@@ -140,7 +140,11 @@ def _make_touch(values: dict[str, float], scene: Scene) -> Touch:
 
 
 SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20), (-15, 20),
-                       (12, -18), (12, 18))  # fmt: skip
+                       (12, -18), (12, 18), (0, 12), (10, 10), (-10, 10), (20, 0), (0, -12),
+                       (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
+                       (30, 0), (20, 20), (-25, 10), (8, 25))  # fmt: skip
+"""Orientations that are tried until MAX_TOUCHES show the marker, as a person would do."""
+MAX_TOUCHES = 9
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
 SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
 """Standard deviations of the simulated pad's position and of the finger's angles."""
@@ -155,10 +159,11 @@ def simulate_touches(
 ) -> list[Touch]:
     """Simulate touches of a known point, as the simulated stereo camera sees them.
 
-    Each orientation of `SIMULATED_TILTS_DEG` is used once, relative to the usual orientation of the
-    finger. The fit takes that one for `direction_world`, so that its offset is right in use. The
-    marker positions are those that the triangulator's detector finds; a touch whose marker it does
-    not accept is left out. calibration: optics that the detector uses; None: the scene's optics.
+    The orientations of `SIMULATED_TILTS_DEG`, relative to the usual orientation of the finger, are
+    used in sequence. The fit takes the usual one for `direction_world`, so that its offset is right
+    in use. The marker positions are those that the triangulator's detector finds; a touch whose
+    marker it does not accept is left out. calibration: optics that the detector uses; None: the
+    scene's optics.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
@@ -184,6 +189,8 @@ def simulate_touches(
         if seen is not None:
             turned = world_from_finger(scene.finger.direction_world, tilt_rad)
             touches.append(Touch(seen, SIMULATED_POINT_M, turned))
+        if len(touches) == MAX_TOUCHES:
+            break
     return touches
 
 
