@@ -17,7 +17,7 @@ from flexsheet.nodes.renderer.node import Renderer
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.twin.finger_node import TwinFingerNode
+from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -117,9 +117,9 @@ async def test_a_moved_projector_is_named_from_images() -> None:
 
 def test_without_marks_the_simulator_and_the_triangulator_do_not_read_frames() -> None:
     assert "frame" in Triangulator.unused_inputs(TriangulatorParameters(), CYLINDER)
-    assert "frame" in TwinFingerNode.unused_inputs(None, CYLINDER)
+    assert "frame" in TwinFingerNode.unused_inputs(TwinFingerParameters(), CYLINDER)
     assert not Triangulator.unused_inputs(TriangulatorParameters(), SCENE)
-    assert not TwinFingerNode.unused_inputs(None, SCENE)
+    assert not TwinFingerNode.unused_inputs(TwinFingerParameters(), SCENE)
 
 
 def test_rays_hit_the_nearest_point_of_their_triangle_or_nothing() -> None:

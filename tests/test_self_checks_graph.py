@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import yaml
-from flexsheet.launch.experiments.flags import read_flags
 
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import run_experiment
 from flexsheet.launch.experiments.stroke import stroke_path
+from flexsheet.launch.experiments.trial import read_flags
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import nominal_apparatus
 from flexsheet.messages.scene import Scene

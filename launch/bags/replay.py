@@ -499,12 +499,19 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
-    """Raise BagError if an input topic was not recorded. A topic without messages is allowed."""
+    """Raise BagError if an input topic was not recorded.
+
+    A topic without messages is allowed, and one that no node of the graph publishes.
+    """
     recorded = set(reader.topics)
     for other in plan.nodes.values():
         if other.role is NodeRole.RECORDER:
             recorded |= {port.topic for port in other.inputs}
-    missing = [port.topic for port in node.inputs if port.topic not in recorded]
+    missing = [
+        port.topic
+        for port in node.inputs
+        if port.topic not in recorded and plan.writers.get(port.topic)
+    ]
     if missing:
         options = " ".join(f"--include {topic}" for topic in missing)
         raise BagError(

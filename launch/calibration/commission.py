@@ -104,6 +104,9 @@ class State(LimitedModel):
 class MissingDataError(CommissionError):
     """Raised by a step that needs data of real devices; the text says how to capture them."""
 
+    code = "commission-data"
+    remedy = "Capture the data as the error says, and give the folder or file by --data STEP=PATH."
+
     def __init__(self, step: StepName, instruction: str) -> None:
         super().__init__(f"step {step}: {instruction}")
         self.step, self.instruction = step, instruction
