@@ -210,6 +210,20 @@ def test_a_stiffer_sheet_is_identified_from_pushes_between_the_true_arms() -> No
     assert found.hysteresis_ratio.value == pytest.approx(0.1, abs=0.03)
 
 
+def test_a_measured_modulus_keeps_the_displacement_of_the_flanges() -> None:
+    arm = SCENE.arms.left.model_copy(update={"flange_compliance_m_per_n": 60e-6})
+    scene = SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update={"left": arm})})
+    before = scene.sheet.young_modulus_pa * scene.sheet.thickness_m
+    values = measured_stiffness(scene, 1.2 * before)
+    assert values == pytest.approx(
+        {
+            "sheet.young_modulus_pa": 1.2 * scene.sheet.young_modulus_pa,
+            "arms.left.flange_compliance_m_per_n": 50e-6,
+            "arms.right.flange_compliance_m_per_n": 0.0,
+        }
+    )
+
+
 def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
     """The triangulator assumes `direction_world`, so the offset must contain the finger's tilt."""
     given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010], finger_tilt_rad=[0.2, -0.15])

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 from PIL import Image
 from playwright.async_api import Page, async_playwright, expect
 
@@ -62,14 +63,15 @@ KNOTS = (
 
 PATH_S = KNOTS[-1][0]
 FRAMES_PER_S = 12
+WARM_UP_FRAMES = 10
 SIZE_PX = (760, 480)
-POSITION_M, TARGET_M, FOV_RAD = (0.42, 0.16, 0.78), (0.0, -0.07, 0.0), 0.75
+POSITION_M, TARGET_M, FOV_RAD = (0.36, 0.2, 0.86), (0.02, -0.09, 0.0), 0.75
 WEBP_QUALITY = 72
 PAGE_PX = (1200, 760)
 
 
-def finger_path(scene: Scene) -> FingerPath:
-    """Make the path of the finger on the scene's cylinder."""
+def finger_path(scene: Scene, number: int) -> FingerPath:
+    """Make the path of the finger on the cylinder; number: distinguishes its repetitions."""
     radius_m = require_cylinder(scene).radius_m
     knots = np.array(KNOTS)
     distance_m = radius_m - knots[:, 3]
@@ -77,7 +79,7 @@ def finger_path(scene: Scene) -> FingerPath:
         [knots[:, 1], distance_m * np.sin(knots[:, 2]), distance_m * np.cos(knots[:, 2])]
     )
     return FingerPath(
-        label=PATH_LABEL,
+        label=f"{PATH_LABEL} {number}",
         times_s=knots[:, 0],
         positions_world_m=apply(object_pose(scene), points),
         wander_m=0.0,
@@ -90,8 +92,8 @@ def record(bag: Path) -> None:
     """Record two passes of the finger; the second one has no approach."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        for _ in range(2):
-            await driver.follow(finger_path(scene))
+        for number in range(2):
+            await driver.follow(finger_path(scene, number))
 
     run_experiment(DEMO, (), bag, procedure, print)
 
@@ -144,13 +146,16 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
         client = await joined
         client.camera.position, client.camera.look_at = POSITION_M, TARGET_M
         client.camera.up_direction, client.camera.fov = (0.0, 1.0, 0.0), FOV_RAD
-        for seconds in np.arange(0.0, PATH_S, 1.0 / frames_per_s):
+        times_s = np.arange(0.0, PATH_S, 1.0 / frames_per_s)
+        # The page loads meshes and fonts while it draws the first frames.
+        for seconds in (*times_s[:WARM_UP_FRAMES], *times_s):
             timeline.seconds = start_s + float(seconds)
             view.draw(compute_snapshot(scene[0], timeline))
             drawn = await asyncio.to_thread(
                 client.get_render, SIZE_PX[1], SIZE_PX[0], transport_format="png"
             )
-            frames.append(Image.fromarray(drawn[..., :3]))
+            frames.append(on_white(drawn))
+        del frames[:WARM_UP_FRAMES]
     server.stop()
     frames[0].save(
         output,
@@ -161,6 +166,13 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
         quality=WEBP_QUALITY,
         method=6,
     )
+
+
+def on_white(drawn: NDArray[np.uint8]) -> Image.Image:
+    """Return an image (h, w, 4) with its transparent parts in white."""
+    image = Image.fromarray(drawn)
+    white = Image.new("RGBA", image.size, "white")
+    return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
 
 
 async def slide(page: Page, label: str, value: float) -> None:

@@ -38,7 +38,7 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import Board, load_calibration, save_calibration
 from flexsheet.messages.files import write_file
-from flexsheet.messages.scene import Pose, require_projector
+from flexsheet.messages.scene import Pose, Scene, require_projector
 from flexsheet.nodes.models.rigid import rpy_from_rotation, transform_from_rpy
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -265,6 +265,7 @@ class Laboratory:
                 "modulus_percent": 100.0 * modulus.standard_deviation / modulus.value,
                 "slack_width_mm": 1e3 * found.slack_width_m.standard_deviation,
             },
+            scene_values=measured_stiffness(scene, modulus.value),
             parameters={"planner.sheet_calibration": SHEET},
         )
 
@@ -494,3 +495,18 @@ def _read_stroke(path: Path) -> dict[str, Any]:
             f"{error!r}; save the output of that command"
         ) from error
     return found
+
+
+def measured_stiffness(scene: Scene, modulus_thickness_n_per_m: float) -> dict[str, float]:
+    """Return the values of the scene for a measured product of modulus and thickness.
+
+    The step `edges` measured how far the tension displaces the flanges. Their compliances change so
+    that this displacement stays the same with the other tension.
+    """
+    sheet = scene.sheet
+    stiffer = modulus_thickness_n_per_m / (sheet.young_modulus_pa * sheet.thickness_m)
+    values = {"sheet.young_modulus_pa": stiffer * sheet.young_modulus_pa}
+    for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
+        compliance = arm.flange_compliance_m_per_n / stiffer
+        values[f"arms.{side}.flange_compliance_m_per_n"] = compliance
+    return values

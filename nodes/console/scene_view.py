@@ -148,8 +148,8 @@ class SceneView:
         self._object = self._add(
             "Object", self._scene.add_mesh_simple("/object", corners, split, color=OBJECT)
         )
-        left_m, lowest_m = rest.min(axis=0)[:2]
-        self._add_name("/object/name", "virtual object", (left_m, lowest_m - 0.02, 0.0))
+        highest_m = float(rest[:, 1].max())
+        self._add_name("/object/name", "virtual object", (0.0, highest_m + 0.01, 0.0))
         self._skin_shape, self._ray_vertices = rest.shape, select_ray_vertices(rest)
         self._make_touchable(self._object)
 
