@@ -29,6 +29,7 @@ from flexsheet.launch.commands.commission_steps import (
     BOARD,
     INSTRUCTIONS,
     Laboratory,
+    measured_stiffness,
     open_laboratory,
 )
 from flexsheet.launch.experiments.trial import run_robustness_trial
