@@ -23,6 +23,7 @@ from playwright.async_api import Page, async_playwright, expect
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import run_experiment
 from flexsheet.launch.experiments.stroke import object_pose
+from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import RunningGraph
@@ -184,8 +185,9 @@ async def slide(page: Page, label: str, value: float) -> None:
 
 async def photograph(bag: Path) -> None:
     """Save images of the page of a running graph: tab Touch, a replay, and tab Graph when dark."""
-    settings = [f"console.bags={bag.parent}"]
-    plan = load_graph(DEMO, settings=settings, console=True)
+    # The page needs most of the processor time of a computer without a graphics card.
+    settings = [f"console.bags={bag.parent}", "fem_solver.compute_table=false"]
+    plan = load_graph(DEMO, settings=settings, console=True, without=[Feature.IMAGE])
     precompute_graph(plan, print)
     url = f"http://127.0.0.1:{plan.nodes['console'].parameters['page_port']}/"
     expect.set_options(timeout=DEADLINE_MS)
@@ -219,14 +221,16 @@ async def dismiss_notice(page: Page) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bag", type=Path, help="bag of an earlier run of this command")
-    parser.add_argument("--animation-only", action="store_true")
+    parser.add_argument("--animation", action="store_true", help="make the animation only")
+    parser.add_argument("--page", action="store_true", help="make the images of the page only")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
         bag = given.bag or Path(folder) / "touch.mcap"
         if given.bag is None or not bag.exists():
             record(bag)
-        asyncio.run(animate(bag, IMAGES / "console.webp"))
-        if not given.animation_only:
+        if not given.page:
+            asyncio.run(animate(bag, IMAGES / "console.webp"))
+        if not given.animation:
             asyncio.run(photograph(bag))
 
 
