@@ -246,13 +246,16 @@ class ForceSample:
 
     @property
     def error_ratio(self) -> float:
-        """Return the relative error of the felt force; divisors are at least FORCE_JND_FLOOR_N."""
+        """Return the error of the felt force relative to the expected force.
+
+        The divisor is the expected force, but at least FORCE_JND_FLOOR_N.
+        """
         expected_n = self.wanted_n if self.reference is None else self.reference.force_n
         return _relative_error(self.felt_n, expected_n)
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the relative error of the wanted force; None without a reference."""
+        """Return the error of the wanted force relative to the reference; None without one."""
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)

@@ -63,7 +63,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
+    """Responses to pushes at m contact nodes, each to L depths, for a Young's modulus of 1 Pa.
 
     depths_m (L,): push depths; the first is 0. fields (m, L - 1, 3 s) float32: displacement of the
     s skin nodes at all depths except 0. force_n (m, L, 3): force on the finger. reach_m (m,):
