@@ -72,7 +72,7 @@ class Driver:
         pids: Callable[[], Mapping[str, int]] = dict,
         publish_scene: Callable[[Scene], int] | None = None,
     ) -> None:
-        """Connect nothing yet.
+        """Store the arguments; `async with` connects to the graph.
 
         pids: function that returns the process id of each running node, for measurements.
         publish_scene: function that replaces the scene and returns its source timestamp.
