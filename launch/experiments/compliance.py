@@ -334,7 +334,7 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return the times (ns) of a push, and the force ratio of `_history_ratio` at them.
+        """Return the times (ns) of a push, and the ratios of `_history_ratio` at these times.
 
         The membrane is solved at a few depths only, with the edges at the deepest point of the
         push. That suffices, because the ratio depends only on the shape of the force curve.

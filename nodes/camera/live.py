@@ -196,7 +196,7 @@ class CameraReader:
             stream.start()
 
     def read(self) -> ImagePair | None:
-        """See `Reader`."""
+        """Wait for the next image pair and return it.  Raises DeviceError."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
@@ -275,7 +275,7 @@ class CameraReader:
         )
 
     def interrupt(self) -> None:
-        """See `Reader`."""
+        """Make `read` return None soon, now and later.  Thread-safe."""
         with self._changed:
             self._interrupted = True
             self._changed.notify_all()
