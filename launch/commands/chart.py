@@ -85,7 +85,7 @@ def chart(
             metavar="SECONDS",
             min=2.0,
             max=600.0,
-            help="For system: duration of each simulated stroke.",
+            help="For system: duration of each simulated stroke, s.",
         ),
     ] = 10.0,
     apparatuses: Annotated[

@@ -121,7 +121,7 @@ class Driver:
             self._newest[name] = message
             self.on_message(message)
             if isinstance(message, Skin):
-                # The bodies of the former scene answer no more.
+                # The soft body of the previous scene no longer responds.
                 self._skin_source_ns = header.source_ns
                 self._newest.pop("soft_body", None)
             if isinstance(message, Status):

@@ -171,7 +171,7 @@ def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) ->
     shape = make_shape(dict(scene.object.geometry))
     points = apply(inverse(object_pose(scene)), recorded.positions_m)
     nearest = shape.closest(points)
-    # Beside the object's end there is no object, at any depth.
+    # Beyond the object's end there is no contact at any depth.
     depths_m = np.where(nearest.on_edge, 0.0, -nearest.height_m)
     times_s, felt_n = recorded.steps[:, 0], recorded.steps[:, 2]
     at_steps_m = np.interp(times_s, recorded.times_s, depths_m)

@@ -70,7 +70,7 @@ def run_robustness(
     """
     if commissioned and calibrated:
         raise ExperimentError(
-            "--commissioned calibrates the devices itself, --calibrated samples calibrated ones; "
+            "--commissioned and --calibrated exclude each other: both give calibrated devices; "
             "give one of the two"
         )
     plan = load_graph(launch_file, settings=settings)
