@@ -17,9 +17,10 @@ from flexsheet.nodes.models.rigid import transform_from_rpy
 Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force in which the depth must change by less than QUIET_M.
+"""Time before and after a measured force, and maximum change of the depth in this time.
 
-Gauges lag, so that forces during a motion cannot be used."""
+Gauges lag, so that forces during a motion cannot be used.
+"""
 
 MAX_GAP_S = 0.05
 """Maximum time between a force and the nearest messages of fingertip and arms."""

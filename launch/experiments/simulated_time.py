@@ -73,7 +73,7 @@ SERVO_LAG_S = 0.025
 """Servo lag of the simulated arms, unless the apparatus states it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
-"""Parameters of the arm bridges."""
+"""Maximum measured servo lag, and maximum extrapolation time of a target, as in the bridges."""
 
 SETTLING_S = 2.0
 """Time for which the finger rests at the start of the path, until the sheet has reached it."""

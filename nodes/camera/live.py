@@ -34,7 +34,8 @@ RELEASE_S = 0.5
 class CapturedFrame:
     """Image of one camera with two estimates of its mid-exposure time, ns.
 
-    by_arrival_ns: from the arrival. by_stamp_ns: from the driver's timestamp; None: not available.
+    by_arrival_ns: computed from the arrival. by_stamp_ns: computed from the driver's timestamp;
+    None if there is none.
     """
 
     image: Image

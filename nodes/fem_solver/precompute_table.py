@@ -136,7 +136,7 @@ class LostWorkersError(WorkersError):
 
 
 def code_version() -> str:
-    """Return the version of the code that computes snapshots, combined from those of its parts."""
+    """Return the version of the code that computes snapshots, from the versions of its parts."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 

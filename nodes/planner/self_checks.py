@@ -51,7 +51,7 @@ MIN_FORCE_N = 0.2
 """Minimum push depth and force that are compared; below, measurement errors dominate."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force in which the indentation must change by less."""
+"""Time before and after a measured force, and maximum change of the indentation in this time."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,7 +53,7 @@ FRICTION_STREAM = 11
 """Second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
-"""Maximum difference of each joint between the first set-point and the arm."""
+"""Maximum difference of each joint between the first set-point and the measured joints."""
 
 STEP_CYCLES = 2.0
 """Maximum step between set-points, as the number of cycles that it would take at full speed."""
